@@ -11,6 +11,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -111,14 +112,26 @@ class HomeAssistant:
         self.start()
 
     def _fix_address(self):
-        """Say the address where newer versions look for it: in 2026.11 that of YAML is tried only.
+        """Say the address where 2026.11 looks for it: that of YAML it only tries.
 
-        After five minutes in which nobody confirms it they would listen on all addresses.
+        After five minutes in which nobody confirms it, it would listen on all addresses.
         """
+        address = {
+            "server_host": ["127.0.0.1"],
+            "server_port": self.port,
+            "cors_allowed_origins": [],
+            "login_attempts_threshold": -1,
+            "ip_ban_enabled": True,
+            "ssl_profile": "modern_v6",
+            "use_x_frame_options": True,
+            "created_at": "2026-01-01T00:00:00+00:00",
+            "error": None,
+            "error_message": None,
+        }
+        data = {"stable": address, "pending": None, "yaml_migration_done": True}
+        stored = {"version": 3, "minor_version": 1, "key": "http", "data": data}
         place = self.folder / ".storage"
         place.mkdir()
-        address = {"server_host": ["127.0.0.1"], "server_port": self.port}
-        stored = {"version": 1, "minor_version": 1, "key": "http", "data": address}
         (place / "http").write_text(json.dumps(stored))
 
     @property
@@ -138,13 +151,28 @@ class HomeAssistant:
         if not self._refresh:
             self._make_owner()
         wait_for(lambda: self.call("/api/config")["state"] == "RUNNING", 120)
-        listening = _listening_addresses(self._process.pid)
-        assert {address for address in listening if address != "127.0.0.1"} == set()
+        assert self.addresses() == {"127.0.0.1"}
 
     def stop(self):
         """End it, if it runs."""
         if self._process is not None and self._process.poll() is None:
             end(self._process, seconds=60)
+
+    def addresses(self):
+        """Return the addresses of this machine at which it waits for connections."""
+        sockets = set()
+        for path in Path(f"/proc/{self._process.pid}/fd").iterdir():
+            with suppress(OSError):
+                sockets.add(path.readlink().name.removeprefix("socket:[").removesuffix("]"))
+        found = set()
+        for table in ("tcp", "tcp6"):
+            for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+                words = line.split()
+                if words[3] == "0A" and words[9] in sockets:
+                    place = bytes.fromhex(words[1].split(":")[0])
+                    is_v4 = len(place) == 4
+                    found.add(".".join(map(str, place[::-1])) if is_v4 else words[1])
+        return found
 
     def connect(self, port):
         """Set up MQTT, as a person does in the settings."""
@@ -208,7 +236,7 @@ class HomeAssistant:
         """Call the REST API."""
         return self._request(path, data, self._access(), method)
 
-    def _request(self, path, data=None, token="", method=None, *, form=False):  # noqa: PLR0913
+    def _request(self, path, data=None, token="", method=None, *, form=False):
         head = {"Authorization": f"Bearer {token}"} if token else {}
         body = None
         if form:
@@ -247,25 +275,6 @@ class HomeAssistant:
         return self._token
 
 
-def _listening_addresses(pid):
-    """Return the addresses of this machine at which a process waits for connections."""
-    sockets = set()
-    for path in Path(f"/proc/{pid}/fd").iterdir():
-        try:
-            sockets.add(path.readlink().name.removeprefix("socket:[").removesuffix("]"))
-        except OSError:
-            continue
-    found = []
-    for table in ("tcp", "tcp6"):
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
-            words = line.split()
-            if words[3] == "0A" and words[9] in sockets:
-                address = bytes.fromhex(words[1].split(":")[0])
-                name = ".".join(map(str, address[::-1])) if len(address) == 4 else words[1]
-                found.append(name)
-    return found
-
-
 class Household:
     """A home that is recorded, and a bridge that tells a broker of it."""
 
@@ -293,21 +302,28 @@ class Household:
         soundfile.write(self.folder / "home.flac", np.tile(noise, 120), _RATE)
 
     def record(self, model="general"):
-        """Start the recorder."""
+        """Start the recorder: it hears the hour, from now on."""
         start = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         sound = self.folder / "home.flac"
         self.recorder = self._start(
             "record", sound, "--realtime", "--start", start, "--model", model
         )
 
+    def listen(self, microphone):
+        """Start the recorder: it hears a virtual microphone."""
+        samples, _ = soundfile.read(self.folder / "home.flac", 60 * _RATE, dtype="int16")
+        microphone.configure(data=samples)
+        arguments = "--device", microphone.device, "--model", "general"
+        self.recorder = self._start("record", *arguments, env=microphone.env)
+
     def tell(self):
         """Start the bridge."""
         self.bridge = self._start("bridge")
 
-    def _start(self, verb, *arguments):
+    def _start(self, verb, *arguments, **options):
         command = [*DIES_WITH_PARENT, *HEARTHLOG, verb, *arguments, "--config", self.configuration]
         with (self.folder / f"said-{verb}").open("a") as said:
-            return subprocess.Popen(list(map(str, command)), stdout=said, stderr=said)
+            return subprocess.Popen(list(map(str, command)), stdout=said, stderr=said, **options)
 
     def close(self):
         """End both, if they run."""

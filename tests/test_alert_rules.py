@@ -91,6 +91,13 @@ def test_a_rule_of_minutes_rings_in_the_second_in_which_there_are_more():
     assert rung(one, heard) == expected
 
 
+def test_minutes_of_events_that_must_be_long_count_from_when_they_are():
+    heard = home((0, 50, "speech"), (100, 100, "speech"), (300, 100, "speech"))
+    one = rule("more_than", minutes=2, window="1h", least_seconds=60, **{"class": "speech"})
+    # The first never counts; the second does with all of its 60 seconds, then second by second.
+    assert rung(one, heard) == [360]
+
+
 def _first_seconds(sounds, window, most):
     """Seconds at which the sum over the window passes a limit, counted second by second."""
     on = np.zeros(20_000, int)
@@ -335,7 +342,7 @@ def test_a_time_of_day_in_the_hour_of_the_change_rings_once_on_that_day(first):
 @st.composite
 def lives(draw):
     """Six hours with sounds, pauses of all lengths, and a recorder that falls silent."""
-    seconds = st.integers(1, 900)
+    seconds = st.integers(1, 20) | st.integers(1, 900)
     heard, now = [], 0
     while now < 6 * HOUR and len(heard) < 80:
         now += draw(seconds)
@@ -347,8 +354,10 @@ def lives(draw):
         length = draw(st.integers(10, 4000))
         writes.append((at_second, length))
         at_second += length + draw(st.integers(30, 1500))
-    cuts = draw(st.lists(st.integers(1, 7 * HOUR - 1), max_size=20, unique=True))
-    return heard, writes, sorted(cuts)
+    edges = [second for start, length, _ in heard for second in (start, start + length)]
+    near = st.builds(int.__add__, st.sampled_from(edges), st.integers(-2, 15))
+    cuts = draw(st.sets(near | st.integers(1, 7 * HOUR), max_size=60))
+    return heard, writes, sorted(cut for cut in cuts if 0 < cut < 7 * HOUR)
 
 
 DIVIDED = [

@@ -50,6 +50,7 @@ COUGHS = rule("more_than", "coughs", count=2, window="1h", **{"class": "coughing
 WATER = rule("longer_than", "water", longer_than="10m", **{"class": "tap_water"})
 QUIET = rule("none_by", "quiet", since="01:00", by="03:00", **{"class": "speech"})
 DEAF = rule("none_by", "deaf", since="03:00", by="04:30", **{"class": "speech"})
+EACH = rule("more_than", "each", count=0, window="1m", cooldown="1m", **{"class": "coughing"})
 SPEECH = rule("more_than", "speech", minutes=8, window="20m", cooldown="10m", **{"class": "speech"})
 
 
@@ -65,7 +66,7 @@ def labels_of(columns):
 def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     """Long sounds have no segment yet when they ring, nor has a long silence when it is judged."""
     rng = np.random.default_rng(4)
-    events = [(second, 2.0, "coughing", 0.9) for second in rng.uniform(0, 5 * HOUR, 30)]
+    events = [(second, 2.0, "coughing", 0.9) for second in rng.uniform(0, 5 * HOUR, 60)]
     events += [(600.0 + 3600 * n, 1500.0, "tap_water", 0.9) for n in range(2)]
     events += [(16_300.0, 700.0, "speech", 0.8), (17_100.0, 700.0, "speech", 0.8)]
     about = {"classes": CLASSES, "hours": range(6), "gaps": [(11_000, 4000, "unplugged")]}
@@ -74,7 +75,7 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     (columns,) = read_columns(find_logs(tmp_path), ["/mic/segment"]).values()
     gaps = read_columns(find_logs(tmp_path), ["/mic/gap"])["/mic/gap"]
     labels = labels_of(columns)
-    rules = [COUGHS, WATER, QUIET, DEAF, SPEECH]
+    rules = [COUGHS, WATER, QUIET, DEAF, SPEECH, EACH]
     outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
     memory = Memory(tmp_path / "rules.json", pytest.fail)
     watch = RuleWatch(rules, UTC, outbox, memory, pytest.fail, begin + MINUTE)
@@ -86,15 +87,31 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
             if second in labels:
                 live.add_label("mic", Label(second * SECOND, labels[second], 0.9), CLASSES)
         until = live.known_until(now)
-        found += watch.evaluate(live.heard, pytest.fail, until, now)
+        new = watch.evaluate(live.heard, pytest.fail, until, now)
+        assert all(now - each.time < 90 * SECOND for each in new)
+        found += new
         live.forget_before(watch.needed_from(now))
         edge, now = now, now + int(rng.integers(1, 40)) * SECOND
     heard = read_heard(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
     expected = [rings(one, heard, begin + MINUTE, until, UTC)[0] for one in rules]
     assert sorted(found) == sorted(ring for own in expected for ring in own)
-    assert [len(own) > 0 for own in expected] == [True] * 5
+    assert [len(own) > 0 for own in expected] == [True] * 6
     assert [ring.is_known for own in expected[2:4] for ring in own] == [True, False]
     assert outbox.waiting_for("x", 1 << 62) == sorted(found, key=lambda ring: ring.time)
+
+
+def test_what_was_heard_before_a_recorder_was_killed_stays_heard(tmp_path):
+    """Its last segment was never written; the next recorder writes the gap that follows."""
+    write_day(tmp_path, DAY, hours=range(3), gaps=[(2 * HOUR, 600, "the recorder was not running")])
+    gaps = read_columns(find_logs(tmp_path), ["/mic/gap"])["/mic/gap"]
+    begin = midnight(DAY)
+    live = LiveHome(begin, 30 * SECOND)
+    for second in range(100, 2 * HOUR, 10):
+        live.add_label("mic", Label(begin + second * SECOND, "silence", 0.9), CLASSES)
+    before = live.heard().coverage["mic"].length
+    assert before > 1.9 * HOUR * SECOND
+    live.push([gaps])
+    assert live.heard().coverage["mic"].length == before
 
 
 def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
@@ -311,7 +328,7 @@ def test_a_replay_prints_each_ring_and_how_often_each_rule_rings(two_days, heart
         "name       rule       rings  a week  not known",
         "coughs     more_than      1     3.6          0",
         "no speech  none_by        2     7.1          1",
-        "2 days, 2026-03-02 02:00 to 2026-03-04 00:59, Europe/Vienna",
+        "2 days, 2026-03-02 02:00 to 2026-03-04 01:00, Europe/Vienna",
     ]
 
 

@@ -1,12 +1,11 @@
 """The page of the home: who may read it, what it shows, and how one says what a sound was."""
 
 import json
-import os
 import socket
 import threading
 import time
 from contextlib import contextmanager, suppress
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from http.client import HTTPConnection, HTTPException
 from zoneinfo import ZoneInfo
 
@@ -37,6 +36,7 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS
 
+LIVED = [name for name in GENERAL if name not in {"silence", "crying"}]
 HOSTILE = '<img src=x onerror="document.title=1">'
 JSON = {"Content-Type": "application/json"}
 
@@ -102,13 +102,23 @@ class Served:
     def marks(self):
         return [mark for log in find_logs(self.log.folder) for mark in read_marks(log)]
 
+    def open_stream(self):
+        """Ask for the stream of news; return the connection, or None if there are too many."""
+        connection = self.connect()
+        head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n"
+        connection.sendall(f"{head}Cookie: {self.cookie()}\r\n\r\n".encode())
+        if connection.recv(12) == b"HTTP/1.1 200":
+            return connection
+        connection.close()
+        return None
+
     @contextmanager
     def stream(self):
         """Open the stream of news; yield what waits for a part of the page."""
-        with self.connect() as connection:
-            head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n"
-            connection.sendall(f"{head}Cookie: {self.cookie()}\r\n\r\n".encode())
-            lines = connection.makefile("r", encoding="utf-8")
+        with (
+            patiently(self.open_stream, bool) as connection,
+            connection.makefile("r", encoding="utf-8") as lines,
+        ):
 
             def next_part(name, is_enough=lambda _: True):
                 for line in lines:
@@ -267,15 +277,12 @@ def test_too_many_connections_are_turned_away_until_others_end(served):
 
 
 def test_too_many_open_pages_leave_room_for_the_page_itself(served):
-    streams = [served.connect() for _ in range(server._MOST_STREAMS)]
-    request = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {served.cookie()}\r\n\r\n"
-    for each in streams:
-        each.sendall(request.encode())
-        assert each.recv(100).startswith(b"HTTP/1.1 200")
+    streams = [patiently(served.open_stream, bool) for _ in range(server._MOST_STREAMS)]
     assert served.ask("GET", "/events")[0] == 503
     assert served.ask("GET", "/")[0] == 200
     for each in streams:
         each.close()
+    assert patiently(served.open_stream, bool).close() is None
 
 
 def test_who_sends_a_request_for_ever_is_cut_off(served, monkeypatch):
@@ -302,15 +309,9 @@ def test_a_reader_who_is_slow_gets_the_newest_and_nobody_waits_for_him():
 
 
 def test_a_browser_that_reads_nothing_does_not_hold_up_the_others(served):
-    with served.connect() as asleep:
-        head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {served.cookie()}\r\n\r\n"
-        asleep.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
-        asleep.sendall(head.encode())
-        with served.stream() as part:
-            start = served.log.heard("laughing", 5)
-            part(
-                "events", lambda it: event_id(start, "laughing") in {e["id"] for e in it["events"]}
-            )
+    with patiently(served.open_stream, bool), served.stream() as part:
+        start = served.log.heard("laughing", 5)
+        part("events", lambda it: event_id(start, "laughing") in {e["id"] for e in it["events"]})
 
 
 # Ports and tokens
@@ -415,8 +416,8 @@ def test_a_day_on_which_the_clock_is_changed_has_the_hours_of_the_clock(day, hou
     (lane,) = picture["rooms"][0]["lanes"]
     assert len(lane["bars"]) == hours * 30
     assert lane["bars"].index("9") / len(lane["bars"]) == pytest.approx(noons[0], abs=1e-4)
-    assert picture["nights"][0][1] == [place for place, hour in picture["hours"] if hour == 7][0]
-    assert picture["nights"][1][0] == [place for place, hour in picture["hours"] if hour == 22][0]
+    places = {hour: place for place, hour in picture["hours"]}
+    assert picture["nights"] == [(0, places[7]), (places[22], 1)]
 
 
 def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_night():
@@ -540,3 +541,296 @@ def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
     assert said.of(event) == "Marked: Telephone ringing"
     later = event._replace(start=event.end, end=event.end + NANOSECONDS)
     assert said.of(later) == ""
+
+
+# In a browser
+
+_WATCH = """
+window.seen = [];
+for (const kind of ["error", "unhandledrejection", "securitypolicyviolation"])
+  addEventListener(kind, (e) =>
+    seen.push(`${kind} ${e.message ?? e.reason ?? e.blockedURI}`), true);
+console.error = (...texts) => seen.push(texts.join(" "));
+"""
+# The texts with too little contrast to the ground below them, after WCAG 2.
+_PALE_TEXTS = """
+(() => {
+  const parts = (colour) => colour.match(/[\\d.]+/g).map(Number);
+  const linear = (v) => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const ground = (e) => {
+    for (; e; e = e.parentElement) {
+      const found = parts(getComputedStyle(e).backgroundColor);
+      if (found.length === 3 || found[3] === 1) return found;
+    }
+    return [255, 0, 0];
+  };
+  const pale = [];
+  for (const e of document.body.querySelectorAll("*")) {
+    const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
+    if (!own || !e.getClientRects().length || e.closest(".hidden, defs, title")) continue;
+    const style = getComputedStyle(e);
+    const colour = e instanceof SVGElement ? style.fill : style.color;
+    const [one, other] = [light(parts(colour)), light(ground(e))].sort((a, b) => b - a);
+    if ((one + 0.05) / (other + 0.05) < 4.5) pale.push(`${e.textContent} ${colour}`);
+  }
+  return pale;
+})()
+"""
+
+
+class Phone:
+    """A browser that is shown the page."""
+
+    def __init__(self, browser):
+        self._browser = browser
+        browser.call("Page.enable")
+        browser.call("Page.addScriptToEvaluateOnNewDocument", source=_WATCH)
+
+    def open(self, served, width=390, height=844, scheme="light"):
+        self._browser.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self._browser.call("Emulation.setEmulatedMedia", features=features)
+        self._browser.open(served.url)
+        patiently(self._is_there, bool)
+
+    def _is_there(self):
+        with suppress(AssertionError):  # it is still going on from the entrance
+            return self.of('document.querySelectorAll("#events li, .lanes svg").length > 1')
+
+    def of(self, expression):
+        return self._browser.evaluate(expression)
+
+    def until(self, expression):
+        return patiently(lambda: self.of(f"!!({expression})"), bool)
+
+    def text(self, selector):
+        return self.of(f"document.querySelector({selector!r})?.innerText")
+
+    def shows(self, selector, text):
+        patiently(lambda: self.text(selector), lambda shown: text.lower() in (shown or "").lower())
+
+    def press(self, key, text=""):
+        for kind in ("keyDown", "keyUp"):
+            code = {"Enter": 13, "Tab": 9, " ": 32}.get(key, 0)
+            self._browser.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                windowsVirtualKeyCode=code,
+                **({"text": text} if text and kind == "keyDown" else {}),
+            )
+
+    def write(self, text):
+        self._browser.call("Input.insertText", text=text)
+
+    def focus(self):
+        return self.of("document.activeElement.innerText || document.activeElement.value")
+
+    def tree(self):
+        """What a screen reader is told: role and name of everything that is not passed over."""
+        nodes = self._browser.call("Accessibility.getFullAXTree")["nodes"]
+        return [
+            (node["role"]["value"], node.get("name", {}).get("value", ""))
+            for node in nodes
+            if not node["ignored"]
+        ]
+
+    def framed(self):
+        """The addresses that a frame could not show."""
+        frames = self._browser.call("Page.getFrameTree")["frameTree"].get("childFrames", [])
+        return [f["frame"]["unreachableUrl"] for f in frames if "unreachableUrl" in f["frame"]]
+
+    def picture(self, path):
+        path.write_bytes(self._browser.picture())
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
+        yield Phone(browser)
+
+
+@pytest.fixture(scope="module")
+def lived(tmp_path_factory):
+    """A home with two rooms, and something of everything that a page can show."""
+    names = ("living_room", "bathroom")
+    with serving(tmp_path_factory.mktemp("lived"), microphones=names) as home:
+        for name in names:
+            home.log.heard("silence", 350, 60, microphone=name)
+            home.log.not_heard(200, 40, microphone=name)
+        for number, label in enumerate(LIVED):
+            home.log.heard(label, 120 - 5 * number, 30, 0.55 + 0.05 * number, "living_room")
+        home.log.says("living_room", 0, "listening", level_dbfs="-43.2")
+        home.log.says("bathroom", 2, "no device of this name")
+        home.log.says("home disk", 1, "2 days left")
+        home.log.hears("speech", "living_room")
+        yield home
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(390, 844), (1366, 768)], ids=str)
+def test_the_page_fits_the_screen_and_can_be_read(phone, lived, size, scheme, tmp_path):
+    lived.log.hears("speech", "living_room")
+    phone.open(lived, *size, scheme)
+    phone.shows("#heard", "Talking")
+    phone.of('document.querySelector("#events summary").click()')
+    phone.until('document.querySelector("#events fieldset")')
+    phone.picture(tmp_path / "seen.png")
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    assert phone.of("location.href") == lived.url.partition("?")[0]
+    assert phone.of(_PALE_TEXTS) == []
+    dark = phone.of("getComputedStyle(document.body).backgroundColor") == "rgb(15, 20, 24)"
+    assert dark == (scheme == "dark")
+    assert phone.of("seen") == []
+
+
+def test_the_page_says_what_is_heard_now_as_the_log_does(phone, lived):
+    phone.open(lived)
+    for label, words in (("coughing", "Coughing"), ("music", "Music")):
+        lived.log.hears(label, "living_room")
+        phone.shows("#heard", words)
+    heard = phone.text("#heard")
+    assert "Living room" in heard
+    assert " ".join(heard.split()).endswith("Bathroom Not listening no device of this name")
+    live = phone.of('[...document.querySelectorAll("[aria-live]")].map((e) => e.id)')
+    assert live == ["heard"]
+
+
+def test_what_is_wrong_is_said_at_the_top_and_below(phone, lived):
+    phone.open(lived)
+    lived.log.hears("speech", "living_room")
+    phone.shows("#attention", "Needs a look: Microphone, Bathroom, Disk")
+    assert "Disk: Look at this (2 days left)" in phone.text("#health")
+    assert "Bathroom: Not working (not listening: no device of this name)" in phone.text("#health")
+
+
+def test_a_screen_reader_is_told_what_everything_is(phone, lived):
+    lived.log.hears("speech", "living_room")
+    phone.open(lived)
+    phone.shows("#heard", "Talking")
+    phone.of('document.querySelector("#events summary").click()')
+    phone.until('document.querySelector("#events fieldset")')
+    tree = phone.tree()
+    named = {"button", "DisclosureTriangle", "image", "link", "meter", "radio", "region", "textbox"}
+    assert [node for node in tree if node[0] in named | {"table"} and not node[1]] == []
+    headings = [name for role, name in tree if role == "heading"]
+    assert headings[:3] == ["Home", "Now", "Today"]
+    assert {"main", "banner", "contentinfo", "list", "columnheader", "rowheader"} <= {
+        role for role, _ in tree
+    }
+    regions = ["Now", "Today", "Last sounds", "Is everything working?"]
+    assert [name for role, name in tree if role == "region"] == regions
+    images = [name for role, name in tree if role == "image"]
+    assert len(images) == len(GENERAL) - 1
+    assert any(name.startswith("Coughing: once today, last at ") for name in images)
+    assert "Crying: never today" in images
+    buttons = [name for role, name in tree if role == "DisclosureTriangle"]
+    assert len({*buttons}) == len(buttons) == len(LIVED)
+    assert ("meter", "Loudness, Living room") in tree
+
+
+def test_one_says_by_keyboard_what_a_sound_was(phone, lived):
+    phone.open(lived)
+    phone.of('document.querySelector("#events summary").focus()')
+    phone.press("Enter", "\r")
+    phone.until('document.querySelector("#events fieldset")')
+    phone.press("Tab")
+    phone.until('document.activeElement.type === "radio"')
+    phone.press(" ", " ")
+    phone.press("Tab")
+    phone.until('document.activeElement.type === "text"')
+    phone.write("Türglocke")
+    phone.press("Enter", "\r")
+    phone.shows("#events .problem", "letters a to z")
+    phone.of("document.activeElement.value = ''")
+    phone.of('document.querySelector("#events input[type=text]").select()')
+    phone.write("Door bell")
+    phone.press("Enter", "\r")
+    phone.shows("#events .said", "You said: Door bell")
+    patiently(phone.focus, lambda shown: "That was" in shown)
+    assert phone.of("seen") == []
+    assert [mark.label for mark in lived.marks()] == ["door_bell"]
+
+
+def test_a_form_that_somebody_fills_in_stays_when_sounds_come(phone, lived):
+    phone.open(lived)
+    phone.of('document.querySelectorAll("#events summary")[1].click()')
+    phone.until('document.querySelector("#events input[type=text]")')
+    phone.of('document.querySelector("#events input[type=text]").focus()')
+    phone.write("Kettle")
+    before = phone.of('document.querySelectorAll("#events li").length')
+    lived.log.heard("laughing", 1, 2, microphone="bathroom")
+    phone.until(f'document.querySelectorAll("#events li").length > {before}')
+    assert phone.focus() == "Kettle"
+    assert phone.text("#events li:first-child .what") == "Laughing"
+
+
+def test_texts_of_a_log_are_texts_of_the_page_whatever_they_are(phone, tmp_path):
+    long = "w" * 64
+    with serving(tmp_path, classes=["silence", HOSTILE, long]) as home:
+        home.log.heard(HOSTILE, 10)
+        home.log.heard(long, 5)
+        home.log.says("home disk", 1, HOSTILE)
+        home.log.says(HOSTILE, 1, "x" * 5000)
+        home.log.hears(HOSTILE)
+        phone.open(home)
+        phone.of('document.querySelectorAll("#events summary").forEach((e) => e.click())')
+        phone.shows("#heard", HOSTILE.capitalize())
+        phone.shows("#health", HOSTILE)
+        for selector in ("#rooms", "#events", "#events fieldset"):
+            assert HOSTILE.capitalize() in phone.text(selector)
+        assert phone.of('document.querySelectorAll("img").length') == 0
+        assert phone.of("document.title") == "Home"
+        assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+        assert phone.of("seen") == []
+
+
+def test_a_script_that_got_into_the_page_would_not_run(phone, lived):
+    phone.open(lived)
+    phone.of(
+        'document.body.append(Object.assign(document.createElement("script"), '
+        '{ type: "text/javascript" }))'
+    )
+    phone.of("document.querySelector('body > script').append('window.ran = 1')")
+    phone.of("try { document.body.innerHTML = '<img src=x onerror=window.ran=1>' } catch {}")
+    phone.of("fetch('http://127.0.0.1:1/').catch(() => {})")
+    phone.until("seen.length >= 3")
+    assert phone.of("window.ran") is None
+    assert phone.of('document.querySelectorAll("img").length') == 0
+
+
+def test_the_page_says_when_the_box_is_gone_and_goes_on_when_it_is_back(phone, tmp_path):
+    with serving(tmp_path) as home:
+        home.log.heard("coughing", 10)
+        home.log.hears("coughing")
+        phone.open(home)
+        home.end()
+        phone.shows("#trouble", "There is no connection to the box. What you see is of 12:")
+        home.restart()
+        phone.until('document.getElementById("trouble").hidden')
+
+
+def test_a_page_elsewhere_can_neither_read_nor_frame_nor_mark(phone, served):
+    phone.open(served)
+    before = served.marks()
+    address = served.url.partition("?")[0]
+    phone._browser.open_as("http://127.0.0.1:9/other", "<!doctype html><title>other</title>")
+    got = phone._browser.wait_for(
+        f"Promise.all([fetch('{address}events', {{credentials: 'include'}}), "
+        f"fetch('{address}mark', {{method: 'POST', credentials: 'include', mode: 'no-cors', "
+        "body: '{}'})].map((each) => each.then((a) => a.type + a.status, (e) => 'refused')))"
+    )
+    assert got == ["refused", "refused"]
+    phone.of(
+        "document.body.append(Object.assign(document.createElement('iframe'), "
+        f"{{src: '{address}'}}))"
+    )
+    assert patiently(phone.framed, bool) == [address]
+    assert served.marks() == before

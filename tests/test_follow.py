@@ -23,6 +23,7 @@ from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.raw_messages import in_order_of_time
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.storage.folder_changes import FolderChanges
 
 pytestmark = pytest.mark.fast
 
@@ -279,3 +280,19 @@ def test_while_nothing_is_written_there_are_ticks_and_only_then(tmp_path):
         assert columns["frame"].tolist() == list(range(first, first + 20))
     writer.abandon()
     followed.close()
+
+
+def test_a_file_system_that_tells_of_no_change_is_looked_at_again_and_again(tmp_path, monkeypatch):
+    def wait(_self, seconds, stop):
+        stop.wait(seconds)
+        return False
+
+    monkeypatch.setattr(FolderChanges, "wait", wait)
+    with Followed(tmp_path, start=0) as followed:
+        for number in range(2):
+            writer = log(tmp_path / f"{number}", f"home_{number}.mcap")
+            for block in range(4):
+                write(writer, 80 * number + 20 * block)
+                expected = list(range(80 * number + 20 * block + 20))
+                assert followed.wait_for(expected) == expected
+            writer.finish()

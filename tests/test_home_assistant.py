@@ -229,13 +229,29 @@ def test_all_is_unavailable_while_the_recorder_is_not_running_but_for_that_it_is
     stopped = time.monotonic()
     wait_for(lambda: home.state(f"{ON}coughing") == "unavailable", 20)
     assert time.monotonic() - stopped > 5
+    for name in ("listening", "recorder"):
+        wait_for(lambda name=name: home.state(f"{ON}{name}") == "off", 2)
     states = home.states()
-    assert states[f"{ON}recorder"]["state"] == states[f"{ON}listening"]["state"] == "off"
     available = {name for name, each in states.items() if each["state"] != "unavailable"}
     assert available == ALWAYS
     home.household.record()
     wait_for(lambda: is_well(home), 30)
     assert home.state(f"{ON}listening") == "on"
+
+
+def test_a_microphone_also_has_a_level(home, labmic):
+    assert home.state(f"{SENSOR}level") == "unknown"  # files have none
+    end(home.household.recorder)
+    home.household.listen(labmic)
+    wait_for(lambda: home.state(f"{SENSOR}level") not in {"unknown", "unavailable"}, 60)
+    level = home.states()[f"{SENSOR}level"]
+    assert -80 < float(level["state"]) < 0
+    assert level["attributes"]["unit_of_measurement"] == "dBFS"
+    kept = {each["statistic_id"]: each for each in home.ask(type="recorder/list_statistic_ids")}
+    assert kept[f"{SENSOR}level"]["has_mean"]
+    end(home.household.recorder)
+    home.household.record()
+    wait_for(lambda: is_well(home), 60)
 
 
 def test_all_is_unavailable_when_the_bridge_is_killed_until_there_is_one_again(home):
@@ -295,3 +311,4 @@ def test_home_assistant_has_nothing_to_complain_of(home):
         and not any(f"[{name}]" in line for name in HARMLESS)
     ]
     assert complaints == []
+    assert home.addresses() == {"127.0.0.1"}

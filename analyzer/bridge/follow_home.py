@@ -1,5 +1,7 @@
 """Follow the log of one recorder from some time on, and then live, without a seam."""
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event as Flag
@@ -19,6 +21,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _LATEST = 60 * NANOSECONDS  # of labels and diagnostics: of the older ones nothing is left
 _WAIT_SECONDS = 1.0
+_TICK_SECONDS = 0.5
 
 
 def is_of_bridge(topic: str) -> bool:
@@ -56,8 +59,7 @@ def follow_home(
     Yields
     ------
     state : HomeState
-        The same one each time: after whatever was written, and five times a second while nothing
-        is.
+        The same one each time: after whatever was written, and twice a second while nothing is.
     begun : list of Event
         Those that began since the last time.
     """
@@ -68,16 +70,20 @@ def follow_home(
         if stop.wait(_WAIT_SECONDS):
             return
     messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
+    yielded = -math.inf
     for path, batch in messages:
         if path == folder:  # all that was written has been read
-            state.caught_up = True
-            yield state, []
+            if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
+                state.caught_up = True
+                yielded = time.monotonic()
+                yield state, []
         elif log_name(path).node == node:
             try:
                 begun = state.push(_decode(batch))
             except LogError as error:
                 damaged(LogError(f"{path}: {error}"))
                 continue
+            yielded = time.monotonic()
             yield state, begun
         if stop.is_set():
             return

@@ -11,6 +11,7 @@ from hearthlog.analyzer.bridge.follow_home import follow_home
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News, Output
+from hearthlog.recorder.memory import give_back, keep_one_heap
 from hearthlog.schemas.times import NANOSECONDS
 
 _NEWS = 60 * NANOSECONDS  # how old an event may be that is told of after a start
@@ -40,6 +41,8 @@ class Bridge:
 
     def run(self, stop: Flag) -> None:
         """Tell what is heard until `stop` is set."""
+        keep_one_heap()
+        has_caught_up = False
         early: list[Event] = []
         try:
             followed = follow_home(
@@ -47,6 +50,9 @@ class Bridge:
             )
             for state, begun in followed:
                 if state.caught_up:
+                    if not has_caught_up:
+                        has_caught_up = True
+                        give_back()  # what it took to read the log
                     self._tell(state, [*early, *begun])
                     early = []
                 else:

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from threading import Event
 
@@ -19,8 +19,11 @@ from hearthlog.schemas.mcap.chunks import (
 )
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.storage.folder_changes import FolderChanges
 
 _POLL_SECONDS = 0.2
+_LOOK_SECONDS = 1.0  # where the file system tells of news
+_MOST_MISSED = 3  # news of which it did not
 _SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change
 
 
@@ -125,7 +128,9 @@ def follow_messages(  # noqa: PLR0913
     finished = [path for path in present if start is not None and not is_active(path)]
     yield from _read_finished(finished, topics, start, damaged)
     growing = [g for path in present if is_active(path) for g in _open(path)]
-    try:
+    with ExitStack() as opened:
+        opened.callback(lambda: [log.file.close() for log in growing])
+        news = opened.enter_context(closing(_News(folder)))
         if start is None:
             _forget(growing)
         if infos:
@@ -138,13 +143,10 @@ def follow_messages(  # noqa: PLR0913
                     yield log.file.path, messages
             growing = [log for log in growing if log.is_open()]
             growing += [log for path in watch.new_logs() for log in _open(path)]
-            if not has_news:
+            news.expect(growing, has_news=has_news)
+            while not has_news and not news.may_be_there(stop):
                 if ticks:
                     yield folder, []
-                stop.wait(_POLL_SECONDS)
-    finally:
-        for log in growing:
-            log.file.close()
 
 
 def _forget(growing: "Iterable[_Growing]") -> None:
@@ -162,6 +164,40 @@ def _read_finished(
                 yield path, messages
         except LogError as error:
             damaged(error)
+
+
+class _News:
+    """Tells when to look for news: when the file system says so, and once a second.
+
+    Where news come without a word of it, as on a file system of the network, five times a second.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._changes = FolderChanges()
+        self._was_told = True
+        self._missed = 0
+        self._due = 0.0  # by CLOCK_MONOTONIC
+
+    def expect(self, growing: "Iterable[_Growing]", *, has_news: bool) -> None:
+        """Note what is being written, and whether there was anything new."""
+        if has_news and not self._was_told and not self._changes.wait(0, Event()):
+            self._missed += 1
+        places = {self._folder}
+        for log in growing:
+            places.update(log.file.path.parents)
+        self._changes.watch(p for p in places if p.is_relative_to(self._folder))
+        self._due = time.monotonic() + _LOOK_SECONDS
+
+    def may_be_there(self, stop: Event) -> bool:
+        """Wait for a fifth of a second at most; tell whether to look for news then."""
+        self._was_told = self._changes.wait(_POLL_SECONDS, stop)
+        tells = self._changes.tells and self._missed < _MOST_MISSED
+        return self._was_told or not tells or time.monotonic() >= self._due or stop.is_set()
+
+    def close(self) -> None:
+        """Be told no more."""
+        self._changes.close()
 
 
 class _Growing:

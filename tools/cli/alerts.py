@@ -38,7 +38,7 @@ def replay(
     logs: Logs,
     *,
     config: Annotated[
-        Path, typer.Option(help="Configuration, a TOML file with tables `[[bridge.alert]]`.")
+        Path, typer.Option(help="Configuration, a TOML file with tables `bridge.alert`.")
     ],
     start: Start = None,
     end: End = None,

@@ -119,6 +119,7 @@ class Gathered:
         """
         covered = self._coverage.setdefault(microphone, _GrowingSpans())
         covered.add(start, end, FRAME_NANOSECONDS)
+        self._written.add(start, end, _PAUSE)  # a long one has a message at its end alone
         name = class_name(label)
         if name == SILENCE:
             return

@@ -7,7 +7,7 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.words import class_words, length, room, sureness, when
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.messages.labels import is_sound
 from hearthlog.schemas.times import NANOSECONDS
 
 _SHOWN = 20
@@ -44,7 +44,7 @@ def last_events(news: News, said_of: Callable[[Event], str]) -> LastEvents:
             _described(event, news, said_of(event), is_alone=len(microphones) == 1)
             for event in found
         ],
-        "classes": [(label, class_words(label)) for label in names if label != SILENCE],
+        "classes": [(label, class_words(label)) for label in names if is_sound(label)],
     }
     return LastEvents({event.id: event for event in found}, shown)
 

@@ -10,7 +10,8 @@ from hearthlog.analyzer.bridge.home_state import MicrophoneState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.words import class_words, room, told, when
 from hearthlog.models.classes import SILENCE, in_words
-from hearthlog.schemas.messages.labels import spelt
+from hearthlog.schemas.messages.labels import is_sound
+from hearthlog.schemas.text import listed
 from hearthlog.schemas.times import NANOSECONDS
 
 _QUIETEST = -80.0  # dBFS, the left end of the bar
@@ -45,13 +46,13 @@ class NowHeard:
         if last is None or last.words != words:
             since = _known_since(microphone) or (news.today.now if last is not None else 0)
             last = self._last[microphone.name] = _Heard(words, since)
-        since = f"since {when(last.since, news.today.now, news.zone)}" if last.since else ""
+        shown = f"since {when(last.since, news.today.now, news.zone)}" if last.since else ""
         health = news.state.health.get(microphone.name)
         is_listening = microphone.is_listening()
         return {
             "room": "" if is_alone else room(microphone.name),
             "words": words,
-            "since": since,
+            "since": shown,
             "why": told(health.text) if health is not None and not is_listening else "",
             "level": _level(microphone) if is_listening else None,
         }
@@ -62,16 +63,7 @@ def _sentence(microphone: MicrophoneState) -> str:
         return _NOT_LISTENING
     names = [class_words(label) for label in _heard_classes(microphone)]
     if names:
-        first, *others = names
-        return " and ".join(
-            filter(
-                None,
-                [
-                    ", ".join([first, *map(str.lower, others[:-1])]),
-                    others[-1].lower() if others else "",
-                ],
-            )
-        )
+        return listed([names[0], *map(str.lower, names[1:])], "and")
     return "A sound" if microphone.heard.is_heard(ANY_SOUND) else in_words(SILENCE)
 
 
@@ -79,7 +71,7 @@ def _heard_classes(microphone: MicrophoneState) -> list[str]:
     return [
         label
         for label in microphone.classes
-        if spelt(label) != SILENCE and microphone.heard.is_heard(label)
+        if is_sound(label) and microphone.heard.is_heard(label)
     ]
 
 
@@ -89,12 +81,10 @@ def _known_since(microphone: MicrophoneState) -> int:
         return microphone.heard.time
     heard = _heard_classes(microphone)
     if heard:
-        going = [
-            e.start
-            for e in _last_events(microphone)
-            if e.label in heard and microphone.heard.time - e.end <= _GOES_ON
-        ]
-        return min(going, default=0)
+        last = [microphone.last_event(label) for label in heard]
+        end = microphone.heard.time - _GOES_ON
+        going = [event.start for event in last if event is not None and event.end >= end]
+        return max(going) if len(going) == len(heard) else 0
     return max((event.end for event in _last_events(microphone)), default=0)
 
 
@@ -110,4 +100,6 @@ def _level(microphone: MicrophoneState) -> Any:
     level = microphone.level_dbfs
     if not math.isfinite(level):
         return None
-    return min(max(round(1 - level / _QUIETEST, 2), 0.0), 1.0), f"{level:.0f} dB".replace("-", "\N{MINUS SIGN}")
+    return min(max(round(1 - level / _QUIETEST, 2), 0.0), 1.0), f"{level:.0f} dB".replace(
+        "-", "\N{MINUS SIGN}"
+    )

@@ -135,7 +135,9 @@ function beginRoom({ room, lanes }, isAlone) {
     make("tbody", {}, ...begun.map(({ row }) => row)));
   const block = make("div", { class: "lanes" }, ...begun.flatMap(({ name, svg }) => [name, svg]), hours);
   const heading = isAlone ? [] : [make("h3", {}, room)];
-  return { elements: [...heading, block, table], lanes: begun, hours };
+  const unheard = make("p", { class: "note" }, "Nothing was heard here today.");
+  const content = lanes.length ? [block, table] : [unheard];
+  return { elements: [...heading, ...content], lanes: begun, hours };
 }
 
 let lastDay = null, rooms = [], roomsOf = "";

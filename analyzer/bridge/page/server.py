@@ -1,6 +1,7 @@
 """The server of the page: a few readers at a time, who know the token."""
 
 import json
+import select
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -14,13 +15,13 @@ from typing import Any, BinaryIO, cast
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.page.admission import PageAdmission
-from hearthlog.analyzer.bridge.page.board import Board
+from hearthlog.analyzer.bridge.page.board import Board, Part
 from hearthlog.schemas.errors import HearthlogError
 
 _MOST_CONNECTIONS, _MOST_STREAMS = 32, 16
 _SECONDS = 10.0  # for a request, and for each part of an answer
 _MARK_SECONDS = 120.0  # for the logs of the event to be read, from a slow disk
-_BEAT_SECONDS = 5.0
+_BEAT_SECONDS, _LOOK_SECONDS = 5.0, 1.0
 _HEAD_LIMIT, _BODY_LIMIT = 16 << 10, 4 << 10  # bytes
 _FILES = {
     "/": ("page.html", "text/html; charset=utf-8"),
@@ -107,7 +108,7 @@ class PageServer(ThreadingHTTPServer):
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
-        self.server_name, self.server_port = self.server_address[0], self.server_address[1]
+        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer in a thread, if there are not too many."""
@@ -206,7 +207,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
             return
         asked = self._body()
-        if asked is None:
+        if isinstance(asked, HTTPStatus):
+            self.send_error(asked)
             return
         self._server.give_time(self.connection, _MARK_SECONDS)
         try:
@@ -223,22 +225,22 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.FORBIDDEN, _REFUSED.encode(), _TEXT)
         return False
 
-    def _body(self) -> tuple[str, str] | None:
-        """Read an event and a class; None if an error was sent instead."""
+    def _body(self) -> tuple[str, str] | HTTPStatus:
+        """Read an event and a class, or return what is wrong."""
         length = self.headers.get("Content-Length", "")
         if self.headers.get_content_type() != _JSON:
-            return self.send_error(HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
+            return HTTPStatus.UNSUPPORTED_MEDIA_TYPE
         if not (length.isascii() and length.isdecimal()):
-            return self.send_error(HTTPStatus.LENGTH_REQUIRED)
+            return HTTPStatus.LENGTH_REQUIRED
         if len(length) > 9 or int(length) > _BODY_LIMIT:
-            return self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE
         try:
             asked = json.loads(self.rfile.read(int(length)))
             event, label = asked["event"], asked["label"]
         except (ValueError, KeyError, TypeError, RecursionError):
-            return self.send_error(HTTPStatus.BAD_REQUEST)
+            return HTTPStatus.BAD_REQUEST
         if not (isinstance(event, str) and isinstance(label, str)):
-            return self.send_error(HTTPStatus.BAD_REQUEST)
+            return HTTPStatus.BAD_REQUEST
         return event, label
 
     def _stream(self) -> None:
@@ -250,19 +252,24 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self._send_head(HTTPStatus.OK, {"Content-Type": "text/event-stream"})
             known: dict[str, int] = {}
+            sent = 0.0
             while not server.board.is_closed:
-                parts = server.board.wait(known, _BEAT_SECONDS)
+                parts = server.board.wait(known, _LOOK_SECONDS)
+                if not parts and monotonic() - sent < _BEAT_SECONDS:
+                    if self._is_gone():
+                        return
+                    continue
                 known |= {name: part.number for name, part in parts.items()}
-                # Without a beat the page says that what it shows may be old.
-                beat = b"event: beat\ndata:\n\n" if server.board.is_fresh() else b":\n\n"
-                news = b"".join(
-                    b"event: %s\ndata: %s\n\n" % (name.encode(), part.content)
-                    for name, part in parts.items()
-                )
+                sent = monotonic()
                 server.give_time(self.connection, _SECONDS + _BEAT_SECONDS)
-                self.wfile.write(news + beat)
+                self.wfile.write(_as_events(parts, is_fresh=server.board.is_fresh()))
         finally:
             server.streams.release()
+
+    def _is_gone(self) -> bool:
+        """Tell whether the browser has closed the connection."""
+        readable, _, _ = select.select([self.connection], [], [], 0)
+        return bool(readable) and not self.connection.recv(1, socket.MSG_PEEK)
 
     def _send(
         self, code: int, content: bytes, kind: str, more: Mapping[str, str] | None = None
@@ -276,6 +283,12 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in {**fields, **_PROTECTION}.items():
             self.send_header(name, value)
         self.end_headers()
+
+
+def _as_events(parts: Mapping[str, Part], *, is_fresh: bool) -> bytes:
+    """Write parts as server-sent events, and a beat: without it what the page shows may be old."""
+    news = [b"event: %s\ndata: %s\n\n" % (n.encode(), part.content) for n, part in parts.items()]
+    return b"".join([*news, b"event: beat\ndata:\n\n" if is_fresh else b":\n\n"])
 
 
 class _Limited:
