@@ -4,7 +4,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import datetime
 
@@ -27,7 +27,7 @@ class ServiceManager:
     """
 
     def __init__(self, microphones: Iterable[str]) -> None:
-        self._address = _address()
+        self._is_there = _address() is not None
         self._feed_seconds = _watchdog_seconds() / 4 or math.inf
         self._health = dict.fromkeys(microphones, "starting")
         self._heard: dict[str, float] = {}  # when, by CLOCK_MONOTONIC
@@ -45,7 +45,7 @@ class ServiceManager:
             Name of the one whose event it is.
         event : Event
         """
-        if self._address is None:
+        if not self._is_there:
             return
         now = time.monotonic()
         if isinstance(event, Frames):
@@ -65,7 +65,7 @@ class ServiceManager:
         if status != self._status:
             self._status = status
             lines.append(f"STATUS={status}")
-        self._tell(lines)
+        notify(lines)
 
     def stop(self, *, restarts: bool) -> None:
         """Tell that the recorder completes its log and ends.
@@ -77,7 +77,7 @@ class ServiceManager:
         """
         now = time.monotonic_ns() // 1000
         state = [f"RELOADING=1\nMONOTONIC_USEC={now}"] if restarts else ["STOPPING=1"]
-        self._tell([*state, "STATUS=completing the log"])
+        notify([*state, "STATUS=completing the log"])
 
     def _describe(self, microphone: str, health: SourceHealth, now: float) -> str:
         summary = " ".join(health.summary.split())
@@ -87,15 +87,24 @@ class ServiceManager:
         last = datetime.fromtimestamp(time.time() - silent).astimezone()
         return f"{summary}; last heard {last:%Y-%m-%d %H:%M}"
 
-    def _tell(self, lines: list[str]) -> None:
-        if self._address is None or not lines:
-            return
-        with (
-            suppress(OSError),  # it is asked again, by what comes next
-            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as connection,
-        ):
-            connection.settimeout(_SEND_SECONDS)
-            connection.sendto("\n".join(lines).encode(), self._address)
+
+def notify(lines: Sequence[str]) -> None:
+    """Tell systemd something, if it has started this process.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Such as `READY=1`, as of `sd_notify(3)`.
+    """
+    address = _address()
+    if address is None or not lines:
+        return
+    with (
+        suppress(OSError),  # it is asked again, by what comes next
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as connection,
+    ):
+        connection.settimeout(_SEND_SECONDS)
+        connection.sendto("\n".join(lines).encode(), address)
 
 
 def _address() -> str | None:

@@ -96,7 +96,7 @@ class HomeAssistant:
     """A Home Assistant on loopback, with an owner, and the blueprints of the examples."""
 
     def __init__(self, hass, folder):
-        self.folder, self._hass = folder, hass
+        self.folder, self._hass, self.version = folder, hass, hass.parents[1].name
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._me = self.url + "/"
@@ -109,7 +109,6 @@ class HomeAssistant:
         (folder / "configuration.yaml").write_text(_CONFIGURATION.format(port=self.port))
         (folder / "automations.yaml").write_text("[]\n")
         self._fix_address()
-        self.start()
 
     def _fix_address(self):
         """Say the address where 2026.11 looks for it: that of YAML it only tries.

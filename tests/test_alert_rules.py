@@ -388,6 +388,15 @@ def test_any_division_of_the_time_gives_the_same_rings(life):
         assert (found, state) == at_once
 
 
+def test_a_sound_that_pauses_where_one_evaluation_ends_rings_once():
+    heard = home((0, 100, "music"), (105, 100, "music"))
+    one = rule("longer_than", longer_than="1m", cooldown="1m")
+    edges = [NOON + second * SECOND for second in (0, 102, 300)]
+    first, state = rings(one, heard.between(0, edges[1], 0), edges[0], edges[1], UTC)
+    assert len(first) == 1
+    assert rings(one, heard, edges[1], edges[2], UTC, state)[0] == []
+
+
 @pytest.mark.parametrize(
     ("text", "seconds"), [("90s", 90), ("20m", 1200), ("1h30m", 5400), ("7d", 604_800)]
 )

@@ -100,6 +100,16 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     assert outbox.waiting_for("x", 1 << 62) == sorted(found, key=lambda ring: ring.time)
 
 
+def test_no_more_is_known_than_labels_have_decided():
+    live, begin = LiveHome(0, 30 * SECOND), 1000
+    assert live.known_until(2000 * SECOND) == 1970 * SECOND  # nobody is heard
+    for second in range(begin, begin + 100):
+        live.add_label("mic", Label(second * SECOND, "silence", 0.9), CLASSES)
+    now = (begin + 100) * SECOND
+    assert live.known_until(now) == (begin + 94) * SECOND
+    assert live.known_until(now + 100 * SECOND) == now + 70 * SECOND  # it is away
+
+
 def test_what_was_heard_before_a_recorder_was_killed_stays_heard(tmp_path):
     """Its last segment was never written; the next recorder writes the gap that follows."""
     write_day(tmp_path, DAY, hours=range(3), gaps=[(2 * HOUR, 600, "the recorder was not running")])
@@ -210,7 +220,7 @@ class Recorder(Thread):
             }
             self.writer.write_columns([TopicBatch("/mic/label", times, fields)])
             self.writer.flush()
-            self.stop.wait(0.1)
+            self.stop.wait(0.5)  # as a recorder does
         self.writer.finish()
 
 

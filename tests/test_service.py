@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from logs import features, read
-from systemd import PROGRAM, booted
+from systemd import PREFIX, PROGRAM, booted
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.tools.service.needs import STATE, Needs
-from hearthlog.tools.service.unit import system_unit, user_unit
+from hearthlog.tools.service.unit import bridge_unit, system_unit, user_unit
 
 UNIT = "/etc/systemd/system/hearthlog.service"
 USER_ID = "4321"
@@ -20,14 +20,14 @@ LOGS = STATE / "logs"
 RECORD = ["/opt/hearthlog/bin/hearthlog", "record", "--config", "/etc/my 100% home.toml"]
 
 
-def analyzed(verb, unit, folder, *options):
+def analyzed(verb, unit, folder, *options, name="hearthlog.service"):
     """What systemd-analyze says of a unit."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("what a sandbox is worth is known to the Debian package systemd")
     # Programs and users that are on this machine; systemd-analyze looks for them.
     text = unit.replace(RECORD[0], "/bin/true").replace("User=hearthlog", "User=daemon")
-    (folder / "hearthlog.service").write_text(text)
-    command = ["systemd-analyze", verb, *options, str(folder / "hearthlog.service")]
+    (folder / name).write_text(text)
+    command = ["systemd-analyze", verb, *options, str(folder / name)]
     env = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
     return subprocess.run(command, capture_output=True, text=True, env=env, check=False)
 
@@ -52,6 +52,17 @@ def test_the_service_of_the_machine_may_do_little(tmp_path, has_network, most):
     denied = {each["name"] for each in json.loads(result.stdout) if each["set"]}
     assert ("PrivateNetwork=" in denied) is not has_network
     assert "MemoryDenyWriteExecute=" not in denied  # PortAudio cannot do without
+
+
+@pytest.mark.parametrize("account", [None, "hearthlog"])
+def test_the_service_of_the_bridge_may_do_little_but_use_the_network(tmp_path, account):
+    unit = bridge_unit(RECORD, account, "hearthlog", Path("/srv/a home"), [Path("/srv/figures")])
+    name = "hearthlog-bridge.service"
+    result = analyzed("verify", unit, tmp_path, name=name)
+    assert (result.returncode, result.stderr) == (0, "")
+    options = ("--offline=yes", "--threshold=15")
+    result = analyzed("security", unit, tmp_path, *options, name=name)
+    assert result.returncode == 0, result.stdout
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +217,51 @@ def test_a_service_may_use_the_network_if_a_microphone_is_there(service):
     )
     wait_for_labels(service)
     service.run("systemctl", "stop", "camera")
+
+
+def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service):
+    told = 'readable_by = "group"\n[bridge.prometheus]\nport = 9177\n'
+    service.write("/etc/home.toml", told)
+    install(service, "--config", "/etc/home.toml")
+    wait_for_labels(service)
+    # Where Python was built with its library in a home, the service would find that of the system.
+    library = "[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n"
+    service.write("/etc/systemd/system/hearthlog-bridge.service.d/python.conf", library)
+    result = install(service, "--bridge", "--config", "/etc/home.toml")
+    assert result.stdout == "/etc/systemd/system/hearthlog-bridge.service\n"
+    asked = (
+        "from urllib.request import urlopen as u; print(u('http://127.0.0.1:9177/metrics').read())"
+    )
+    python = f"{PREFIX}/bin/python"
+    service.wait(
+        lambda: (
+            'listening{microphone="mic",node="home"} 1.0'
+            in service.run(python, "-c", asked, check=False).stdout
+        )
+    )
+    process = service.shows("MainPID", unit="hearthlog-bridge")
+    who = service.run("stat", "-c", "%U", f"/proc/{process}").stdout.strip()
+    assert who not in {"root", "hearthlog"}
+    enter = ["nsenter", "-t", process, "-m"]  # as root, in what the service sees
+    service.run(*enter, "ls", LOGS)
+    assert "Read-only" in service.run(*enter, "touch", f"{LOGS}/x", check=False).stderr
+    service.run("systemctl", "disable", "--now", "hearthlog-bridge")
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ("[bridge.ping]\nurl = 'http://x'\n", "who may not read the logs; say there readable_by"),
+        ("", "tells nobody anything; it has no table such as [bridge.mqtt]"),
+        ("[bridge.mqtt]\n", "bridge.mqtt.host: Field required"),
+    ],
+)
+def test_a_bridge_that_would_not_run_is_refused_with_one_line(service, told, said):
+    service.write("/etc/home.toml", told)
+    result = install(service, "--bridge", "--config", "/etc/home.toml", check=False)
+    assert result.returncode
+    assert said in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_a_service_that_does_not_start_is_an_error_that_says_where_to_look(service):

@@ -12,9 +12,11 @@ from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News, Output
 from hearthlog.recorder.memory import give_back, keep_one_heap
+from hearthlog.recorder.service_manager import notify
 from hearthlog.schemas.times import NANOSECONDS
 
 _NEWS = 60 * NANOSECONDS  # how old an event may be that is told of after a start
+_WATCHDOG_SECONDS = 10.0
 _MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of
 _FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
 
@@ -38,10 +40,12 @@ class Bridge:
     since: int
     outputs: dict[str, Output]
     say: Callable[[str], None]
+    _watchdog_due: float = 0.0
 
     def run(self, stop: Flag) -> None:
         """Tell what is heard until `stop` is set."""
         keep_one_heap()
+        notify(["READY=1"])
         has_caught_up = False
         early: list[Event] = []
         try:
@@ -49,6 +53,7 @@ class Bridge:
                 self.home.folder, self.home.node, self.since, stop, self._damaged
             )
             for state, begun in followed:
+                self._live()
                 if state.caught_up:
                     if not has_caught_up:
                         has_caught_up = True
@@ -58,8 +63,15 @@ class Bridge:
                 else:
                     early = [*early, *begun][-_MOST_EARLY:]
         finally:
+            notify(["STOPPING=1"])
             for output in self.outputs.values():
                 output.close()
+
+    def _live(self) -> None:
+        """Tell systemd that the log is followed."""
+        if time.monotonic() >= self._watchdog_due:
+            self._watchdog_due = time.monotonic() + _WATCHDOG_SECONDS
+            notify(["WATCHDOG=1"])
 
     def _tell(self, state: HomeState, begun: Sequence[Event]) -> None:
         now = time.time_ns()

@@ -89,6 +89,11 @@ class BridgeSettings(_Table):
     alert: AlertRules = Field(default=[], description="One table for each rule.")
     delivery: DeliverySettings = DeliverySettings()
 
+    def has_outputs(self) -> bool:
+        """Tell whether anybody is told anything."""
+        outputs = self.mqtt, self.prometheus, self.page, self.ping
+        return any(output is not None for output in outputs) or bool(self.alert)
+
 
 def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
     """Load the configuration of a recorder, and of the bridge that follows its log.

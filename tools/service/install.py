@@ -3,39 +3,32 @@
 import json
 import os
 import pwd
-import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import hearthlog.recorder
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.modules import module_command
 from hearthlog.tools.service.errors import ServiceError
 from hearthlog.tools.service.needs import STATE, Needs
-from hearthlog.tools.service.unit import NAME, is_ours, system_unit, user_unit
+from hearthlog.tools.service.unit import NAME, system_unit, user_unit
+from hearthlog.tools.service.units import (
+    SYSTEM_UNITS,
+    Installed,
+    check_program_seen,
+    check_root,
+    check_seen,
+    is_systemd_running,
+    is_user_manager_running,
+    place_of,
+    start_unit,
+    user_units,
+    verb_command,
+    write_unit,
+)
 
-_UNSEEN = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108
-_SYSTEMD = Path("/run/systemd/system")  # is there as long as it runs
 _REHEARSAL_SECONDS = 120
-
-
-@dataclass(frozen=True)
-class Installed:
-    """A service that was installed.
-
-    Attributes
-    ----------
-    unit : Path
-        Its unit.
-    started : bool
-        Whether it runs, or will only when systemd does.
-    """
-
-    unit: Path
-    started: bool
 
 
 def install_for_system(account: str, config: Path | None) -> Installed:
@@ -55,23 +48,18 @@ def install_for_system(account: str, config: Path | None) -> Installed:
     ServiceError
         If it cannot be for another reason. Nothing was written then, unless it did not start.
     """
-    if os.geteuid():
-        raise ServiceError(
-            "a service of the machine is installed by root: use sudo, or --user for one of your own"
-        )
-    unit = _place_of(Path("/etc/systemd/system"))
+    check_root()
+    unit = place_of(SYSTEM_UNITS, NAME)
     person = _person(account)
     config = None if config is None else config.absolute()
-    _check_seen("hearthlog", Path(hearthlog.recorder.__file__).resolve())
-    _check_seen("its Python", Path(sys.executable).absolute())
-    _check_seen("the Python of its environment", Path(sys.executable).resolve())
-    _check_seen("the configuration", config)
+    check_program_seen()
+    check_seen("the configuration", config)
     needs = _rehearse(STATE, config, person)
-    _check_seen("the folder of logs", Path(needs.output))
+    check_seen("the folder of logs", Path(needs.output))
     for model in needs.models:
-        _check_seen("a model", Path(model))
-    _write(unit, system_unit(_command(config), account, needs))
-    return Installed(unit, _start(is_running=_SYSTEMD.is_dir()))
+        check_seen("a model", Path(model))
+    write_unit(unit, system_unit(verb_command("record", config), account, needs))
+    return Installed(unit, start_unit(NAME, is_running=is_systemd_running()))
 
 
 def install_for_user(config: Path | None) -> Installed:
@@ -87,26 +75,11 @@ def install_for_user(config: Path | None) -> Installed:
     ConfigurationError, ServiceError
         As `install_for_system`.
     """
-    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    unit = _place_of(home / "systemd" / "user")
+    unit = place_of(user_units(), NAME)
     config = None if config is None else config.absolute()
     needs = _rehearse(Path.cwd(), config, None)
-    _write(unit, user_unit(_command(config), Path.cwd(), needs))
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    is_running = bool(runtime) and Path(runtime, "systemd").is_dir()
-    return Installed(unit, _start("--user", is_running=is_running))
-
-
-def _place_of(folder: Path) -> Path:
-    """Return where the unit is to be, if it may be there."""
-    if shutil.which("systemctl") is None:
-        raise ServiceError(
-            "systemd is not here; start `hearthlog record` by the supervisor that this machine has"
-        )
-    unit = folder / NAME
-    if os.path.lexists(unit) and (unit.is_symlink() or not is_ours(unit.read_text("utf-8"))):
-        raise ServiceError(f"{unit}: was not written by hearthlog; move it away")
-    return unit
+    write_unit(unit, user_unit(verb_command("record", config), Path.cwd(), needs))
+    return Installed(unit, start_unit(NAME, "--user", is_running=is_user_manager_running()))
 
 
 def _person(account: str) -> pwd.struct_passwd:
@@ -156,54 +129,3 @@ def _cannot_run(person: pwd.struct_passwd | None, reason: str) -> str:
         f"{sys.prefix}: {name} cannot run hearthlog from there ({reason}); "
         "install it where everyone may read, as `sudo python3 -m venv /opt/hearthlog` does"
     )
-
-
-def _check_seen(what: str, path: Path | None) -> None:
-    if path is not None and any(path.is_relative_to(folder) for folder in _UNSEEN):
-        raise ServiceError(
-            f"{path}: {what} is in a folder that the service does not see, as no home and no /tmp; "
-            "move it, to /opt, /etc or /srv, or install a service of your own with --user"
-        )
-
-
-def _command(config: Path | None) -> list[str]:
-    program = Path(sys.executable).with_name("hearthlog")
-    command = [str(program)] if program.exists() else module_command("hearthlog.tools.cli.main")
-    return [*command, "record", *([] if config is None else ["--config", str(config)])]
-
-
-def _write(unit: Path, text: str) -> None:
-    unit.parent.mkdir(parents=True, exist_ok=True)
-    fresh = unit.with_name(f".{unit.name}.new")
-    fresh.write_text(text, "utf-8")
-    fresh.chmod(0o644)
-    fresh.replace(unit)
-
-
-def _start(*options: str, is_running: bool) -> bool:
-    """Enable the service, and start it anew if systemd runs; return whether it does."""
-    if not is_running:
-        _systemctl(*options, "enable", NAME, env={"SYSTEMD_OFFLINE": "1"})
-        return False
-    _systemctl(*options, "daemon-reload")
-    _systemctl(*options, "enable", NAME)
-    try:
-        _systemctl(*options, "restart", NAME)
-    except ServiceError as error:
-        raise ServiceError(
-            f"{NAME} did not start; `journalctl {' '.join([*options, '-u'])} {NAME}` says why"
-        ) from error
-    return True
-
-
-def _systemctl(*arguments: str, env: dict[str, str] | None = None) -> None:
-    result = subprocess.run(  # noqa: S603
-        ["systemctl", *arguments],  # noqa: S607  of the system
-        env=os.environ | (env or {}),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if result.returncode:
-        said = " ".join(result.stderr.split()) or f"status {result.returncode}"
-        raise ServiceError(f"systemctl {' '.join(arguments)}: {said}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from hearthlog.tools.service.errors import ServiceError
 from hearthlog.tools.service.needs import STATE, Needs
 
-NAME = "hearthlog.service"
+NAME, BRIDGE_NAME = "hearthlog.service", "hearthlog-bridge.service"
 _STATE_MODES = {"owner": "0700", "group": "0750", "all": "0755"}
 _NO_NETWORK = "RestrictAddressFamilies=AF_UNIX"
 _NETWORK = "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6"
@@ -68,6 +68,40 @@ def user_unit(command: Sequence[str], folder: Path, needs: Needs) -> str:
         command=_command(command),
         folder=_printable(folder).replace("%", "%%"),
         network=_NETWORK if needs.has_network else _NO_NETWORK,
+    )
+
+
+def bridge_unit(
+    command: Sequence[str], account: str | None, recorder: str, logs: Path, written: Sequence[Path]
+) -> str:
+    """Return the unit of the bridge as a service of the machine.
+
+    Parameters
+    ----------
+    command : sequence of str
+        That follows the log.
+    account : str or None
+        The user that it is run by; None for one that systemd makes for it.
+    recorder : str
+        The user of the recorder, whose group may read the logs.
+    logs : Path
+    written : sequence of Path
+        Other folders that it writes to.
+
+    Raises
+    ------
+    ServiceError
+        If a name cannot stand in a unit.
+    """
+    own = f"DynamicUser=yes\nSupplementaryGroups={recorder}"
+    access = [f"{'ReadOnlyPaths' if account is None else 'ReadWritePaths'}={_word(logs)}"]
+    access += [f"ReadWritePaths={_word(folder)}" for folder in written]
+    return _filled(
+        "bridge.service",
+        command=_command(command),
+        who=own if account is None else f"User={account}",
+        folder=STATE,
+        access="\n".join(access),
     )
 
 

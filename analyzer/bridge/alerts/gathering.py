@@ -182,11 +182,11 @@ class Gathered:
         """
         sounds = {label: rows.sounds() for label, rows in self._rows.items()}
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
+        written = self._written.spans(_PAUSE)
         for microphone, start, end, label, confidence in others:
+            written = _with(written, start, end, _PAUSE)
             spans = coverage.get(microphone, NONE)
-            coverage[microphone] = joined(
-                np.append(spans.starts, start), np.append(spans.ends, end), FRAME_NANOSECONDS
-            )
+            coverage[microphone] = _with(spans, start, end, FRAME_NANOSECONDS)
             name = class_name(label)
             if name != SILENCE:
                 more = Sounds(
@@ -197,7 +197,7 @@ class Gathered:
                 )
                 sounds[name] = sounds_of([sounds.get(name, NO_SOUNDS), more])
         classes = {name: frozenset(own) for name, own in self.classes.items()}
-        return HomeHeard(sounds, coverage, classes, self._written.spans(_PAUSE))
+        return HomeHeard(sounds, coverage, classes, written)
 
     def forget_before(self, time: int, pause: int) -> None:
         """Forget the events that were over before a time.
@@ -214,3 +214,7 @@ class Gathered:
                 rows.keep(rows.sounds().between(time, 1 << 62, pause))
         for own in (*self._coverage.values(), self._written):
             own.forget_before(time)
+
+
+def _with(spans: Spans, start: int, end: int, pause: int) -> Spans:
+    return joined(np.append(spans.starts, start), np.append(spans.ends, end), pause)
