@@ -47,7 +47,7 @@ class Ending(NamedTuple):
         ]
 
 
-def kill_at_random(
+def kill_at_random(  # noqa: PLR0913, PLR0917
     folder: Path, sounds: list[Path], model: str, seconds: float, kills: int, chance: random.Random
 ) -> Ending:
     """Let all three run, kill each so many times, and wait until what is left is told."""

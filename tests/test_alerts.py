@@ -5,6 +5,7 @@ import shutil
 import time
 from contextlib import contextmanager
 from datetime import UTC, date
+from itertools import chain, repeat
 from threading import Event, Thread
 from zoneinfo import ZoneInfo
 
@@ -151,6 +152,29 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
         assert start(now).evaluate(lambda: heard, pytest.fail, now + SECOND, now + SECOND) == []
 
 
+def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
+    for number in range(1, 11):
+        events = [(9 * HOUR, 3000.0 if number == 10 else 300.0, "speech", 0.9)]
+        write_day(tmp_path / "logs", DAY.replace(day=number), events, classes=CLASSES, file_hours=6)
+    one = rule("unlike_usual", of="minutes", **{"class": "speech"})
+    outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
+    memory = Memory(tmp_path / "rules.json", pytest.fail)
+    now = midnight(DAY.replace(day=10)) + 12 * HOUR * SECOND
+    watch = RuleWatch([one], UTC, outbox, memory, pytest.fail, now)
+    asked = []
+
+    def weeks(start, end):
+        asked.append(end)
+        return read_heard(find_home_logs([tmp_path / "logs"]), "home", start, end, pytest.fail)
+
+    found = []
+    for _ in range(30):
+        now += HOUR * SECOND
+        found += watch.evaluate(pytest.fail, weeks, now, now)
+    assert len(asked) == 1
+    assert [ring.text for ring in found] == ["Talking on 2026-03-10: 50 min, usually 5 min"]
+
+
 def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
     said = []
     path = tmp_path / "rules.json"
@@ -230,8 +254,11 @@ def bridge(root, rules, told, said):
     home, stop = Home(root / "logs", "home", ZoneInfo("Europe/Vienna")), Event()
 
     def tell(*ring):
-        told.append(ring)
+        is_taken = next(connected)
+        told.extend([ring] * is_taken)
+        return is_taken
 
+    connected = chain([False, False], repeat(True))  # the broker comes after the first ring
     own = AlertsOutput(rules, DeliverySettings(), home, root / "state", said.append, tell)
     running = Bridge(home, time.time_ns() - HOUR * SECOND, {"alerts": own}, said.append)
     thread = Thread(target=running.run, args=(stop,), daemon=True)

@@ -3,6 +3,7 @@
 import shutil
 import signal
 import subprocess
+from itertools import count
 from threading import Event, Thread
 from time import monotonic, sleep
 
@@ -296,3 +297,24 @@ def test_a_file_system_that_tells_of_no_change_is_looked_at_again_and_again(tmp_
                 expected = list(range(80 * number + 20 * block + 20))
                 assert followed.wait_for(expected) == expected
             writer.finish()
+
+
+def test_a_tick_comes_while_a_file_is_written_again_and_again(tmp_path):
+    writer, stop = log(tmp_path, "home_0.mcap"), Event()
+
+    def write_on():
+        for first in count(0, 20):
+            if stop.wait(0.02):
+                return
+            write(writer, first)
+
+    thread = Thread(target=write_on)
+    thread.start()
+    ticks = 0
+    for path, _ in follow_messages(tmp_path, start=0, stop=stop, ticks=True):
+        ticks += path == tmp_path
+        if ticks == 5:
+            stop.set()
+    thread.join()
+    writer.abandon()
+    assert ticks == 5

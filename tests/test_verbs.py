@@ -55,6 +55,7 @@ READING = (
     "pause logs --for 1h",
     "resume logs",
     "config schema",
+    "alerts replay logs --config rules.toml",
 )
 DRAWING = (
     "review logs --save day.rrd",
@@ -67,6 +68,16 @@ LISTENING = (
 )
 RECORDING = "record --device labmic --output heard"
 WATCHING = "watch logs --serve"
+BRIDGING = "bridge unrecorded --config home.toml"
+TOLD = '[bridge.ping]\nurl = "http://127.0.0.1:9"\n'
+RULES = """
+[[bridge.alert]]
+name = "much water"
+rule = "more_than"
+class = "tap_water"
+count = 1
+window = "1h"
+"""
 INSTALLING = "install-service --user"
 LOST = 3
 needs_viewer = pytest.mark.skipif(find_spec("rerun") is None, reason="needs hearthlog[viewer]")
@@ -87,6 +98,8 @@ def folder(tmp_path_factory):
     for command in MAKING:
         result = run(folder, command)
         assert (result.returncode, sprung(folder)) == (0, []), f"{command}: {result.stderr}"
+    (folder / "home.toml").write_text(TOLD)
+    (folder / "rules.toml").write_text(RULES)
     whole = min(folder.glob("logs/**/*Z.mcap")).read_bytes()
     (folder / "cut.mcap").write_bytes(whole[: len(whole) // 2])
     return folder
@@ -123,7 +136,7 @@ def sprung(folder):
 
 
 def test_every_verb_is_tried_here():
-    commands = (*MAKING, *READING, *DRAWING, *LISTENING, RECORDING, WATCHING, INSTALLING)
+    commands = (*MAKING, *READING, *DRAWING, *LISTENING, RECORDING, WATCHING, BRIDGING, INSTALLING)
     tried = {command.split()[0] for command in commands}
     assert tried == set(typer.main.get_command(app).commands)
 
@@ -168,6 +181,13 @@ def test_a_verb_that_draws_imports_nothing_of_the_folder(folder, command):
 def test_watching_imports_nothing_of_the_folder(folder):
     with running(folder, f"{WATCHING} --port {free_port()}") as process:
         assert "look with" in process.stderr.readline()
+    assert process.returncode == 0
+    assert sprung(folder) == []
+
+
+def test_bridging_imports_nothing_of_the_folder(folder):
+    with running(folder, BRIDGING) as process:
+        assert "waiting for a recorder" in process.stderr.readline()
     assert process.returncode == 0
     assert sprung(folder) == []
 

@@ -129,7 +129,7 @@ def follow_messages(  # noqa: PLR0913
     yield from _read_finished(finished, topics, start, damaged)
     growing = [g for path in present if is_active(path) for g in _open(path)]
     with ExitStack() as opened:
-        opened.callback(lambda: [log.file.close() for log in growing])
+        opened.callback(lambda: _close(growing))
         news = opened.enter_context(closing(_News(folder)))
         if start is None:
             _forget(growing)
@@ -144,9 +144,16 @@ def follow_messages(  # noqa: PLR0913
             growing = [log for log in growing if log.is_open()]
             growing += [log for path in watch.new_logs() for log in _open(path)]
             news.expect(growing, has_news=has_news)
-            while not has_news and not news.may_be_there(stop):
+            is_due = has_news
+            while not is_due:
                 if ticks:
                     yield folder, []
+                is_due = news.may_be_there(stop)
+
+
+def _close(growing: "Iterable[_Growing]") -> None:
+    for log in growing:
+        log.file.close()
 
 
 def _forget(growing: "Iterable[_Growing]") -> None:

@@ -31,7 +31,8 @@ from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.times import NANOSECONDS
 
-OnRing = Callable[[str, str, int], None]  # told the name of a rule, a text, and when it rang
+# Told the name of a rule, a text, and when it rang; returns whether somebody takes it.
+OnRing = Callable[[str, str, int], bool]
 BROKER = "mqtt"  # in the place of the name of a target
 _PATIENCE = 30 * NANOSECONDS
 _LOOK_SECONDS = 1.0
@@ -55,7 +56,7 @@ class AlertsOutput:
         Told what is wrong, in a line.
     on_ring : callable, optional
         Told the name of the rule, the text and the time (nanoseconds of UTC) of each ring, in the
-        thread of `update`.
+        thread of `update`; told again unless it returns that somebody takes it.
 
     Raises
     ------
@@ -119,8 +120,8 @@ class AlertsOutput:
         self._delivery.close()
 
     def _tell_broker(self, ring: Ring, on_ring: OnRing) -> None:
-        on_ring(ring.rule, message(ring, self._followed.zone), ring.time)
-        self._outbox.note_told(BROKER, ring)
+        if on_ring(ring.rule, message(ring, self._followed.zone), ring.time):
+            self._outbox.note_told(BROKER, ring)
 
     def _run(self) -> None:
         while not self._stop.is_set():

@@ -1,11 +1,13 @@
 """A connection to a broker that may come and go: what it has to say is said again, or in time."""
 
+import os
 import ssl
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -27,7 +29,8 @@ _CLOSE_SECONDS = 2.0
 _QOS = 1
 _SHORT_SECONDS = 15.0  # so short a connection is no good one
 _TAKEN_OVER = 0x8E
-_LONGEST_PASSWORD = 4096
+_LONGEST_PASSWORD = 4096  # bytes
+_CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
 
 Say = Callable[[str], None]
 Received = Callable[[mqtt.MQTTMessage], None]
@@ -83,6 +86,10 @@ class Connection:
         self._lock = Lock()
         self._is_new = False  # a connection to which nothing was said yet
         self._client = self._make_client(settings)
+
+    def is_open(self) -> bool:
+        """Tell whether the broker is connected."""
+        return self._client.is_connected()
 
     def keep(self, topic: str, value: str) -> None:
         """Publish a value that the broker keeps, unless it is the one that was published last."""
@@ -241,8 +248,9 @@ def _port(settings: MqttSettings) -> int:
 def _password(settings: MqttSettings) -> str | None:
     if settings.password_file is None:
         return None
-    data = read_whole(settings.password_file, "password file", _LONGEST_PASSWORD, BridgeError)
+    path = Path(os.environ.get(_CREDENTIALS, "")) / settings.password_file
+    data = read_whole(path, "password file", _LONGEST_PASSWORD, BridgeError)
     try:
         return data.decode().split("\n", 1)[0].rstrip("\r")
     except UnicodeDecodeError:
-        raise BridgeError(f"{settings.password_file}: holds no text in UTF-8") from None
+        raise BridgeError(f"{path}: holds no text in UTF-8") from None

@@ -96,8 +96,8 @@ class MqttPublisher:
             self._connection.repeat()
         self._connection.flush()
 
-    def alert(self, name: str, text: str, time: int) -> None:
-        """Say that an alert rings.
+    def alert(self, name: str, text: str, time: int) -> bool:
+        """Say that an alert rings; tell whether there is a broker that takes it.
 
         Parameters
         ----------
@@ -108,9 +108,12 @@ class MqttPublisher:
         time : int
             Since when, in nanoseconds of UTC.
         """
+        if not self._connection.is_open():
+            return False
         since = iso_time(time, self._home.zone)
         fields = {"event_type": "alert", "name": name, "text": text, "time": since}
         self._connection.send(self._topics.of_home("alert"), json.dumps(fields))
+        return True
 
     def close(self) -> None:
         """Say `offline`, and end."""

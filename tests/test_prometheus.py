@@ -1,0 +1,142 @@
+"""Figures for Prometheus, on a port of loopback and in a text file."""
+
+import http.client
+import time
+from datetime import UTC
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+from livehome import LiveHome
+from prometheus_client.parser import text_string_to_metric_families
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
+from hearthlog.analyzer.bridge.run import Bridge
+from hearthlog.analyzer.bridge.settings import PrometheusSettings
+from hearthlog.analyzer.ports import free_port
+from hearthlog.schemas.times import NANOSECONDS
+
+pytestmark = pytest.mark.fast
+
+HOUR = 3600 * NANOSECONDS
+
+
+@pytest.fixture
+def home(tmp_path):
+    home = LiveHome(tmp_path / "logs")
+    yield home
+    home.close()
+
+
+class Bridged:
+    """A bridge in a thread that gives figures."""
+
+    def __init__(self, home, folder, **settings):
+        self.said = []
+        self._stop = Event()
+        since = time.time_ns() - 24 * HOUR
+        place = Home(home.folder, "home", UTC)
+        settings = PrometheusSettings(**settings)
+        output = PrometheusOutput(settings, place, folder, since, self.said.append)
+        bridge = Bridge(place, since, {"prometheus": output}, self.said.append)
+        self._thread = Thread(target=bridge.run, args=[self._stop], daemon=True)
+        self._thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
+
+
+def ask(port, path="/metrics", **fields):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.putrequest("GET", path, skip_host="Host" in fields)
+    for name, value in fields.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, text
+
+
+def figures(text):
+    """The values of a text of figures, by name and labels but the node."""
+    return {
+        (sample.name, *(v for k, v in sorted(sample.labels.items()) if k != "node")): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def wait_for(text_of):
+    until = time.monotonic() + 30
+    while time.monotonic() < until:
+        if found := figures(text_of()):
+            return found
+        time.sleep(0.05)
+    pytest.fail("no figures came")
+
+
+def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
+    home.heard("coughing", 30, seconds=2)
+    home.heard("coughing", 20, seconds=3)
+    home.hears("silence")
+    home.says("mic", 1, "the microphone clips", level_dbfs="-40.5")
+    port = free_port()
+    with Bridged(home, tmp_path, port=port):
+        found = wait_for(lambda: ask(port)[1])
+    assert found["hearthlog_events_total", "coughing", "mic"] == 2
+    assert found["hearthlog_event_seconds_total", "coughing", "mic"] == 5
+    assert found["hearthlog_listening", "mic"] == found["hearthlog_recording",] == 1
+    assert found["hearthlog_problem", "mic"] == 1
+    assert found["hearthlog_free_bytes",] > 0
+    assert abs(found["hearthlog_last_label_timestamp_seconds", "mic"] - time.time()) < 60
+
+
+@pytest.mark.parametrize(
+    ("path", "fields", "status"),
+    [
+        ("/metrics", {}, 200),
+        ("/metrics", {"Host": "localhost"}, 200),
+        ("/metrics", {"Host": "home.example"}, 403),  # a name that points to this machine
+        ("/metrics", {"Origin": "http://127.0.0.1:8000"}, 403),  # a page in a browser
+        ("/", {}, 404),
+        ("/../etc/passwd", {}, 404),
+    ],
+)
+def test_the_port_answers_who_asks_for_an_address_in_digits(home, tmp_path, path, fields, status):
+    home.hears("silence")
+    port = free_port()
+    with Bridged(home, tmp_path, port=port):
+        assert ask(port, path, **fields)[0] == status
+
+
+def test_the_port_is_of_loopback_alone(home, tmp_path):
+    port = free_port()
+    with Bridged(home, tmp_path, port=port):
+        rows = Path("/proc/net/tcp").read_text().splitlines()
+        listening = [row.split()[1] for row in rows if f":{port:04X} " in row]
+    assert f"0100007F:{port:04X}" in listening
+    assert not any(address.startswith("00000000") for address in listening)
+
+
+def test_a_port_that_is_taken_is_named(home, tmp_path):
+    port = free_port()
+    with Bridged(home, tmp_path, port=port), pytest.raises(BridgeError, match=f"port {port}"):
+        Bridged(home, tmp_path, port=port)
+
+
+def test_a_text_file_is_there_while_the_bridge_is(home, tmp_path):
+    home.heard("coughing", 30)
+    home.hears("silence")
+    path = tmp_path / "hearthlog.prom"
+    with Bridged(home, tmp_path, text_file=path):
+        found = wait_for(lambda: path.read_text() if path.exists() else "")
+        assert path.stat().st_mode & 0o777 == 0o644  # another user collects it
+    assert found["hearthlog_events_total", "coughing", "mic"] == 1
+    assert not path.exists()
