@@ -600,7 +600,7 @@ class Phone:
         )
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         self._browser.call("Emulation.setEmulatedMedia", features=features)
-        self._browser.open(served.url)
+        self._browser.call("Page.navigate", url=served.url)
         patiently(self._is_there, bool)
 
     def _is_there(self):

@@ -64,6 +64,7 @@ def home(request, tmp_path_factory):
         broker = Broker(folder)
         ends.callback(broker.kill)
         home = HomeAssistant(hass, folder / "ha")
+        home.broker = broker
         ends.callback(home.stop)
         home.household = Household(folder / "home", broker.port)
         ends.callback(home.household.close)
@@ -316,7 +317,8 @@ def test_classes_that_went_while_there_was_no_bridge_are_gone_too(home):
     home.household.tell()
     wait_for(lambda: is_well(home), 60)
     assert triggers(home) == {("heard", name) for name in words(GENERAL)}
-    wait_for(lambda: home.state(f"{SENSOR}coughing_today") not in {"0", "unknown"}, 60)
+    before = len(home.told.payloads("lab/device"))
+    home.told.wait_until(lambda: len(home.told.payloads("lab/device")) > before, 60)
 
 
 def test_what_is_gone_does_not_come_back_when_home_assistant_starts_again(home):
@@ -338,3 +340,10 @@ def test_home_assistant_has_nothing_to_complain_of(home):
     ]
     assert complaints == []
     assert home.addresses() == {"127.0.0.1"}
+
+
+def test_a_broker_that_starts_again_without_its_values_is_told_everything(home):
+    home.broker.kill()
+    wait_for(lambda: {each["state"] for each in home.states().values()} == {"unavailable"}, 10)
+    home.broker.start()
+    wait_for(lambda: is_well(home), 60)

@@ -1,17 +1,65 @@
-"""The outputs that are configured, opened."""
+"""The outputs that are configured, opened, and opened again where that failed."""
 
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.output import Output
+from hearthlog.analyzer.bridge.output import News, Output
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import BridgeSettings
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
 
 _OLDEST = 7 * 24 * 3600 * NANOSECONDS  # how far back the log is read at most, at a start
+_AGAIN_SECONDS = 60.0
+
+_Output = TypeVar("_Output", bound=Output)
+
+
+class Reopened(Generic[_Output]):
+    """An output that is tried again every minute while it cannot be opened.
+
+    Parameters
+    ----------
+    make : callable
+        Opens it.
+    say : callable
+        Told why it cannot be opened, in a line.
+
+    Attributes
+    ----------
+    output : Output or None
+        None while it cannot be opened.
+    """
+
+    def __init__(self, make: Callable[[], _Output], say: Callable[[str], None]) -> None:
+        self.output: _Output | None = None
+        self._make = make
+        self._say = say
+        self._due = 0.0  # by CLOCK_MONOTONIC
+        self._open()
+
+    def update(self, news: News) -> None:
+        """Tell what is new, if it is open."""
+        if self.output is None and time.monotonic() >= self._due:
+            self._open()
+        if self.output is not None:
+            self.output.update(news)
+
+    def close(self) -> None:
+        """End, if it is open."""
+        if self.output is not None:
+            self.output.close()
+
+    def _open(self) -> None:
+        self._due = time.monotonic() + _AGAIN_SECONDS
+        try:
+            self.output = self._make()
+        except (HearthlogError, OSError) as error:
+            self._say(f"{error}; trying again")
 
 
 def open_outputs(
@@ -26,6 +74,7 @@ def open_outputs(
     state_folder : Path
         Of what they have to remember.
     say : Saying
+        Told why one cannot be opened; it is tried again.
 
     Returns
     -------
@@ -36,39 +85,45 @@ def open_outputs(
 
     Raises
     ------
-    HearthlogError
-        If one cannot be opened.
     ModuleNotFoundError
         If a package that one needs is not installed.
     """
-    # Imported here: who wants no broker needs no client of one.
     moment = today(time.time_ns(), home.zone)
     since = min(moment.midnight, moment.night)
     outputs: dict[str, Output] = {}
-    on_ring: Callable[[str, str, int], None] | None = None
-    if settings.mqtt is not None:
+    # Imported here: who wants no broker needs no client of one.
+    if (mqtt := settings.mqtt) is not None:
         from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
 
-        outputs["mqtt"] = publisher = MqttPublisher(settings.mqtt, home, say)
-        on_ring = publisher.alert
-    if settings.prometheus is not None:
+        publisher = Reopened(lambda: MqttPublisher(mqtt, home, say), say)
+        outputs["mqtt"] = publisher
+    if (figures := settings.prometheus) is not None:
         from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415
 
-        prometheus = PrometheusOutput(settings.prometheus, home, state_folder, since, say)
-        since = min(since, max(prometheus.totals.time, moment.now - _OLDEST))
+        first = since
+        prometheus = Reopened(
+            lambda: PrometheusOutput(figures, home, state_folder, first, say), say
+        )
         outputs["prometheus"] = prometheus
-    if settings.page is not None:
+        if prometheus.output is not None:
+            since = min(since, max(prometheus.output.totals.time, moment.now - _OLDEST))
+    if (page := settings.page) is not None:
         from hearthlog.analyzer.bridge.page.home_page import HomePage  # noqa: PLC0415
 
-        outputs["page"] = HomePage(settings.page, home, state_folder, say)
-    if settings.ping is not None:
+        outputs["page"] = Reopened(lambda: HomePage(page, home, state_folder, say), say)
+    if (watchdog := settings.ping) is not None:
         from hearthlog.analyzer.bridge.pinging import Pinging  # noqa: PLC0415
 
-        outputs["ping"] = Pinging(settings.ping, say)
+        outputs["ping"] = Pinging(watchdog, say)
     if settings.alert:
         from hearthlog.analyzer.bridge.alerts.output import AlertsOutput  # noqa: PLC0415
 
-        outputs["alerts"] = AlertsOutput(
-            settings.alert, settings.delivery, home, state_folder, say, on_ring
+        def ring(rule: str, text: str, rung: int) -> bool:
+            return publisher.output is not None and publisher.output.alert(rule, text, rung)
+
+        rules, delivery = settings.alert, settings.delivery
+        on_ring = None if mqtt is None else ring
+        outputs["alerts"] = Reopened(
+            lambda: AlertsOutput(rules, delivery, home, state_folder, say, on_ring), say
         )
     return outputs, since
