@@ -49,4 +49,4 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
 def test_without_a_table_nothing_is_opened(home, tmp_path):
     opened, since = open_outputs(BridgeSettings(), home, tmp_path, Saying(pytest.fail))
     assert opened == {}
-    assert 0 < since
+    assert since > 0

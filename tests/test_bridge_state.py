@@ -53,6 +53,23 @@ def test_a_sound_is_held_for_ten_seconds(frames, is_heard):
     assert heard(20 * ["coughing"] + frames * ["silence"])[2:] == [is_heard, is_heard]
 
 
+def test_a_clock_that_is_set_back_ends_what_was_heard():
+    now = HeardNow(CLASSES)
+    now.push(40 * ["coughing"], 3600 * NANOSECONDS + FRAME * np.arange(40))
+    assert now.is_heard("coughing")
+    now.push(["silence"], np.array([FRAME]))
+    assert not now.is_heard("coughing")
+
+
+def test_events_are_counted_by_their_time_when_the_clock_is_set_back():
+    record = EventRecord("mic", "coughing")
+    for start, is_new in ((5000, True), (6000, True), (5500, True), (5505, False), (6500, True)):
+        assert record.push(start * NANOSECONDS, (start + 2) * NANOSECONDS, 1.0) == is_new
+    assert [event.start // NANOSECONDS for event in record.events] == [5000, 5500, 6000, 6500]
+    assert [event.seconds for event in record.events] == [2, 4, 2, 2]
+    assert len(record.since(5500 * NANOSECONDS)) == 3
+
+
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 20)), max_size=40))
 def test_events_are_those_of_the_report(spans):
     starts, ends, time = [], [], 0

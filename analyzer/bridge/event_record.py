@@ -1,6 +1,6 @@
 """The events of one class that a microphone heard lately, put together segment by segment."""
 
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from typing import NamedTuple
 
 from hearthlog.schemas.times import NANOSECONDS
@@ -46,7 +46,8 @@ class EventRecord:
     def __init__(self, microphone: str, label: str) -> None:
         self._microphone = microphone
         self._label = label
-        self.events: list[Event] = []  # in the order of time
+        self.events: list[Event] = []  # by their starts
+        self._current: Event | None = None  # with which a segment may go on
 
     def push(self, start: int, end: int, confidence: float) -> bool:
         """Add a segment; tell whether an event begins with it.
@@ -59,27 +60,38 @@ class EventRecord:
             Of the segment.
         """
         seconds = (end - start) / NANOSECONDS
-        last = self.events[-1] if self.events else None
-        if last is None or not self._goes_on(last, start):
+        current = self._current
+        if current is None or not _goes_on(current, start):
             new = Event(self._microphone, self._label, start, end, confidence, seconds)
-            self.events.append(new)
+            insort(self.events, new, key=_start)  # not the last one if the clock was set back
+            self._current = new
             return True
-        self.events[-1] = last._replace(
-            end=max(last.end, end),
-            confidence=max(last.confidence, confidence),
-            seconds=last.seconds + seconds,
+        self._current = current._replace(
+            end=max(current.end, end),
+            confidence=max(current.confidence, confidence),
+            seconds=current.seconds + seconds,
         )
+        place = bisect_left(self.events, current.start, key=_start)
+        self.events[self.events.index(current, place)] = self._current
         return False
 
     def since(self, time: int) -> list[Event]:
         """Return the events that began at a time or later, in nanoseconds of UTC."""
-        return self.events[bisect_left(self.events, time, key=lambda event: event.start) :]
+        return self.events[bisect_left(self.events, time, key=_start) :]
 
     def forget_before(self, time: int) -> None:
         """Forget the events that began before a time, but for the last one."""
-        first = bisect_left(self.events, time, key=lambda event: event.start)
-        del self.events[: min(first, max(len(self.events) - 1, 0))]
+        first = bisect_left(self.events, time, key=_start)
+        forgotten = min(first, max(len(self.events) - 1, 0))
+        if forgotten:
+            del self.events[:forgotten]
+            if self._current not in self.events:
+                self._current = None
 
-    @staticmethod
-    def _goes_on(last: Event, start: int) -> bool:
-        return last.start <= start <= last.end + PAUSE_SECONDS * NANOSECONDS
+
+def _start(event: Event) -> int:
+    return event.start
+
+
+def _goes_on(event: Event, start: int) -> bool:
+    return event.start <= start <= event.end + PAUSE_SECONDS * NANOSECONDS

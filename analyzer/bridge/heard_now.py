@@ -49,6 +49,9 @@ class HeardNow:
         """
         if not len(times):
             return
+        if times[0] < self.time:  # the clock was set back: what was heard then was not just now
+            self._last_heard = dict.fromkeys(self._last_heard, 0)
+            self._last_labels = self._last_labels[:0]
         places = {name: place for place, name in enumerate(self._classes)}
         new = np.array([places.get(label, -1) for label in labels])
         known = np.concatenate([self._last_labels, new])

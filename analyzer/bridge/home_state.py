@@ -125,7 +125,7 @@ class MicrophoneState:
         ended = []
         for label in sorted(self._unended):
             event = self._records[label].events[-1]
-            if self.heard.time - event.end > _DECIDED:
+            if abs(self.heard.time - event.end) > _DECIDED:  # before it, if the clock was set back
                 ended.append(event)
         self._unended.difference_update(event.label for event in ended)
         return ended
