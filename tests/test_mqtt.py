@@ -230,16 +230,41 @@ def test_a_pause_that_comes_in_has_an_end_and_says_who_asked_for_it(home, broker
 
 
 @pytest.mark.fast
+def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, broker):
+    home.hears("coughing")
+    command = {"told": False, "label": "coughing", "by": "Anna"}
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker, commands=True):
+            listener.wait_for(f"{COUGHING}/on", "ON")
+            listener.publish(f"{ROOT}/command", json.dumps(command))
+            listener.wait_for(f"{ROOT}/told/coughing", "OFF")
+            listener.wait_for(f"{COUGHING}/on", "OFF")
+        with Bridged(home.folder, broker, commands=True):
+            home.hears("coughing")
+            home.heard("coughing", 0.1)
+            home.heard("speech", 0.1)
+            listener.wait_for(f"{COUGHING}/count_today", "1")  # the log has it all the same
+            event = json.loads(listener.wait_for(f"{ROOT}/mic/event"))
+            assert event["event_type"] == "speech"
+            assert listener.values[f"{COUGHING}/on"] == "OFF"
+            listener.publish(f"{ROOT}/command", json.dumps(command | {"told": True}))
+            listener.wait_for(f"{ROOT}/told/coughing", "ON")
+            home.hears("coughing")
+            listener.wait_for(f"{COUGHING}/on", "ON")
+
+
+@pytest.mark.fast
 @pytest.mark.parametrize(
     ("command", "problem"),
     [
         ("{", "command: Invalid JSON"),
         ("[]", "command: Input should be an object"),
-        ("{}", "one of correct, pause_minutes and resume has to be there"),
-        ('{"resume": true, "pause_minutes": 3}', "one of correct, pause_minutes and resume"),
+        ("{}", "one of correct, told, pause_minutes and resume has to be there"),
+        ('{"resume": true, "pause_minutes": 3}', "one of correct, told, pause_minutes and"),
+        ('{"told": false}', "label belongs to correct and told"),
         ('{"pause_minutes": 1e9}', "pause_minutes: Input should be less than or equal to"),
         ('{"pause_minutes": 3, "for": 3}', "for: Extra inputs are not permitted"),
-        ('{"correct": "x"}', "correct and label belong together"),
+        ('{"correct": "x"}', "label belongs to correct and told"),
         ('{"correct": "x", "label": "../y"}', "'../y' cannot be the name of a class"),
         ('{"correct": "x", "label": "kettle"}', "'x' is no event since last evening"),
         ('{"resume": true, "by": "a\\u0000"}', "by: String should match pattern"),

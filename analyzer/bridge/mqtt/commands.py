@@ -32,23 +32,24 @@ class Answer(NamedTuple):
 
 
 class _Command(BaseModel):
-    """One of `correct` with `label`, `pause_minutes` and `resume`."""
+    """One of `correct` and `told`, both with `label`, `pause_minutes` and `resume`."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
     by: Annotated[str, Field(max_length=100, pattern=r"^[^\x00-\x1f\x7f]*$")] = ""
     correct: str | None = None
+    told: bool | None = None
     label: str | None = None
     pause_minutes: Annotated[float, Field(gt=0, le=_MOST_MINUTES)] | None = None
     resume: bool = False
 
     def problem(self) -> str:
         """Return what is wrong with the command; empty if nothing is."""
-        asked = [self.correct is not None, self.pause_minutes is not None, self.resume]
-        if sum(asked) != 1:
-            return "one of correct, pause_minutes and resume has to be there"
-        if (self.label is None) != (self.correct is None):
-            return "correct and label belong together"
+        of_class = self.correct is not None, self.told is not None
+        if sum([*of_class, self.pause_minutes is not None, self.resume]) != 1:
+            return "one of correct, told, pause_minutes and resume has to be there"
+        if (self.label is not None) != any(of_class):
+            return "label belongs to correct and told"
         return ""
 
 
@@ -61,13 +62,22 @@ class Commands:
         Of the logs.
     node : str
         Name of the recorder.
+    switch : callable
+        Told a class, and whether the broker is to be told of it.
     answered : callable
         Told what became of each, in that thread.
     """
 
-    def __init__(self, folder: Path, node: str, answered: Callable[[Answer], None]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        node: str,
+        switch: Callable[[str, bool], None],
+        answered: Callable[[Answer], None],
+    ) -> None:
         self._folder = folder
         self._node = node
+        self._switch = switch
         self._answered = answered
         self._waiting: queue.Queue[tuple[bytes, FindEvent] | None] = queue.Queue(_WAITING)
         self._thread = Thread(target=self._work, daemon=True)
@@ -113,6 +123,9 @@ class Commands:
         label = spelt(command.label or "")
         if not CLASS_NAME.fullmatch(label):
             raise BridgeError(f"{label[:64]!r} cannot be the name of a class")
+        if command.told is not None:
+            self._switch(label, command.told)
+            return f"{label} is {'' if command.told else 'not '}told of, says {by}"
         event = find_event(command.correct or "")
         if event is None:
             raise BridgeError(f"{(command.correct or '')[:100]!r} is no event since last evening")

@@ -1,5 +1,6 @@
 """A connection to a broker that may come and go: what it has to say is said again, or in time."""
 
+import math
 import os
 import ssl
 import sys
@@ -8,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -23,6 +23,7 @@ from hearthlog.schemas.storage.small_file import read_whole
 
 _KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
 _QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection
+_KEPT_SECONDS = 0.5  # in which a broker sends what it kept to who has subscribed
 _TIMELY_SECONDS = 60.0  # after which an event is no news
 _FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
 _CLOSE_SECONDS = 2.0
@@ -83,7 +84,7 @@ class Connection:
         self._values: dict[str, str] = {}  # the newest of each topic that the broker keeps
         self._unsent: dict[str, None] = {}  # topics, in order
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_QUEUED)
-        self._lock = Lock()
+        self._ready_at = math.inf  # by CLOCK_MONOTONIC: when the broker has sent what it kept
         self._is_new = False  # a connection to which nothing was said yet
         self._client = self._make_client(settings)
 
@@ -111,11 +112,10 @@ class Connection:
 
     def flush(self) -> None:
         """Hand what there is to say to the connection, if there is one."""
-        if not self._client.is_connected():
+        if not self._client.is_connected() or time.monotonic() < self._ready_at:
             return
-        with self._lock:
-            is_new, self._is_new = self._is_new, False
-        if is_new:
+        if self._is_new:
+            self._is_new = False
             self.repeat()
         for topic in list(self._unsent):
             if not self._publish(topic, self._values[topic], retain=True):
@@ -191,8 +191,8 @@ class Connection:
         for topic in self._subscriptions:
             client.subscribe(topic, _QOS)
         client.publish(self._alive, "online", _QOS, retain=True)
-        with self._lock:
-            self._is_new = True
+        self._is_new = True
+        self._ready_at = self._connected + _KEPT_SECONDS
 
     def _on_connect_fail(self, _client: mqtt.Client, _data: Any) -> None:
         error = sys.exc_info()[1]  # called while it is handled
@@ -206,6 +206,7 @@ class Connection:
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
     ) -> None:
         since, self._connected = self._connected, None
+        self._ready_at = math.inf
         if since is None:
             if reason.is_failure:
                 self._say(f"{self._place}: no connection: {reason}{self._hint}; trying again")

@@ -4,7 +4,6 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from threading import Lock
 
 from paho.mqtt.client import MQTTMessage
 
@@ -16,6 +15,7 @@ from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
 from hearthlog.analyzer.bridge.mqtt.commands import Answer, Commands
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
+from hearthlog.analyzer.bridge.mqtt.held_values import HeldValues
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import MqttSettings
@@ -50,14 +50,9 @@ class MqttPublisher:
         self._home = home
         self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
-        self._lock = Lock()
-        self._at_broker: set[tuple[str, str]] = set()  # microphones and classes with values there
-        self._others: set[str] = set()  # microphones with values there
+        self._held = HeldValues(topics)
         self._is_born = False
-        subscriptions = [
-            topics.of_microphone("+", "listening"),
-            f"{topics.root}/+/class/+/on",
-        ]
+        subscriptions = self._held.subscriptions
         if settings.home_assistant:
             subscriptions.append(self._birth_topic)
         self._commands = None
@@ -65,7 +60,9 @@ class MqttPublisher:
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
         if settings.commands:
             subscriptions.append(self._command_topic)
-            self._commands = Commands(home.folder, home.node, self._answers.append)
+            self._commands = Commands(
+                home.folder, home.node, self._held.switch, self._answers.append
+            )
         client_id = settings.client_id or f"hearthlog-{home.node}"
         self._connection = Connection(
             settings,
@@ -86,13 +83,12 @@ class MqttPublisher:
             self._say_problem(microphone, news.state)
         self._clear_others(news.state)
         for events, kind in ((news.begun, "event"), (news.ended, "event_ended")):
-            for event in events:
+            for event in (each for each in events if self._held.is_told(each.label)):
                 topic = self._topics.of_microphone(event.microphone, kind)
                 self._connection.send(topic, json.dumps(event_fields(event, news)))
         self._obey(news.state)
-        with self._lock:
-            is_born, self._is_born = self._is_born, False
-        if is_born:
+        if self._is_born:
+            self._is_born = False
             self._connection.repeat()
         self._connection.flush()
 
@@ -140,18 +136,14 @@ class MqttPublisher:
         return f"{self._settings.discovery_topic}/status"
 
     def _take(self, message: MQTTMessage) -> None:
-        """Note what the broker has of earlier bridges, and that Home Assistant has started."""
-        topic, payload = message.topic, message.payload
-        with self._lock:
-            if topic == self._command_topic:
-                if not message.retain:  # else it was meant for whoever was there then
-                    self._asked.append(bytes(payload))
-            elif topic == self._birth_topic:
-                self._is_born |= payload == _BORN and not message.retain
-            elif payload and (found := self._topics.parse_class(topic, "on")):
-                self._at_broker.add(found)
-            elif payload and (name := self._topics.parse_microphone(topic, "listening")):
-                self._others.add(name)
+        """Note a message, in the thread of the connection."""
+        if message.topic == self._birth_topic:
+            self._is_born |= message.payload == _BORN and not message.retain
+        elif message.topic == self._command_topic:
+            if not message.retain:  # else it was meant for whoever was there then
+                self._asked.append(bytes(message.payload))
+        else:
+            self._held.take(message)
 
     def _describe(self, microphone: MicrophoneState) -> None:
         """Tell Home Assistant of the classes of a microphone, before the first value of one."""
@@ -168,21 +160,15 @@ class MqttPublisher:
 
     def _clear_others(self, state: HomeState) -> None:
         """Have the broker forget the classes that earlier models had."""
-        with self._lock:
-            at_broker, others = set(self._at_broker), set(self._others)
-        for microphone in sorted(others - state.microphones.keys()):
-            topic = self._topics.of_microphone(microphone, "listening")
-            self._connection.keep(topic, _ONLINE[False])
+        for name in self._held.other_microphones(state.microphones):
+            self._connection.keep(self._topics.of_microphone(name, "listening"), _ONLINE[False])
         for name, classes in self._classes.items():
-            gone = sorted(c for m, c in at_broker if m == name and c not in classes)
-            if not gone:
-                continue
-            self._tell_home_assistant(name, tuple(gone))
+            gone = self._held.other_classes(name, classes)
+            if gone:
+                self._tell_home_assistant(name, tuple(gone))
             for label in gone:
                 for kind in ("on", "count_today", "count_night", "last_heard"):
                     self._connection.forget(self._topics.of_class(name, label, kind))
-            with self._lock:
-                self._at_broker.difference_update((name, label) for label in gone)
 
     def _say_state(self, microphone: MicrophoneState, news: News) -> None:
         def say(kind: str, value: str) -> None:
@@ -196,11 +182,13 @@ class MqttPublisher:
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             say("level", f"{microphone.level_dbfs:.1f}")
-        for label in microphone.classes:
-            if label != SILENCE:
-                for kind, value in class_values(microphone, label, news):
-                    topic = self._topics.of_class(microphone.name, label, kind)
-                    self._connection.keep(topic, value)
+        for label in (each for each in microphone.classes if each != SILENCE):
+            is_told = self._held.is_told(label)
+            if self._settings.commands:
+                self._connection.keep(self._topics.of_told(label), _ON[is_told])
+            for kind, value in class_values(microphone, label, news):
+                topic = self._topics.of_class(microphone.name, label, kind)
+                self._connection.keep(topic, value if is_told or kind != "on" else _ON[False])
 
     def _say_problem(self, microphone: MicrophoneState, state: HomeState) -> None:
         others = state.microphones.keys() - {microphone.name}

@@ -46,8 +46,11 @@ class Topics(NamedTuple):
             addresses.
         kind : str
         """
-        name = quote(label, safe=_KEPT)
-        return f"{self.root}/{microphone}{_CLASS_PART}{name}/{kind}"
+        return f"{self.root}/{microphone}{_CLASS_PART}{_part(label)}/{kind}"
+
+    def of_told(self, label: str) -> str:
+        """Name the topic that says whether a class is told of."""
+        return f"{self.root}/told/{_part(label)}"
 
     def parse_class(self, topic: str, kind: str) -> tuple[str, str] | None:
         """Return the microphone and the class of a topic; None if it is no such topic."""
@@ -55,10 +58,19 @@ class Topics(NamedTuple):
         match = re.fullmatch(form, topic)
         return None if match is None else (match[1], unquote(match[2]))
 
+    def parse_told(self, topic: str) -> str | None:
+        """Return the class of a topic that says whether it is told of; None of another one."""
+        name = topic.removeprefix(f"{self.root}/told/")
+        return None if name == topic else unquote(name)
+
     def parse_microphone(self, topic: str, kind: str) -> str | None:
         """Return the microphone of a topic; None if it is no such topic."""
         match = re.fullmatch(rf"{re.escape(self.root)}/([^/]+)/{kind}", topic)
         return None if match is None else match[1]
+
+
+def _part(label: str) -> str:
+    return quote(label, safe=_KEPT)
 
 
 def identifier(text: str) -> str:

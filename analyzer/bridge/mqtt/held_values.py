@@ -1,0 +1,70 @@
+"""What a broker holds of earlier bridges, and which classes it is not told of."""
+
+from collections.abc import Collection
+from threading import Lock
+
+from paho.mqtt.client import MQTTMessage
+
+from hearthlog.analyzer.bridge.mqtt.topics import Topics
+
+_OFF = b"OFF"
+
+
+class HeldValues:
+    """Notes of the values that a broker kept, as it sends them to who subscribes; for any thread.
+
+    Parameters
+    ----------
+    topics : Topics
+    """
+
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
+        self._lock = Lock()
+        self._classes: set[tuple[str, str]] = set()  # microphones and classes
+        self._microphones: set[str] = set()
+        self._untold: set[str] = set()  # classes
+
+    @property
+    def subscriptions(self) -> list[str]:
+        """Filters of the topics that there are notes of."""
+        root = f"{self._topics.root}/+"
+        return [f"{root}/listening", f"{root}/class/+/on", f"{self._topics.root}/told/+"]
+
+    def take(self, message: MQTTMessage) -> None:
+        """Note a value that was kept; what comes as it is published is one's own."""
+        topic, payload = message.topic, bytes(message.payload)
+        if not message.retain or not payload:
+            return
+        with self._lock:
+            if held := self._topics.parse_class(topic, "on"):
+                self._classes.add(held)
+            elif name := self._topics.parse_microphone(topic, "listening"):
+                self._microphones.add(name)
+            elif (label := self._topics.parse_told(topic)) and payload == _OFF:
+                self._untold.add(label)
+
+    def other_microphones(self, known: Collection[str]) -> list[str]:
+        """Return the microphones that are not known any more, each once."""
+        with self._lock:
+            others = sorted(self._microphones.difference(known))
+            self._microphones.difference_update(others)
+            return others
+
+    def other_classes(self, microphone: str, known: Collection[str]) -> list[str]:
+        """Return the classes of a microphone that are not known any more, each once."""
+        with self._lock:
+            others = {(name, c) for name, c in self._classes if name == microphone}
+            gone = {(name, label) for name, label in others if label not in known}
+            self._classes -= gone
+            return sorted(label for _, label in gone)
+
+    def is_told(self, label: str) -> bool:
+        """Tell whether the broker is told when a class is heard."""
+        with self._lock:
+            return label not in self._untold
+
+    def switch(self, label: str, is_told: bool) -> None:  # noqa: FBT001  it is handed over
+        """Have the broker told of a class or not."""
+        with self._lock:
+            (self._untold.discard if is_told else self._untold.add)(label)
