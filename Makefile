@@ -36,7 +36,7 @@ test-lowest: dist
 	python=$$(.ci/python 3.11) && $$python -m venv --clear build/lowest
 	build/lowest/bin/pip install --quiet uv
 	build/lowest/bin/uv pip compile --quiet --python build/lowest/bin/python pyproject.toml \
-		--extra analyzer --extra cluster --resolution lowest-direct -o build/lowest/versions.txt
+		--extra analyzer --extra bridge --extra cluster --resolution lowest-direct -o build/lowest/versions.txt
 	build/lowest/bin/pip install --quiet "$$(ls build/dist/*.whl)[dev]" \
 		--constraint build/lowest/versions.txt
 	build/lowest/bin/pytest -n 2 -m fast

@@ -122,7 +122,7 @@ def test_the_modules_of_the_wheel_find_each_other_under_its_name_alone(wheel, tm
 
 
 BOX = ("schemas", "models", "recorder")
-EXTRAS = ("headless", "viewer", "foxglove", "cluster")
+EXTRAS = ("headless", "viewer", "foxglove", "bridge", "cluster")
 
 
 def asked_for(*extras):

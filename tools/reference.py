@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.recorder.config import Settings
 
 _HEAD = """\
@@ -29,10 +30,22 @@ error says why, and it goes on as before.
 """
 
 
+_BRIDGE = """
+## The bridge
+
+The tables of [the bridge](bridge.md) may stand in the same file: the recorder takes no notice of them, and writes
+none of them into a log. Each is an output; without one nobody is told anything. `state`, in the table `[bridge]`
+itself, is the folder of what the bridge has to remember: by default that of systemd, or `bridge` beside the logs.
+The tables `[[bridge.alert]]` are [the rules of alerts](alerts.md#rules).
+"""
+_TABLES = ("mqtt", "prometheus", "page", "ping", "delivery")
+
+
 def configuration_page() -> str:
     """Return the page of everything that can be configured, as Markdown."""
     schema = Settings.model_json_schema()
     microphone = schema["$defs"]["MicrophoneSettings"]
+    tables = BridgeSettings.model_json_schema()["$defs"]
     return "\n".join(
         [
             _HEAD,
@@ -43,7 +56,17 @@ def configuration_page() -> str:
             "Each table `[[microphone]]` is one. Without any there is the default one: `mic`.",
             "",
             *_table(microphone["properties"]),
-            "",
+            _BRIDGE,
+            *(
+                line
+                for name in _TABLES
+                for line in (
+                    f"### bridge.{name}",
+                    "",
+                    *_table(tables[f"{name.capitalize()}Settings"]["properties"]),
+                    "",
+                )
+            ),
         ]
     )
 
@@ -63,8 +86,10 @@ def _values(about: dict[str, Any]) -> str:
     if about.get("type") == "array":
         return "list of texts"
     if "anyOf" in about:
-        types = {each.get("type") for each in about["anyOf"]}
-        return "size" if "integer" in types else "path"
+        kinds = [each for each in about["anyOf"] if each.get("type") != "null"]
+        return _values(kinds[0]) if len(kinds) == 1 else "size"
+    if about["type"] == "boolean":
+        return "`true`, `false`"
     if about["type"] == "string":
         return "path" if about.get("format") == "path" else "text"
     least, most = about.get("minimum"), about.get("maximum")

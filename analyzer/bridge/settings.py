@@ -123,5 +123,5 @@ def file_schema() -> dict[str, Any]:
     schema = Settings.model_json_schema()
     bridge = BridgeSettings.model_json_schema()
     schema["$defs"] |= bridge.pop("$defs", {})
-    schema["properties"][BRIDGE] = bridge
+    schema["properties"][BRIDGE] = bridge | {"description": "Of the bridge, not of the recorder."}
     return schema
