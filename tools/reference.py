@@ -33,10 +33,11 @@ error says why, and it goes on as before.
 _BRIDGE = """
 ## The bridge
 
-The tables of [the bridge](bridge.md) may stand in the same file: the recorder takes no notice of them, and writes
-none of them into a log. Each is an output; without one nobody is told anything. `state`, in the table `[bridge]`
-itself, is the folder of what the bridge has to remember: by default that of systemd, or `bridge` beside the logs.
-The tables `[[bridge.alert]]` are [the rules of alerts](alerts.md#rules).
+The tables of [the bridge](bridge.md) may stand in the same file: the recorder takes no notice of
+them, and writes none of them into a log. Each is an output; without one nobody is told anything.
+`state`, in the table `[bridge]` itself, is the folder of what the bridge has to remember: by
+default that of systemd, or `bridge` beside the logs. The tables `[[bridge.alert]]` are
+[the rules of alerts](alerts.md#rules).
 """
 _TABLES = ("mqtt", "prometheus", "page", "ping", "delivery")
 
@@ -83,15 +84,16 @@ def _table(properties: dict[str, Any]) -> Iterator[str]:
 def _values(about: dict[str, Any]) -> str:
     if "enum" in about:
         return ", ".join(map(_code, about["enum"]))
-    if about.get("type") == "array":
-        return "list of texts"
     if "anyOf" in about:
         kinds = [each for each in about["anyOf"] if each.get("type") != "null"]
         return _values(kinds[0]) if len(kinds) == 1 else "size"
-    if about["type"] == "boolean":
-        return "`true`, `false`"
-    if about["type"] == "string":
-        return "path" if about.get("format") == "path" else "text"
+    if about["type"] in {"number", "integer"}:
+        return _numbers(about)
+    words = {"array": "list of texts", "boolean": "`true`, `false`", "string": "text"}
+    return "path" if about.get("format") == "path" else words[about["type"]]
+
+
+def _numbers(about: dict[str, Any]) -> str:
     least, most = about.get("minimum"), about.get("maximum")
     kind = "number" if about["type"] == "number" else "whole number"
     if most is not None:
