@@ -97,7 +97,6 @@ def _clock(nanoseconds):
     return f"{moment:%Y-%m-%dT%H:%M:%S}"
 
 
-@pytest.mark.fast
 def test_a_class_is_on_while_it_is_heard_and_its_event_ends(home, broker):
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
         home.hears("silence")
@@ -113,7 +112,6 @@ def test_a_class_is_on_while_it_is_heard_and_its_event_ends(home, broker):
     assert ended["event_type"] == "coughing"
 
 
-@pytest.mark.fast
 def test_what_is_wrong_is_a_problem_of_the_microphone_that_it_is_about(tmp_path, broker):
     home = LiveHome(tmp_path / "logs", ("kitchen", "bath"))
     for microphone in ("kitchen", "bath"):
@@ -130,7 +128,6 @@ def test_what_is_wrong_is_a_problem_of_the_microphone_that_it_is_about(tmp_path,
     home.close()
 
 
-@pytest.mark.fast
 def test_what_an_earlier_bridge_left_at_the_broker_is_cleared(home, broker):
     left = {
         f"{ROOT}/mic/class/barking/on": "ON",
@@ -152,7 +149,6 @@ def test_what_an_earlier_bridge_left_at_the_broker_is_cleared(home, broker):
     assert not any("barking/" in topic for topic in settled_values(broker.port, seconds=0.3))
 
 
-@pytest.mark.fast
 def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
@@ -167,7 +163,6 @@ def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
         assert len(listener.payloads(DISCOVERY)) == 1  # what the broker has from before
 
 
-@pytest.mark.fast
 def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path, broker):
     with (
         Listener(broker.port) as listener,
@@ -189,7 +184,6 @@ class _Failing:
         pass
 
 
-@pytest.mark.fast
 def test_an_output_that_fails_stops_no_other(home, broker):
     home.hears("silence")
     with (
@@ -215,7 +209,6 @@ def test_a_correction_that_comes_in_is_a_mark_in_the_name_of_who_says_so(home, b
     assert mark.corrects == "live"
 
 
-@pytest.mark.fast
 def test_a_pause_that_comes_in_has_an_end_and_says_who_asked_for_it(home, broker):
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
@@ -229,7 +222,6 @@ def test_a_pause_that_comes_in_has_an_end_and_says_who_asked_for_it(home, broker
     assert not (home.folder / ".pause").exists()
 
 
-@pytest.mark.fast
 def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, broker):
     home.hears("coughing")
     command = {"told": False, "label": "coughing", "by": "Anna"}
@@ -253,7 +245,6 @@ def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, 
             listener.wait_for(f"{COUGHING}/on", "ON")
 
 
-@pytest.mark.fast
 @pytest.mark.parametrize(
     ("command", "problem"),
     [
@@ -281,7 +272,6 @@ def test_a_command_that_makes_no_sense_is_answered_so(home, broker, command, pro
     assert answer["text"].startswith(f"refused: {problem}")
 
 
-@pytest.mark.fast
 def test_commands_are_not_taken_unless_the_configuration_says_so(home, broker):
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
