@@ -117,6 +117,7 @@ class Listener:
     def __exit__(self, *_):
         self._client.disconnect()
         self._client.loop_stop()
+        self._client._reset_sockets()  # which it leaves to the garbage collector
 
 
 @pytest.fixture

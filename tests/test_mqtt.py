@@ -245,6 +245,34 @@ def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, 
             listener.wait_for(f"{COUGHING}/on", "ON")
 
 
+def test_a_bridge_that_is_started_again_tells_of_no_event_twice(home, broker):
+    home.hears("silence")
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker):
+            first = home.heard("coughing", 0.3)
+            listener.wait_until(lambda: len(listener.payloads(f"{ROOT}/mic/event")) == 1)
+        second = home.heard("speech", 0.2)  # while there is no bridge
+        with Bridged(home.folder, broker):
+            third = home.heard("laughing", 0.1)
+            listener.wait_until(lambda: len(listener.payloads(f"{ROOT}/mic/event")) == 3)
+        ids = [json.loads(event)["id"] for event in listener.payloads(f"{ROOT}/mic/event")]
+    assert ids == [f"mic-coughing-{first}", f"mic-speech-{second}", f"mic-laughing-{third}"]
+
+
+def test_classes_that_go_while_the_bridge_runs_are_cleared(home, broker):
+    home.hears("coughing")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{COUGHING}/on")
+        time.sleep(1)  # logs are named by the second
+        other = LiveHome(home.folder, classes=["silence", "shower"])
+        other.hears("shower")
+        listener.wait_for(f"{ROOT}/mic/class/shower/on")
+        listener.wait_for(f"{COUGHING}/on", "")
+        gone = '"on_coughing": {"p": "binary_sensor"}'
+        listener.wait_until(lambda: gone in listener.values[DISCOVERY])
+    other.close()
+
+
 @pytest.mark.parametrize(
     ("command", "problem"),
     [
@@ -321,6 +349,25 @@ def test_a_recorder_and_a_bridge_that_end_are_said_to_be_away(tmp_path, broker, 
 
 def _topics(listener, first):
     return {topic for _, topic, _, _ in listener.messages[first:]}
+
+
+def test_a_class_that_is_named_like_a_wildcard_has_topics_of_its_own(tmp_path, broker):
+    hostile = ["silence", "#", "+", "a/b/../c", "%2B", "{{ 1 }}", "$SYS", "é\u0000\n"]
+    home = LiveHome(tmp_path / "logs", classes=hostile)
+    home.hears("+")
+    home.heard("#", 0.1)
+    with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
+        listener.wait_for(f"{ROOT}/mic/class/%2B/on", "ON")
+        listener.wait_for(f"{ROOT}/mic/class/%23/count_today", "1")
+        listener.wait_for(f"{ROOT}/mic/class/%252B/on", "OFF")
+        config = json.loads(listener.wait_for(DISCOVERY))
+    on = {topic for topic in listener.values if topic.endswith("/on")}
+    assert len(on) == len(hostile) - 1
+    assert all(topic.count("/") == 5 for topic in on)
+    states = [c["state_topic"] for k, c in config["components"].items() if k.startswith("on_")]
+    assert set(states) == on
+    assert bridged.said == []
+    home.close()
 
 
 def test_the_classes_of_a_log_are_told_of_before_one_of_them_is_heard(home, broker):

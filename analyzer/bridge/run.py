@@ -10,12 +10,11 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.follow_home import follow_home
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.output import News, Output
+from hearthlog.analyzer.bridge.output import RECENT, News, Output
 from hearthlog.recorder.memory import give_back, keep_one_heap
 from hearthlog.recorder.service_manager import notify
 from hearthlog.schemas.times import NANOSECONDS
 
-_NEWS = 60 * NANOSECONDS  # how old an event may be that is told of after a start
 _WATCHDOG_SECONDS = 10.0
 _MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of
 _FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
@@ -79,7 +78,7 @@ class Bridge:
         ended = [event for each in state.microphones.values() for event in each.ended_events()]
         for microphone in state.microphones.values():
             microphone.forget_before(min(moment.midnight, moment.night) - _FORGOTTEN)
-        recent = [event for event in begun if now - event.end <= _NEWS]
+        recent = [event for event in begun if now - event.end <= RECENT]
         news = News(state, recent, ended, moment, self.home.zone)
         for name, output in self.outputs.items():
             try:

@@ -21,9 +21,7 @@ import typer
 
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.bench import (
-    check as checks,
-)
-from hearthlog.tools.bench import (
+    bridge,
     features,
     history,
     inference,
@@ -35,12 +33,26 @@ from hearthlog.tools.bench import (
     size,
     writing,
 )
+from hearthlog.tools.bench import (
+    check as checks,
+)
 from hearthlog.tools.bench.table import Table
 from hearthlog.tools.bench.workload import Workload
 
 MEASUREMENTS = {
     module.__name__.rpartition(".")[2]: module.measure
-    for module in (features, recording, live, inference, size, reading, writing, relabel, review)
+    for module in (
+        features,
+        recording,
+        live,
+        bridge,
+        inference,
+        size,
+        reading,
+        writing,
+        relabel,
+        review,
+    )
 }
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.timing import BenchError
 
-DEVICE = "labmic"
+DEVICE, SECOND_DEVICE = "labmic", "second"
 _SOURCE = Path(__file__).parents[2] / "tests" / "labmic" / "labmic.c"
 _ALSA_CONFIGURATION = Path("/usr/share/alsa/alsa.conf")
 
@@ -23,7 +23,7 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        Environment of a process that shall see it, under the name `DEVICE`.
+        Environment of a process that shall see it, under the names `DEVICE` and `SECOND_DEVICE`.
 
     Raises
     ------
@@ -61,6 +61,9 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
     configuration.write_text(
         f"<{_ALSA_CONFIGURATION}>\n"
         f'pcm_type.{DEVICE} {{ lib "{plugin}" }}\n'
-        f'pcm.{DEVICE} {{ type {DEVICE} rate {SAMPLE_RATE} data "{recording}" }}\n'
+        + "".join(
+            f'pcm.{device} {{ type {DEVICE} rate {SAMPLE_RATE} data "{recording}" }}\n'
+            for device in (DEVICE, SECOND_DEVICE)
+        )
     )
     return {**os.environ, "ALSA_CONFIG_PATH": str(configuration)}

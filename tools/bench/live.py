@@ -75,23 +75,23 @@ def measure(work: Workload) -> Table:
 
 
 def _live(work: Workload) -> list[Row]:
-    env = make_microphone(work.folder, _most_sounding(work.samples))
+    env = make_microphone(work.folder, most_sounding(work.samples))
     logs, on_trial = work.folder / "logs-live", work.folder / "logs-on-trial"
     block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
     latency = capture.LATENCY_SECONDS
     bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
     with ExitStack() as stack:
         recorders = [
-            stack.enter_context(_running(_recorder(model, folder), env))
+            stack.enter_context(running(_recorder(model, folder), env))
             for model, folder in ((work.model_file, logs), (_beside_candidate(work), on_trial))
         ]
-        processes = [*recorders, stack.enter_context(_running(bare, env))]
+        processes = [*recorders, stack.enter_context(running(bare, env))]
         for recorder, folder in zip(recorders, (logs, on_trial), strict=True):
-            _wait_for_log(folder, recorder)
+            wait_for_log(folder, recorder)
         time.sleep(_SETTLE_SECONDS)
-        before, began = [_usage(process) for process in processes], time.monotonic()
+        before, began = [usage(process) for process in processes], time.monotonic()
         time.sleep(_SECONDS)
-        after, seconds = [_usage(process) for process in processes], time.monotonic() - began
+        after, seconds = [usage(process) for process in processes], time.monotonic() - began
         for recorder in recorders:
             recorder.terminate()
         ends = [recorder.wait(timeout=_START_SECONDS) for recorder in recorders]
@@ -118,7 +118,7 @@ def _beside_candidate(work: Workload) -> Path:
     return Path(shutil.copy(work.model_file, folder))
 
 
-def _most_sounding(samples: NDArray[np.int16]) -> NDArray[np.int16]:
+def most_sounding(samples: NDArray[np.int16]) -> NDArray[np.int16]:
     """Return the ten seconds in which most seconds are loud: in quiet a model is hardly asked."""
     seconds = samples[: len(samples) // SAMPLE_RATE * SAMPLE_RATE].reshape(-1, SAMPLE_RATE)
     levels = np.log10(np.einsum("ij,ij->i", seconds, seconds, dtype=np.float64) + 1.0)
@@ -144,7 +144,7 @@ def _rows(percents: list[list[float]], megabytes: list[list[float]], notes: list
 
 
 @contextmanager
-def _running(command: list[object], env: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+def running(command: list[object], env: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
     """Run a process that ends with the block, or with this process if that is killed."""
     process = subprocess.Popen(  # noqa: S603  our own
         ["setpriv", "--pdeathsig", "KILL", *map(str, command)],  # noqa: S607  where it is, differs
@@ -160,7 +160,8 @@ def _running(command: list[object], env: dict[str, str]) -> Iterator[subprocess.
         process.wait()
 
 
-def _wait_for_log(logs: Path, recorder: subprocess.Popen[bytes]) -> None:
+def wait_for_log(logs: Path, recorder: subprocess.Popen[bytes]) -> None:
+    """Wait until a recorder writes."""
     deadline = time.monotonic() + _START_SECONDS
     while not any(logs.rglob("*.active")):
         if time.monotonic() > deadline or recorder.poll() is not None:
@@ -168,7 +169,7 @@ def _wait_for_log(logs: Path, recorder: subprocess.Popen[bytes]) -> None:
         time.sleep(0.1)
 
 
-def _usage(process: subprocess.Popen[bytes]) -> dict[int, _Usage]:
+def usage(process: subprocess.Popen[bytes]) -> dict[int, _Usage]:
     """Read what a process, and then those it started, have used so far, by process id."""
     import psutil  # noqa: PLC0415  an extra, like the peers
 

@@ -92,6 +92,10 @@ class Connection:
         """Tell whether the broker is connected."""
         return self._client.is_connected()
 
+    def is_ready(self) -> bool:
+        """Tell whether the broker is connected, and has sent what it kept."""
+        return self._client.is_connected() and time.monotonic() >= self._ready_at
+
     def keep(self, topic: str, value: str) -> None:
         """Publish a value that the broker keeps, unless it is the one that was published last."""
         if self._values.get(topic) != value:
@@ -112,7 +116,7 @@ class Connection:
 
     def flush(self) -> None:
         """Hand what there is to say to the connection, if there is one."""
-        if not self._client.is_connected() or time.monotonic() < self._ready_at:
+        if not self.is_ready():
             return
         if self._is_new:
             self._is_new = False

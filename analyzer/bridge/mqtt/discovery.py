@@ -73,10 +73,10 @@ def _of_microphone(
         "heard": {
             "p": "sensor",
             "name": "Heard",
-            "device_class": "enum",
-            "options": [SILENCE, *sounds],
+            # No `options`: when a model comes that has not the class which is shown, Home Assistant
+            # would fail, and take no discovery any more. No confidence: it would keep each change.
             "state_topic": at("heard"),
-            "value_template": "{{ value_json.label }}",  # not its confidence, kept at each change
+            "value_template": "{{ value_json.label }}",
             "icon": "mdi:ear-hearing",
         },
         "sound": {

@@ -1,10 +1,13 @@
 """What a broker holds of earlier bridges, and which classes it is not told of."""
 
-from collections.abc import Collection
+import json
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from threading import Lock
 
 from paho.mqtt.client import MQTTMessage
 
+from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 
 _OFF = b"OFF"
@@ -24,12 +27,14 @@ class HeldValues:
         self._classes: set[tuple[str, str]] = set()  # microphones and classes
         self._microphones: set[str] = set()
         self._untold: set[str] = set()  # classes
+        self._last_events: set[str] = set()  # ids
 
     @property
     def subscriptions(self) -> list[str]:
         """Filters of the topics that there are notes of."""
         root = f"{self._topics.root}/+"
-        return [f"{root}/listening", f"{root}/class/+/on", f"{self._topics.root}/told/+"]
+        kinds = "listening", "last_event", "class/+/on"
+        return [*(f"{root}/{kind}" for kind in kinds), f"{self._topics.root}/told/+"]
 
     def take(self, message: MQTTMessage) -> None:
         """Note a value that was kept; what comes as it is published is one's own."""
@@ -41,8 +46,15 @@ class HeldValues:
                 self._classes.add(held)
             elif name := self._topics.parse_microphone(topic, "listening"):
                 self._microphones.add(name)
+            elif self._topics.parse_microphone(topic, "last_event"):
+                self._last_events.add(_id_of(payload))
             elif (label := self._topics.parse_told(topic)) and payload == _OFF:
                 self._untold.add(label)
+
+    def add_classes(self, microphone: str, labels: Collection[str]) -> None:
+        """Note the classes of a microphone of which the broker was told by this bridge."""
+        with self._lock:
+            self._classes.update((microphone, label) for label in labels)
 
     def other_microphones(self, known: Collection[str]) -> list[str]:
         """Return the microphones that are not known any more, each once."""
@@ -59,6 +71,23 @@ class HeldValues:
             self._classes -= gone
             return sorted(label for _, label in gone)
 
+    def new_events(self, events: Sequence[Event]) -> list[Event]:
+        """Return the events that an earlier bridge has not told of.
+
+        Parameters
+        ----------
+        events : sequence of Event
+            In the order in which they began; what is before one that was told of was told of, too.
+        """
+        with self._lock:
+            told = {
+                (event.microphone, n)
+                for n, event in enumerate(events)
+                if event.id in self._last_events
+            }
+        last = {name: max(n for m, n in told if m == name) for name, _ in told}
+        return [e for n, e in enumerate(events) if n > last.get(e.microphone, -1)]
+
     def is_told(self, label: str) -> bool:
         """Tell whether the broker is told when a class is heard."""
         with self._lock:
@@ -68,3 +97,10 @@ class HeldValues:
         """Have the broker told of a class or not."""
         with self._lock:
             (self._untold.discard if is_told else self._untold.add)(label)
+
+
+def _id_of(payload: bytes) -> str:
+    """Return the id of an event, as JSON; empty if it has none."""
+    with suppress(ValueError, RecursionError, TypeError, KeyError):
+        return str(json.loads(payload)["id"])
+    return ""

@@ -3,7 +3,7 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from paho.mqtt.client import MQTTMessage
 
@@ -17,7 +17,7 @@ from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.held_values import HeldValues
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.text import shortened
@@ -27,6 +27,7 @@ _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
 _BORN = b"online"  # of Home Assistant
 _MOST_ASKED = 20  # commands that wait
+_MOST_BEGUN = 1000
 
 
 class MqttPublisher:
@@ -51,6 +52,7 @@ class MqttPublisher:
         self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
         self._held = HeldValues(topics)
+        self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)  # that were not told of yet
         self._is_born = False
         subscriptions = self._held.subscriptions
         if settings.home_assistant:
@@ -82,15 +84,31 @@ class MqttPublisher:
             self._say_state(microphone, news)
             self._say_problem(microphone, news.state)
         self._clear_others(news.state)
-        for events, kind in ((news.begun, "event"), (news.ended, "event_ended")):
-            for event in (each for each in events if self._held.is_told(each.label)):
-                topic = self._topics.of_microphone(event.microphone, kind)
-                self._connection.send(topic, json.dumps(event_fields(event, news)))
+        self._begun += news.begun
+        if self._connection.is_ready():
+            self._tell_begun(news)
+        self._send_events("event_ended", news.ended, news)
         self._obey(news.state)
         if self._is_born:
             self._is_born = False
             self._connection.repeat()
         self._connection.flush()
+
+    def _tell_begun(self, news: News) -> None:
+        """Tell of the events that began, but for those that an earlier bridge told of."""
+        now = news.today.now
+        recent = [event for event in self._begun if now - event.end <= RECENT]
+        self._begun.clear()
+        events = self._held.new_events(recent)
+        self._send_events("event", events, news)
+        for event in events:
+            topic = self._topics.of_microphone(event.microphone, "last_event")
+            self._connection.keep(topic, json.dumps(event_fields(event, news)))
+
+    def _send_events(self, kind: str, events: Sequence[Event], news: News) -> None:
+        for event in (each for each in events if self._held.is_told(each.label)):
+            topic = self._topics.of_microphone(event.microphone, kind)
+            self._connection.send(topic, json.dumps(event_fields(event, news)))
 
     def alert(self, name: str, text: str, time: int) -> bool:
         """Say that an alert rings; tell whether there is a broker that takes it.
@@ -149,6 +167,7 @@ class MqttPublisher:
         """Tell Home Assistant of the classes of a microphone, before the first value of one."""
         name, classes = microphone.name, microphone.classes
         self._classes[name] = list(classes)
+        self._held.add_classes(name, classes)
         self._tell_home_assistant(name)
 
     def _tell_home_assistant(self, microphone: str, gone: tuple[str, ...] = ()) -> None:
