@@ -122,9 +122,10 @@ class _Listener:
 
     def __init__(self, port: int) -> None:
         import paho.mqtt.client as mqtt  # noqa: PLC0415  an extra, like the peers
+        from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
 
         self.turned_on: list[float] = []
-        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self._client = mqtt.Client(CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
         self._client.on_connect = lambda client, *_: client.subscribe("hearthlog/+/+/sound", 1)
         self._client.on_message = self._note
         self._client.connect_async("127.0.0.1", port)
