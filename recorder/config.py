@@ -317,7 +317,7 @@ def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> Config
     errors = error.errors()
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     whole = (*table, *first["loc"])
-    where = _place(whole[:-1] if first["type"] == "missing" else whole, origins)
+    where = _place(whole, origins)
     key = ".".join(str(part) for part in whole)
     if first["type"] == "extra_forbidden":
         return ConfigurationError(f"{where}: unknown key {key!r}")
@@ -326,8 +326,8 @@ def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> Config
 
 def _place(key: Key, origins: Origins) -> str:
     """Say where something is wrong: a line of the file, or what else the value comes from."""
-    origin = origins.origin(key)
-    return "configuration" if origin == DEFAULT else origin
+    every = (origins.origin(key[:end]) for end in range(len(key), 0, -1))  # of what it is in
+    return next((origin for origin in every if origin != DEFAULT), "configuration")
 
 
 def _check_microphones(microphones: list[MicrophoneSettings], origins: Origins) -> None:

@@ -33,12 +33,14 @@ class LiveHome:
         Of the log, in nanoseconds of UTC.
     """
 
-    def __init__(self, folder, microphones=("mic",), classes=GENERAL):
+    def __init__(self, folder, microphones=("mic",), classes=GENERAL, **metadata):
         self.folder, self.classes = folder, list(classes)
         self.start = time.time_ns() - 360 * MINUTE
         topics = {t.name: t for m in microphones for t in topics_of(m, FEATURE_NAMES, self.classes)}
         path = log_path(folder, "home", self.start)
-        self._writer = LogWriter(path, list(topics.values()), {"version": "0", "node": "home"})
+        self._writer = LogWriter(
+            path, list(topics.values()), {"version": "0", "node": "home"} | metadata
+        )
 
     def heard(self, label, minutes_ago, seconds=4.0, confidence=0.93, microphone="mic"):
         """Write a segment that began so many minutes ago; return when that was."""

@@ -351,6 +351,17 @@ def _topics(listener, first):
     return {topic for _, topic, _, _ in listener.messages[first:]}
 
 
+def test_a_log_of_a_later_version_is_named_and_read_as_far_as_it_is_known(tmp_path, broker):
+    home = LiveHome(tmp_path / "logs", schema_version="99")
+    home.hears("coughing")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
+        listener.wait_for(f"{COUGHING}/on", "ON")
+    (line,) = bridged.said
+    assert "is of schema version '99', and this hearthlog knows up to " in line
+    assert line.endswith("; update hearthlog")
+    home.close()
+
+
 def test_a_class_that_is_named_like_a_wildcard_has_topics_of_its_own(tmp_path, broker):
     hostile = ["silence", "#", "+", "a/b/../c", "%2B", "{{ 1 }}", "$SYS", "é\u0000\n"]
     home = LiveHome(tmp_path / "logs", classes=hostile)

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from threading import Event as Flag
 
@@ -14,6 +15,8 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import log_name
 from hearthlog.schemas.logs.follow import follow_messages
+from hearthlog.schemas.logs.provenance import provenance_records, unknown_version
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
@@ -70,7 +73,7 @@ def follow_home(
         if stop.wait(_WAIT_SECONDS):
             return
     messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
-    yielded = -math.inf
+    yielded, checked = -math.inf, folder
     for path, batch in messages:
         if path == folder:  # all that was written has been read
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
@@ -79,6 +82,9 @@ def follow_home(
                 yield state, []
         elif log_name(path).node == node:
             try:
+                if path != checked:
+                    checked = path
+                    _check_version(path, damaged)
                 begun = state.push(_decode(batch))
             except LogError as error:
                 damaged(LogError(f"{path}: {error}"))
@@ -87,6 +93,14 @@ def follow_home(
             yield state, begun
         if stop.is_set():
             return
+
+
+def _check_version(log: Path, damaged: Callable[[LogError], None]) -> None:
+    """Tell of a log of a later version, of which only what is known here is read."""
+    with suppress(LogError), LogFile(log) as file:  # it gets another name at this moment
+        for record in provenance_records(file):
+            if text := unknown_version(record):
+                damaged(LogError(f"{log}: {text}"))
 
 
 def _decode(batch: list[RawMessages]) -> list[Columns]:

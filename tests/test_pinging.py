@@ -1,0 +1,97 @@
+"""Signs of life to a watchdog on the network."""
+
+import time
+from contextlib import contextmanager
+from datetime import UTC
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
+import pytest
+
+from hearthlog.analyzer.bridge import pinging
+from hearthlog.analyzer.bridge.day import today
+from hearthlog.analyzer.bridge.home_state import Health, HomeState
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.pinging import Pinging
+from hearthlog.analyzer.bridge.settings import PingSettings
+from hearthlog.analyzer.ports import free_port
+
+pytestmark = pytest.mark.fast
+
+
+@contextmanager
+def watchdog():
+    """A watchdog that notes what it is asked for: its address, and the notes."""
+    asked = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/box", asked
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def often(monkeypatch):
+    """A ping every twentieth of a second, and no judgement that lasts longer than half of one."""
+    monkeypatch.setattr(pinging, "_SOON", 0.05)
+    monkeypatch.setattr(pinging, "_JUDGED_SECONDS", 0.5)
+    return lambda url: PingSettings(url=url).model_copy(update={"every_seconds": 0.05})
+
+
+def news(*, is_recording=True, **health):
+    state = HomeState()
+    state._seen = time.monotonic() - (0.0 if is_recording else 60.0)
+    state.health = {name: Health(level, "") for name, level in health.items()}
+    return News(state, [], [], today(0, UTC), UTC)
+
+
+def last_asked(pings, asked, what):
+    """Return what is asked for last while something goes on."""
+    until, first = time.monotonic() + 10, len(asked)
+    while len(asked) < first + 3 and time.monotonic() < until:
+        pings.update(what)
+        time.sleep(0.02)
+    return asked[-1]
+
+
+def test_a_watchdog_is_asked_while_all_is_well_and_told_of_a_failure(often):
+    with watchdog() as (url, asked):
+        pings = Pinging(often(url), pytest.fail)
+        assert last_asked(pings, asked, news(mic=0, clock=1)) == "/box"
+        assert last_asked(pings, asked, news(mic=2)) == "/box/fail"
+        assert last_asked(pings, asked, news(is_recording=False)) == "/box/fail"
+        assert last_asked(pings, asked, news(mic=0)) == "/box"
+        pings.close()
+
+
+def test_a_bridge_that_hangs_asks_no_more(often):
+    with watchdog() as (url, asked):
+        pings = Pinging(often(url), pytest.fail)
+        last_asked(pings, asked, news(mic=0))
+        time.sleep(0.8)
+        count = len(asked)
+        time.sleep(0.3)
+        assert len(asked) == count
+        pings.close()
+
+
+def test_a_watchdog_that_is_away_is_said_to_be(often):
+    said = []
+    pings = Pinging(often(f"http://127.0.0.1:{free_port()}"), said.append)
+    until = time.monotonic() + 10
+    while not said and time.monotonic() < until:
+        pings.update(news())
+        time.sleep(0.02)
+    pings.close()
+    assert said[0] == "ping: nobody there has taken it (Connection refused); trying again"
