@@ -10,6 +10,7 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -42,16 +43,14 @@ def is_of_bridge(topic: str) -> bool:
 
 
 def follow_home(
-    folder: Path, node: str, start: int, stop: Flag, damaged: Callable[[LogError], None]
+    home: Home, start: int, stop: Flag, damaged: Callable[[LogError], None]
 ) -> Iterator[tuple[HomeState, list[Event]]]:
     """Follow the logs of a recorder, and keep the state of its home.
 
     Parameters
     ----------
-    folder : Path
-        Of the logs; it may come later.
-    node : str
-        Name of the recorder.
+    home : Home
+        Whose folder of logs may come later.
     start : int
         Log time from which on the events are to be known, in nanoseconds of UTC.
     stop : threading.Event
@@ -66,12 +65,14 @@ def follow_home(
     begun : list of Event
         Those that began since the last time.
     """
-    state = HomeState()
+    state, folder = HomeState(), home.folder
     while not folder.is_dir():
         damaged(LogError(f"{folder}: no such folder yet; waiting for a recorder"))
+        state.caught_up = True
         yield state, []
         if stop.wait(_WAIT_SECONDS):
             return
+    state.caught_up = False
     messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
     yielded, checked = -math.inf, folder
     for path, batch in messages:
@@ -80,7 +81,7 @@ def follow_home(
                 state.caught_up = True
                 yielded = time.monotonic()
                 yield state, []
-        elif log_name(path).node == node:
+        elif log_name(path).node == home.node:
             try:
                 if path != checked:
                     checked = path

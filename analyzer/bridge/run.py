@@ -1,8 +1,10 @@
 """The bridge: follows the log of a recorder, and tells everybody who is to know."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from threading import Event as Flag
 
 from hearthlog.analyzer.bridge.day import today
@@ -45,26 +47,20 @@ class Bridge:
         """Tell what is heard until `stop` is set."""
         keep_one_heap()
         notify(["READY=1"])
-        has_caught_up = False
-        early: list[Event] = []
+        early: deque[Event] = deque(maxlen=_MOST_EARLY)
+        had_caught_up = False
         try:
-            followed = follow_home(
-                self.home.folder, self.home.node, self.since, stop, self._damaged
-            )
-            for state, begun in followed:
+            for state, begun in follow_home(self.home, self.since, stop, self._damaged):
                 self._live()
+                early += begun
                 if state.caught_up:
-                    if not has_caught_up:
-                        has_caught_up = True
-                        give_back()  # what it took to read the log
-                    self._tell(state, [*early, *begun])
-                    early = []
-                else:
-                    early = [*early, *begun][-_MOST_EARLY:]
+                    self._tell(state, list(early), is_first=not had_caught_up)
+                    early.clear()
+                had_caught_up = state.caught_up
         finally:
             notify(["STOPPING=1"])
-            for output in self.outputs.values():
-                output.close()
+            for name, output in self.outputs.items():
+                self._try(name, output.close)
 
     def _live(self) -> None:
         """Tell systemd that the log is followed."""
@@ -72,19 +68,25 @@ class Bridge:
             self._watchdog_due = time.monotonic() + _WATCHDOG_SECONDS
             notify(["WATCHDOG=1"])
 
-    def _tell(self, state: HomeState, begun: Sequence[Event]) -> None:
+    def _tell(self, state: HomeState, begun: Sequence[Event], *, is_first: bool) -> None:
         now = time.time_ns()
         moment = today(now, self.home.zone)
         ended = [event for each in state.microphones.values() for event in each.ended_events()]
+        if is_first:
+            give_back()  # what it took to read the log
+            ended = [event for event in ended if now - event.end <= RECENT]
         for microphone in state.microphones.values():
             microphone.forget_before(min(moment.midnight, moment.night) - _FORGOTTEN)
         recent = [event for event in begun if now - event.end <= RECENT]
         news = News(state, recent, ended, moment, self.home.zone)
         for name, output in self.outputs.items():
-            try:
-                output.update(news)
-            except Exception as error:  # noqa: BLE001  one that fails must not stop the others
-                self.say(f"{name}: {type(error).__name__}: {error}")
+            self._try(name, partial(output.update, news))
+
+    def _try(self, name: str, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except Exception as error:  # noqa: BLE001  one that fails must not stop the others
+            self.say(f"{name}: {type(error).__name__}: {error}")
 
     def _damaged(self, error: Exception) -> None:
         self.say(str(error))
