@@ -15,6 +15,7 @@ from homelife import HOUR, midnight, write_day
 from pydantic import TypeAdapter
 
 from hearthlog.analyzer.bridge.alerts.evaluate import rings
+from hearthlog.analyzer.bridge.alerts.gathering import Gathered
 from hearthlog.analyzer.bridge.alerts.live_home import LiveHome
 from hearthlog.analyzer.bridge.alerts.memory import Memory
 from hearthlog.analyzer.bridge.alerts.open_run import Label
@@ -150,6 +151,24 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
         start(now).evaluate(lambda: heard, pytest.fail, now, now)
         start(now).save(now)
         assert start(now).evaluate(lambda: heard, pytest.fail, now + SECOND, now + SECOND) == []
+
+
+def test_a_new_rule_does_not_ring_for_the_silence_before_it(tmp_path):
+    silent = rule("recorder_silent", "silent", silent_for="10m")
+    memory = Memory(tmp_path / "rules.json", pytest.fail)
+    outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
+    begin = midnight(DAY)
+    watch = RuleWatch([silent], UTC, outbox, memory, pytest.fail, begin)
+    nothing = Gathered().heard()
+
+    def ring_times(minutes):
+        until = begin + minutes * 60 * SECOND
+        found = watch.evaluate(lambda: nothing, pytest.fail, until, until)
+        return [(ring.time - begin) // (60 * SECOND) for ring in found]
+
+    assert ring_times(1) == []
+    assert ring_times(9) == []
+    assert ring_times(30) == [10]  # no recorder came
 
 
 def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):

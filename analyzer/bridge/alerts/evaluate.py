@@ -62,7 +62,7 @@ def rings(  # noqa: PLR0913, PLR0917
     """
     found: list[Ring] = []
     last, has_rung = state.last, False
-    for alarm in _alarms(rule, heard, start, end, zone):
+    for alarm in _alarms(rule, heard, start, end, zone, state.since):
         if alarm.end <= start or alarm.start >= end:
             continue
         goes_on = alarm.start < start
@@ -72,11 +72,11 @@ def rings(  # noqa: PLR0913, PLR0917
             found.append(_ring(rule, heard, alarm, time, zone))
             last, rung = time, True
         has_rung = rung and alarm.end >= end
-    return found, RuleState(last, has_rung)
+    return found, RuleState(last, has_rung, state.since)
 
 
-def _alarms(
-    rule: AlertRule, heard: HomeHeard, start: int, end: int, zone: tzinfo
+def _alarms(  # noqa: PLR0913, PLR0917
+    rule: AlertRule, heard: HomeHeard, start: int, end: int, zone: tzinfo, since: int
 ) -> Sequence[Alarm]:
     """Find when what a rule looks for is the case; ascending, and apart from each other."""
     if isinstance(rule, MoreThan):
@@ -84,7 +84,7 @@ def _alarms(
     if isinstance(rule, LongerThan):
         return longer_than_alarms(rule, heard)
     if isinstance(rule, RecorderSilent):
-        return silent_alarms(rule, heard, start, end)
+        return silent_alarms(rule, heard, start, end, since)
     if isinstance(rule, NoneBy):
         return none_by_alarms(rule, heard, start, end, zone)
     return unlike_alarms(rule, heard, start, end, zone)

@@ -53,7 +53,9 @@ def longer_than_text(rule: LongerThan, since: str) -> str:
     return f"{rule.words} for longer than {duration_words(rule.longer_than)}, since {since}"
 
 
-def silent_alarms(rule: RecorderSilent, heard: HomeHeard, start: int, end: int) -> list[Alarm]:
+def silent_alarms(
+    rule: RecorderSilent, heard: HomeHeard, start: int, end: int, since: int
+) -> list[Alarm]:
     """Find when the recorder had written nothing for too long.
 
     Parameters
@@ -63,10 +65,13 @@ def silent_alarms(rule: RecorderSilent, heard: HomeHeard, start: int, end: int) 
     start, end : int
         In nanoseconds of UTC; where nothing was written in as long before the start, nothing was
         from ever on.
+    since : int
+        From when on the rule is in force, in nanoseconds of UTC: earlier silence does not count.
     """
     starts, ends = heard.written
     before = start - 1 - rule.silent_for
-    silences = zip([before, *ends.tolist()], [*starts.tolist(), end], strict=True)
+    lasts = (max(last, since) for last in [before, *ends.tolist()])
+    silences = zip(lasts, [*starts.tolist(), end], strict=True)
     return [
         Alarm(last + rule.silent_for, first)
         for last, first in silences

@@ -83,5 +83,5 @@ class Memory:
 
 
 def _progress(content: dict[str, int]) -> Progress:
-    state = RuleState(int(content["last"]), bool(content["has_rung"]))
+    state = RuleState(int(content["last"]), bool(content["has_rung"]), int(content["since"]))
     return Progress(int(content["until"]), state)

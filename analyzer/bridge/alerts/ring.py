@@ -3,6 +3,8 @@
 import hashlib
 from typing import NamedTuple
 
+_NEVER = -(1 << 62)
+
 
 class Ring(NamedTuple):
     """What a rule has to tell.
@@ -42,10 +44,14 @@ class RuleState(NamedTuple):
         When it rang last, in nanoseconds of UTC.
     has_rung : bool
         Whether it has rung for what is the case where its evaluation ended.
+    since : int
+        From when on it is in force, in nanoseconds of UTC: of the time before nobody knows whether
+        there was a recorder.
     """
 
-    last: int = -(1 << 62)
+    last: int = _NEVER
     has_rung: bool = False
+    since: int = _NEVER
 
 
 class Alarm(NamedTuple):

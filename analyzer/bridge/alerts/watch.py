@@ -65,7 +65,7 @@ class RuleWatch:
             self._say(f"{rule.name}: was evaluated up to a time to come; did the clock run ahead?")
             return Progress(now, RuleState())
         if not own.until:
-            return Progress(now, own.state)
+            return Progress(now, own.state._replace(since=now))
         if own.until < now - _OLDEST:
             return Progress(now - _OLDEST, own.state._replace(has_rung=False))
         return own
