@@ -165,10 +165,10 @@ def paused_until(folder: Path) -> float | None:
         Of the logs.
     """
     try:
-        end = float(int(_read_pause(folder).partition(b"\n")[0]))
+        end = int(_read_pause(folder).partition(b"\n")[0])
     except (OSError, ValueError):  # in doubt nobody is listened to
         return None
-    return end if end < _LAST else None
+    return float(end) if end < _LAST else None
 
 
 def _paused_by(folder: Path) -> str:

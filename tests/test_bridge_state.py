@@ -13,7 +13,7 @@ from hearthlog.analyzer.bridge.day import iso_time, today
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import EventRecord
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HeardNow
-from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
+from hearthlog.analyzer.bridge.home_state import Health, HomeState, MicrophoneState
 from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
@@ -188,3 +188,32 @@ def test_the_recorder_takes_no_notice_of_the_table_of_the_bridge(tmp_path):
     assert bridge.mqtt is not None
     assert bridge.mqtt.host == "broker"
     assert bridge.ping is None
+
+
+def test_a_segment_that_is_written_twice_is_counted_once():
+    record = EventRecord("mic", "coughing")
+    spans = [(n * 20 * NANOSECONDS, (n * 20 + 2) * NANOSECONDS) for n in range(5)]
+    for start, end in [*spans, *spans[2:], (200 * NANOSECONDS, 201 * NANOSECONDS)]:
+        record.push(start, end, 1.0)
+    assert [event.seconds for event in record.events] == [2, 2, 2, 2, 2, 1]
+
+
+def test_events_of_a_clock_that_ran_ahead_are_forgotten_but_not_the_last_one():
+    record = EventRecord("mic", "coughing")
+    for start in (100, 200, 300, 9000):
+        record.push(start * NANOSECONDS, (start + 1) * NANOSECONDS, 1.0)
+    record.forget(250 * NANOSECONDS, 1000 * NANOSECONDS)
+    assert [event.start // NANOSECONDS for event in record.events] == [300]
+    record.forget(5000 * NANOSECONDS, 6000 * NANOSECONDS)
+    assert [event.start // NANOSECONDS for event in record.events] == [300]
+    assert record.push(9002 * NANOSECONDS, 9003 * NANOSECONDS, 1.0)  # not with the forgotten one
+
+
+def test_what_a_recorder_speaks_of_no_more_is_forgotten_a_log_later():
+    state = HomeState()
+    for subjects in (("mic", "porch"), ("mic",), ("mic",)):
+        state.begin_log()
+        for subject in subjects:
+            state._said.add(subject)
+            state.health[subject] = Health(0, "")
+    assert set(state.health) == {"mic"}

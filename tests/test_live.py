@@ -17,8 +17,8 @@ from test_disk import small_disk
 from test_rest import recording
 from test_swap import wait_for
 
+from hearthlog.analyzer import ping
 from hearthlog.analyzer.live import examine_live
-from hearthlog.tools.cli import ping
 
 __all__ = ["small_disk"]
 

@@ -10,6 +10,7 @@ import pytest
 from livehome import LiveHome
 from prometheus_client.parser import text_string_to_metric_families
 
+from hearthlog.analyzer.bridge import prometheus
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
@@ -82,6 +83,12 @@ def wait_for(text_of):
     pytest.fail("no figures came")
 
 
+def known(port):
+    """The text of the figures; empty while there are none."""
+    status, text = ask(port)
+    return text if status == 200 else ""
+
+
 def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
     home.heard("coughing", 30, seconds=2)
     home.heard("coughing", 20, seconds=3)
@@ -89,7 +96,7 @@ def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
     home.says("mic", 1, "the microphone clips", level_dbfs="-40.5")
     port = free_port()
     with Bridged(home, tmp_path, port=port):
-        found = wait_for(lambda: ask(port)[1])
+        found = wait_for(lambda: known(port))
     assert found["hearthlog_events_total", "coughing", "mic"] == 2
     assert found["hearthlog_event_seconds_total", "coughing", "mic"] == 5
     assert found["hearthlog_listening", "mic"] == found["hearthlog_recording",] == 1
@@ -113,7 +120,17 @@ def test_the_port_answers_who_asks_for_an_address_in_digits(home, tmp_path, path
     home.hears("silence")
     port = free_port()
     with Bridged(home, tmp_path, port=port):
+        wait_for(lambda: known(port))
         assert ask(port, path, **fields)[0] == status
+
+
+def test_figures_that_are_old_are_not_given(home, tmp_path, monkeypatch):
+    home.hears("silence")
+    port = free_port()
+    with Bridged(home, tmp_path, port=port):
+        wait_for(lambda: known(port))
+        monkeypatch.setattr(prometheus, "_STALE_SECONDS", -1.0)
+        assert ask(port)[0] == 503
 
 
 def test_the_port_is_of_loopback_alone(home, tmp_path):

@@ -1,11 +1,15 @@
 """The events of one class that a microphone heard lately, put together segment by segment."""
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
+from collections import deque
 from typing import NamedTuple
 
 from hearthlog.schemas.times import NANOSECONDS
 
 PAUSE_SECONDS = 10  # between the segments of one event, at most: as in the report
+
+
+_MOST_AGAIN = 50  # segments that a recorder writes again after its disk was full
 
 
 class Event(NamedTuple):
@@ -48,6 +52,7 @@ class EventRecord:
         self._label = label
         self.events: list[Event] = []  # by their starts
         self._current: Event | None = None  # with which a segment may go on
+        self._segments: deque[tuple[int, int]] = deque(maxlen=_MOST_AGAIN)  # the last ones
 
     def push(self, start: int, end: int, confidence: float) -> bool:
         """Add a segment; tell whether an event begins with it.
@@ -59,6 +64,9 @@ class EventRecord:
         confidence : float
             Of the segment.
         """
+        if (start, end) in self._segments:  # written again, as the disk had refused it
+            return False
+        self._segments.append((start, end))
         seconds = (end - start) / NANOSECONDS
         current = self._current
         if current is None or not _goes_on(current, start):
@@ -79,13 +87,20 @@ class EventRecord:
         """Return the events that began at a time or later, in nanoseconds of UTC."""
         return self.events[bisect_left(self.events, time, key=_start) :]
 
-    def forget_before(self, time: int) -> None:
-        """Forget the events that began before a time, but for the last one."""
-        first = bisect_left(self.events, time, key=_start)
-        forgotten = min(first, max(len(self.events) - 1, 0))
-        if forgotten:
-            del self.events[:forgotten]
-            if self._current not in self.events:
+    def forget(self, before: int, after: int) -> None:
+        """Forget the events that began before a time, but for the last one, and after another one.
+
+        Parameters
+        ----------
+        before, after : int
+            In nanoseconds of UTC.
+        """
+        first = bisect_left(self.events, before, key=_start)
+        end = bisect_right(self.events, after, key=_start)
+        kept = self.events[min(first, max(end - 1, 0)) : end]
+        if len(kept) < len(self.events):
+            self.events = kept
+            if self._current not in kept:
                 self._current = None
 
 

@@ -85,6 +85,7 @@ def follow_home(
             try:
                 if path != checked:
                     checked = path
+                    state.begin_log()
                     _check_version(path, damaged)
                 begun = state.push(_decode(batch))
             except LogError as error:

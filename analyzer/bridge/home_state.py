@@ -125,17 +125,28 @@ class MicrophoneState:
         ended = []
         for label in sorted(self._unended):
             event = self._records[label].events[-1]
-            if abs(self.heard.time - event.end) > _DECIDED:  # before it, if the clock was set back
+            # Before it, if the clock was set back.
+            is_over = abs(self.heard.time - event.end) > _DECIDED
+            if is_over or not self.is_listening():
                 ended.append(event)
         self._unended.difference_update(event.label for event in ended)
         return ended
 
-    def forget_before(self, time: int) -> None:
-        """Forget the events that began before a time, but for the last one of each class."""
+    def forget(self, before: int, after: int) -> None:
+        """Forget the events that began before a time, but for the last one of each class.
+
+        Parameters
+        ----------
+        before : int
+            In nanoseconds of UTC.
+        after : int
+            The same: what began later is of a clock that ran ahead, and forgotten as well.
+        """
         for record in self._records.values():
-            record.forget_before(time)
-        if self.gaps and self.gaps[0][1] < time:
-            self.gaps = [gap for gap in self.gaps if gap[1] >= time]
+            record.forget(before, after)
+        self._unended = {label for label in self._unended if self._records[label].events}
+        if self.gaps and self.gaps[0][1] < before:
+            self.gaps = [gap for gap in self.gaps if gap[1] >= before]
 
     def _is_full(self) -> bool:
         return len(self._records) >= _MOST_CLASSES
@@ -158,14 +169,20 @@ class HomeState:
         self.health: dict[str, Health] = {}
         self.caught_up = False
         self._seen = -math.inf  # when anything came, by CLOCK_MONOTONIC
+        self._said: set[str] = set()  # subjects of the health in the log that is read
 
     def is_recording(self) -> bool:
         """Tell whether anything was written in the last fifteen seconds."""
         return time.monotonic() - self._seen <= _AWAY_SECONDS
 
+    def begin_log(self) -> None:
+        """Forget the health of what was spoken of in the log before the last one, and no more."""
+        self.health = {name: each for name, each in self.health.items() if name in self._said}
+        self._said.clear()
+
     def find_event(self, identifier: str) -> Event | None:
         """Return the event of an id; None if it is not known, or no more."""
-        for microphone in self.microphones.values():
+        for microphone in list(self.microphones.values()):  # it may be asked in another thread
             for label in microphone.labels():
                 for event in microphone.events(label, 0):
                     if event.id == identifier:
@@ -216,6 +233,7 @@ class HomeState:
         for status in (each for same in columns["status"] for each in same):
             subject = str(status["name"]).removeprefix("hearthlog: ")
             if subject in self.health or len(self.health) < _MOST_CLASSES:
+                self._said.add(subject)
                 self.health[subject] = Health(int(status["level"]), str(status["message"]))
             microphone = self.microphones.get(subject)
             if microphone is not None:

@@ -10,10 +10,12 @@ from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News, Output
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import BridgeSettings
+from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
 
 _OLDEST = 7 * 24 * 3600 * NANOSECONDS  # how far back the log is read at most, at a start
+_EARLIER = 6 * 3600 * NANOSECONDS  # so much longer no event takes, so that those are known whole
 _AGAIN_SECONDS = 60.0
 
 _Output = TypeVar("_Output", bound=Output)
@@ -89,7 +91,7 @@ def open_outputs(
         If a package that one needs is not installed.
     """
     moment = today(time.time_ns(), home.zone)
-    since = min(moment.midnight, moment.night)
+    since = min(moment.midnight, moment.night) - _EARLIER
     outputs: dict[str, Output] = {}
     # Imported here: who wants no broker needs no client of one.
     if (mqtt := settings.mqtt) is not None:
@@ -101,12 +103,11 @@ def open_outputs(
         from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415
 
         first = since
-        prometheus = Reopened(
+        outputs["prometheus"] = Reopened(
             lambda: PrometheusOutput(figures, home, state_folder, first, say), say
         )
-        outputs["prometheus"] = prometheus
-        if prometheus.output is not None:
-            since = min(since, max(prometheus.output.totals.time, moment.now - _OLDEST))
+        kept = kept_until(state_folder / TOTALS, since) - _EARLIER
+        since = min(since, max(kept, moment.now - _OLDEST))
     if (page := settings.page) is not None:
         from hearthlog.analyzer.bridge.page.home_page import HomePage  # noqa: PLC0415
 

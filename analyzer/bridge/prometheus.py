@@ -1,8 +1,10 @@
 """Figures for Prometheus: in a text file of node_exporter, or on a port of loopback."""
 
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
@@ -16,14 +18,13 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
-from hearthlog.analyzer.bridge.totals import Total, Totals
+from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
 from hearthlog.analyzer.ports import HOST, is_asked_in_digits
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
-_EVERY_SECONDS = 10.0
+_EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
 _LATER = 12 * 3600 * NANOSECONDS  # than its beginning an event may be known
-_TOTALS = "totals.json"
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 _TIMEOUT_SECONDS = 5.0
 _LABELS = ("node", "microphone", "label")
@@ -64,8 +65,8 @@ class PrometheusOutput:
         self._settings = settings
         self._home = home
         self._say = say
-        self.totals = Totals(state_folder / _TOTALS, since)
-        self._text = b""
+        self.totals = Totals(state_folder / TOTALS, since)
+        self._text, self._made = b"", -math.inf  # and when, by CLOCK_MONOTONIC
         self._lock = Lock()
         self._due = 0.0  # by CLOCK_MONOTONIC
         self._server = None if settings.port is None else self._listen(settings.port)
@@ -80,7 +81,7 @@ class PrometheusOutput:
         registry.register(_Figures(news, self._home, self.totals.count(news.state)))
         text = generate_latest(registry)
         with self._lock:
-            self._text = text
+            self._text, self._made = text, time.monotonic()
         if self._settings.text_file is not None:
             with replaced_file(self._settings.text_file) as temporary:
                 temporary.write_bytes(text)
@@ -113,9 +114,13 @@ class PrometheusOutput:
         if request["REQUEST_METHOD"] != "GET" or request["PATH_INFO"] != "/metrics":
             start_response("404 Not Found", [("Content-Type", _TEXT)])
             return [b"there is /metrics\n"]
-        start_response("200 OK", [("Content-Type", _TEXT)])
         with self._lock:
-            return [self._text]
+            text, made = self._text, self._made
+        if time.monotonic() - made > _STALE_SECONDS:
+            start_response("503 Service Unavailable", [("Content-Type", _TEXT)])
+            return [b"what is known is old\n"]
+        start_response("200 OK", [("Content-Type", _TEXT)])
+        return [text]
 
 
 class _Handler(WSGIRequestHandler):
@@ -155,8 +160,9 @@ class _Figures(Collector):
             [((node, subject), health.level) for subject, health in state.health.items()],
             "subject",
         )
-        free = shutil.disk_usage(self._home.folder).free
-        yield _gauge("free_bytes", "Of the disk of the logs.", [((node,), free)])
+        with suppress(OSError):  # it is away
+            free = shutil.disk_usage(self._home.folder).free
+            yield _gauge("free_bytes", "Of the disk of the logs.", [((node,), free)])
 
     def _of_microphones(self) -> Iterator[Metric]:
         node = self._home.node

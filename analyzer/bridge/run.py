@@ -19,6 +19,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _WATCHDOG_SECONDS = 10.0
 _MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of
+_AHEAD = 3600 * NANOSECONDS  # of now: so much later no event can begin
 _FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
 
 
@@ -75,12 +76,12 @@ class Bridge:
         if is_first:
             give_back()  # what it took to read the log
             ended = [event for event in ended if now - event.end <= RECENT]
-        for microphone in state.microphones.values():
-            microphone.forget_before(min(moment.midnight, moment.night) - _FORGOTTEN)
         recent = [event for event in begun if now - event.end <= RECENT]
         news = News(state, recent, ended, moment, self.home.zone)
         for name, output in self.outputs.items():
             self._try(name, partial(output.update, news))
+        for microphone in state.microphones.values():
+            microphone.forget(min(moment.midnight, moment.night) - _FORGOTTEN, now + _AHEAD)
 
     def _try(self, name: str, step: Callable[[], None]) -> None:
         try:

@@ -3,6 +3,7 @@
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from threading import Lock
 
 _AGAIN_SECONDS = 3600.0
@@ -33,4 +34,5 @@ class Saying:
             self._said.move_to_end(line)
             if len(self._said) > _MOST:
                 self._said.popitem(last=False)
-        self._say(line)
+        with suppress(OSError, ValueError):  # a full disk, or nobody who reads it
+            self._say(line)

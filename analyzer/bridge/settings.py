@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
@@ -16,6 +16,16 @@ _Topic = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^+#\x00]
 _Port = Annotated[int, Field(ge=1, le=65535)]
 
 
+def _check_host(name: str) -> str:
+    try:
+        encoded = name.encode("idna")
+    except UnicodeError:
+        encoded = b""
+    if not encoded:
+        raise ValueError(f"{name[:64]!r} cannot be the name of a host")
+    return name
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -23,7 +33,9 @@ class _Table(BaseModel):
 class MqttSettings(_Table):
     """A broker, and how one speaks to it."""
 
-    host: str = Field(min_length=1, description="Name or address of the broker.")
+    host: Annotated[str, AfterValidator(_check_host)] = Field(
+        description="Name or address of the broker."
+    )
     port: _Port | None = Field(default=None, description="1883, with TLS 8883, by default.")
     user: str = Field(default="", description="Empty: nobody in particular.")
     password_file: Path | None = Field(default=None, description="Of one line.")

@@ -1,5 +1,6 @@
 """How often and how long each class was heard since a bridge was first started, from the log."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
+TOTALS = "totals.json"  # in the folder of the state
 _LIMIT = 1 << 20  # bytes
 
 
@@ -115,3 +117,29 @@ class Totals:
         except (OSError, HearthlogError) as error:
             raise BridgeError(f"{self._path}: cannot be written ({error})") from error
         self.time, self._kept = kept.time, kept.totals
+
+
+def kept_until(path: Path, default: int) -> int:
+    """Return before which time events are in a file, in nanoseconds of UTC.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    default : int
+        What is returned if there is none of use.
+    """
+    with suppress(HearthlogError):
+        kept = _read(path)
+        return default if kept is None else kept.time
+    return default
+
+
+def _read(path: Path) -> _Kept | None:
+    if not path.exists():
+        return None
+    data = read_whole(path, "file of totals", _LIMIT, BridgeError)
+    try:
+        return _Kept.model_validate_json(data)
+    except ValidationError as error:
+        raise BridgeError(f"{path}: is damaged; delete it, and counts begin anew") from error

@@ -64,6 +64,7 @@ def install_bridge(config: Path, account: str | None) -> Installed:
     _check_person(account or RECORDER)
     figures = None if bridge.prometheus is None else bridge.prometheus.text_file
     written = [] if figures is None else [figures.absolute().parent]
+    written += [] if bridge.state is None else [bridge.state.absolute()]
     text = bridge_unit(verb_command("bridge", config), account, RECORDER, logs, written)
     write_unit(unit, text)
     return Installed(unit, start_unit(BRIDGE_NAME, is_running=is_systemd_running()))

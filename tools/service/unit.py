@@ -94,8 +94,9 @@ def bridge_unit(
         If a name cannot stand in a unit.
     """
     own = f"DynamicUser=yes\nSupplementaryGroups={recorder}"
-    access = [f"{'ReadOnlyPaths' if account is None else 'ReadWritePaths'}={_word(logs)}"]
-    access += [f"ReadWritePaths={_word(folder)}" for folder in written]
+    # A folder that is not there yet is waited for.
+    access = [f"{'ReadOnlyPaths' if account is None else 'ReadWritePaths'}={_word(f'-{logs}')}"]
+    access += [f"ReadWritePaths={_word(f'-{folder}')}" for folder in written]
     return _filled(
         "bridge.service",
         command=_command(command),

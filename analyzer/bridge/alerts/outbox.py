@@ -115,6 +115,18 @@ class Outbox:
             else:
                 self._write(waiting)
 
+    def forget_after(self, time: int) -> None:
+        """Forget the rings of a time to come, which rang while the clock was ahead.
+
+        Parameters
+        ----------
+        time : int
+            In nanoseconds of UTC.
+        """
+        with self._lock:
+            for name in [n for n, each in self._waiting.items() if each.ring.time > time]:
+                self._remove(name)
+
     def _drop_oldest(self) -> None:
         number = len(self._waiting) - self._most
         if number > 0:

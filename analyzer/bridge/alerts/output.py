@@ -19,7 +19,7 @@ from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.alerts.targets import read_targets
-from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
+from hearthlog.analyzer.bridge.alerts.watch import AHEAD, RuleWatch
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News
@@ -31,10 +31,11 @@ from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.times import NANOSECONDS
 
-# Told the name of a rule, a text, and when it rang; returns whether somebody takes it.
+# Told the name of a rule, a text, and when it rang; returns whether somebody has taken it.
 OnRing = Callable[[str, str, int], bool]
 BROKER = "mqtt"  # in the place of the name of a target
 _PATIENCE = 30 * NANOSECONDS
+_TO_COME = 60 * NANOSECONDS  # from now: what is later was written while a clock was ahead
 _LOOK_SECONDS = 1.0
 _FORGET_SECONDS = 300.0
 _CLOSE_SECONDS = 2.0
@@ -56,7 +57,8 @@ class AlertsOutput:
         Told what is wrong, in a line.
     on_ring : callable, optional
         Told the name of the rule, the text and the time (nanoseconds of UTC) of each ring, in the
-        thread of `update`; told again unless it returns that somebody takes it.
+        thread of `update`; told the same at each update, and nothing else, until it returns that
+        somebody has taken it.
 
     Raises
     ------
@@ -91,12 +93,13 @@ class AlertsOutput:
         except OSError as error:
             raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
         memory = Memory(folder / "rules.json", say)
-        now = time.time_ns()
+        now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
         self._heard = LiveHome(self._watch.start, _PATIENCE)
         self._began = time.monotonic()
         self._has_news = Flag()  # what is heard now is known
         self._labels: deque[tuple[str, Label, Sequence[str]]] = deque(maxlen=_LABELS)
+        self._told_now: tuple[Ring, str] | None = None  # of which the broker is told
         self._stop = Flag()
         self._delivery = Delivery(self._outbox, targets, home.node, home.zone, say)
         self._thread = Thread(target=self._run, daemon=True, name="alerts")
@@ -110,8 +113,8 @@ class AlertsOutput:
                 self._labels.append((microphone.name, label, microphone.classes))
         self._has_news.set()
         if self._on_ring is not None:
-            for ring in self._outbox.waiting_for(BROKER, time.time_ns()):
-                self._tell_broker(ring, self._on_ring)
+            while self._tell_broker(self._on_ring):
+                pass
 
     def close(self) -> None:
         """End within seconds; what was not told waits for the next start."""
@@ -119,9 +122,20 @@ class AlertsOutput:
         self._thread.join(_CLOSE_SECONDS)
         self._delivery.close()
 
-    def _tell_broker(self, ring: Ring, on_ring: OnRing) -> None:
-        if on_ring(ring.rule, message(ring, self._followed.zone), ring.time):
+    def _tell_broker(self, on_ring: OnRing) -> bool:
+        """Tell of one ring, the same one until it is taken; return whether it was."""
+        if self._told_now is None:
+            waiting = self._outbox.waiting_for(BROKER, time.time_ns())
+            if not waiting:
+                return False
+            # Written once: minutes later it would say that it is late, and be another message.
+            self._told_now = waiting[0], message(waiting[0], self._followed.zone)
+        ring, text = self._told_now
+        is_taken = on_ring(ring.rule, text, ring.time)
+        if is_taken:
             self._outbox.note_told(BROKER, ring)
+            self._told_now = None
+        return is_taken
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -133,9 +147,14 @@ class AlertsOutput:
         self._watch.save(time.time_ns())
 
     def _follow(self) -> None:
-        """Read what is written, and evaluate the rules whenever all of it has been read."""
+        """Read what is written, and evaluate the rules whenever all of it has been read.
+
+        Ends when the clock is set back: what was read may be of a time to come.
+        """
         logs, looked, forgot = self._followed.folder, 0.0, time.monotonic()
-        start = self._watch.needed_from(time.time_ns())
+        now = self._latest = time.time_ns()
+        self._watch.set_right(now)
+        start = self._watch.needed_from(now)
         self._heard = LiveHome(start, _PATIENCE)
         while not logs.is_dir():
             self._look()
@@ -144,6 +163,8 @@ class AlertsOutput:
         batches = follow_messages(logs, is_of_alerts, start, self._stop, self._damaged, ticks=True)
         caught_up = False
         for path, batch in batches:
+            if self._now() < self._latest - AHEAD:
+                return
             if path == logs:
                 caught_up = True
             elif log_name(path).node == self._followed.node:
@@ -157,17 +178,28 @@ class AlertsOutput:
 
     def _push(self, path: Path, batch: Sequence[RawMessages]) -> None:
         try:
-            self._heard.push(_decoded(batch))
+            end = self._now() + _TO_COME
+            known = [raw.between(None, end) for raw in batch]
+            if sum(map(len, known)) < sum(map(len, batch)):
+                self._say(f"alerts: {path}: what is of a time to come is left out; was its clock ahead?")
+            self._heard.push(_decoded(known))
         except LogError as error:
             self._damaged(LogError(f"{path}: {error}"))
 
     def _look(self) -> None:
         if not self._has_news.is_set() and time.monotonic() - self._began < _WAIT_SECONDS:
             return
+        now = self._now()
         while self._labels:
-            self._heard.add_label(*self._labels.popleft())
-        now = time.time_ns()
+            name, label, classes = self._labels.popleft()
+            if label.time < now + _TO_COME:
+                self._heard.add_label(name, label, classes)
         self._watch.evaluate(self._heard.heard, self._weeks, self._heard.known_until(now), now)
+
+    def _now(self) -> int:
+        now = time.time_ns()
+        self._latest = max(self._latest, now)
+        return now
 
     def _weeks(self, start: int, end: int) -> HomeHeard:
         """Read weeks from the logs, once a day; what cannot be read was not heard."""

@@ -2,17 +2,19 @@
 
 import hashlib
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
 from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.schemas.storage.small_file import read_whole
-from hearthlog.schemas.text import shortened
 
 _LIMIT = 1 << 16  # bytes of the file
-_LONGEST = 120  # characters of a reason
 _OTHERS = 0o004
+_HOST = re.compile(r"localhost|\[[0-9a-f:.]+\]|[\w-]+(\.[\w-]+)+", re.ASCII | re.IGNORECASE)
+_CODE = re.compile(r"\berror=(\d{3})\b")
 
 
 class Target(Protocol):
@@ -24,7 +26,7 @@ class Target(Protocol):
 
     @property
     def place(self) -> str:
-        """What people call the target."""
+        """What people call the target; it gives nothing away either."""
 
     def deliver(self, title: str, text: str) -> str:
         """Tell; return why it could not be told, or an empty text.
@@ -44,12 +46,14 @@ class AppriseTarget:
         The address, as Apprise has read it.
     address : str
         A secret.
+    line : int
+        Number of its line in the file.
     """
 
-    def __init__(self, plugin: Any, address: str) -> None:
+    def __init__(self, plugin: Any, address: str, line: int) -> None:
         self._plugin = plugin
         self.name = hashlib.sha256(address.encode()).hexdigest()[:16]
-        self.place = shortened(plugin.url(privacy=True).partition("?")[0], _LONGEST)
+        self.place = f"line {line}, {_scheme_and_host(plugin, address)}"
 
     def deliver(self, title: str, text: str) -> str:
         """Tell, within the seconds that the address allows; return why it could not be told.
@@ -66,8 +70,23 @@ class AppriseTarget:
             )
             if done:
                 return ""
-            lines = said.getvalue().split("\n")
-        return shortened(lines[0].rstrip("."), _LONGEST) or "no reason is given"
+            return _reason(said.getvalue())
+
+
+def _scheme_and_host(plugin: Any, address: str) -> str:
+    scheme, host = address.partition("://")[0], plugin.host or ""
+    # Many services have a token in the place of the host, or a topic, in which there is no dot.
+    is_host = "host" in (plugin.template_tokens or {}) and _HOST.fullmatch(host)
+    return f"{scheme}://{host}" if is_host else scheme
+
+
+def _reason(said: str) -> str:
+    """Say what is known of a failure, without what Apprise says: it has topics and paths in it."""
+    code = _CODE.search(said)
+    if code:
+        return f"error {code[1]}"
+    is_away = "connection error" in said.lower()
+    return "no connection" if is_away else "`apprise --body test ADDRESS` says why"
 
 
 def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
@@ -76,6 +95,7 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
     Parameters
     ----------
     file : Path
+        As `secret_path` finds it.
     say : callable
         Told in a line that others may read the file.
 
@@ -86,6 +106,7 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
     """
     import apprise  # noqa: PLC0415
 
+    file = secret_path(file)
     data = read_whole(file, "file of addresses", _LIMIT, BridgeError)
     if file.stat().st_mode & _OTHERS:
         say(f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}")
@@ -104,7 +125,7 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
             raise BridgeError(
                 f"{file}, line {number}: no address that Apprise knows; docs/alerts.md has examples"
             )
-        targets.append(AppriseTarget(plugin, address))
+        targets.append(AppriseTarget(plugin, address, number))
     if not targets:
         raise BridgeError(f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic")
     return targets

@@ -5,7 +5,7 @@ from datetime import tzinfo
 from functools import cache
 
 from hearthlog.analyzer.bridge.alerts.daily import judged_days
-from hearthlog.analyzer.bridge.alerts.duration import DAY, HOUR, MINUTE, SECOND
+from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND
 from hearthlog.analyzer.bridge.alerts.evaluate import rings
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.memory import Memory, Progress
@@ -16,6 +16,7 @@ from hearthlog.analyzer.bridge.alerts.rules import AlertRule, UnlikeUsual, histo
 _OLDEST = DAY  # what rang longer ago is not told any more
 _EVERY = SECOND  # of the log
 _SAVE_EVERY = 5 * MINUTE
+AHEAD = 5 * SECOND  # that make a clock one that was set back
 
 
 class RuleWatch:
@@ -54,21 +55,24 @@ class RuleWatch:
         self._memory = memory
         self._say = say
         self._progress = memory.load(rules)
-        for rule in rules:
-            self._progress[rule.name] = self._as_of(rule, now)
         self._saved = now
+        self.set_right(now)
         self.start = self.needed_from(now)
 
-    def _as_of(self, rule: AlertRule, now: int) -> Progress:
-        own = self._progress[rule.name]
-        if own.until > now + HOUR:
-            self._say(f"{rule.name}: was evaluated up to a time to come; did the clock run ahead?")
-            return Progress(now, RuleState())
-        if not own.until:
-            return Progress(now, own.state._replace(since=now))
-        if own.until < now - _OLDEST:
-            return Progress(now - _OLDEST, own.state._replace(has_rung=False))
-        return own
+    def set_right(self, now: int) -> None:
+        """Let rules begin anew that are evaluated up to a time to come, or up to long ago.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
+        is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
+        self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
+        if is_ahead:
+            self._say("alerts: the clock was ahead, and was set back; the rules begin anew")
+            self._outbox.forget_after(now + AHEAD)
+            self.save(now)
 
     def needed_from(self, now: int) -> int:
         """Return from when on what was heard has to be known, in nanoseconds of UTC.
@@ -105,6 +109,7 @@ class RuleWatch:
         -------
         list of Ring
         """
+        self.set_right(now)
         found: list[Ring] = []
         heard_once = cache(heard)
         for rule in self._rules:
@@ -136,3 +141,11 @@ class RuleWatch:
         """
         self._memory.save(self._rules, self._progress)
         self._saved = now
+
+
+def _as_of(own: Progress, now: int) -> Progress:
+    if own.until > now + AHEAD or not own.until:
+        return Progress(now, RuleState(since=now))
+    if own.until < now - _OLDEST:
+        return Progress(now - _OLDEST, own.state._replace(has_rung=False))
+    return own

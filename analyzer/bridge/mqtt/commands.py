@@ -2,6 +2,7 @@
 
 import queue
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
 from threading import Thread
@@ -14,7 +15,6 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.recorder import rest
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.labels import spelt
 
 _WAITING = 20  # commands; more are refused
@@ -100,15 +100,16 @@ class Commands:
 
     def close(self) -> None:
         """End when the command that is carried out is done."""
-        while not self._waiting.empty():
-            self._waiting.get_nowait()
+        with suppress(queue.Empty):
+            while True:
+                self._waiting.get_nowait()
         self._waiting.put(None)
 
     def _work(self) -> None:
         while (item := self._waiting.get()) is not None:
             try:
                 self._answered(Answer(True, self._carry_out(*item)))
-            except (HearthlogError, OSError) as error:
+            except Exception as error:  # noqa: BLE001  the next one is to be carried out
                 self._answered(Answer(False, f"refused: {error}"))
 
     def _carry_out(self, payload: bytes, find_event: FindEvent) -> str:

@@ -24,6 +24,7 @@ from hearthlog.schemas.storage.small_file import read_whole
 _KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
 _QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection
 _KEPT_SECONDS = 0.5  # in which a broker sends what it kept to who has subscribed
+_ANSWER_SECONDS = 2.0  # in which a broker has taken an event
 _TIMELY_SECONDS = 60.0  # after which an event is no news
 _FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
 _CLOSE_SECONDS = 2.0
@@ -84,13 +85,11 @@ class Connection:
         self._values: dict[str, str] = {}  # the newest of each topic that the broker keeps
         self._unsent: dict[str, None] = {}  # topics, in order
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_QUEUED)
+        self._sent: tuple[float, mqtt.MQTTMessageInfo] | None = None  # the last event, and when
+        self._delivering: dict[tuple[str, str], mqtt.MQTTMessageInfo] = {}
         self._ready_at = math.inf  # by CLOCK_MONOTONIC: when the broker has sent what it kept
         self._is_new = False  # a connection to which nothing was said yet
         self._client = self._make_client(settings)
-
-    def is_open(self) -> bool:
-        """Tell whether the broker is connected."""
-        return self._client.is_connected()
 
     def is_ready(self) -> bool:
         """Tell whether the broker is connected, and has sent what it kept."""
@@ -110,6 +109,20 @@ class Connection:
         """Publish an event, now or within a minute."""
         self._events.append((time.monotonic(), topic, payload))
 
+    def deliver(self, topic: str, payload: str) -> bool:
+        """Publish what must arrive; to be called again until the broker has it, which it tells."""
+        key = topic, payload
+        info = self._delivering.get(key)
+        try:
+            if info is not None and info.is_published():
+                del self._delivering[key]
+                return True
+            if info is None and self.is_ready():
+                self._delivering[key] = self._client.publish(topic, payload, _QOS)
+        except (RuntimeError, ValueError):  # the queue was full
+            del self._delivering[key]
+        return False
+
     def repeat(self) -> None:
         """Say all values again at the next `flush`."""
         self._unsent = dict.fromkeys(self._values)
@@ -125,12 +138,21 @@ class Connection:
             if not self._publish(topic, self._values[topic], retain=True):
                 return
             del self._unsent[topic]
-        while self._events:
+        while self._events and self._is_answering():
             known, topic, payload = self._events[0]
             timely = time.monotonic() - known <= _TIMELY_SECONDS
             if timely and not self._publish(topic, payload, retain=False):
                 return
             self._events.popleft()
+
+    def _is_answering(self) -> bool:
+        """Tell whether the broker takes events: what it does not, it would get late."""
+        if self._sent is None:
+            return True
+        when, info = self._sent
+        with suppress(RuntimeError, ValueError):
+            return info.is_published() or time.monotonic() - when < _ANSWER_SECONDS
+        return False
 
     def close(self) -> None:
         """Say `offline`, and end."""
@@ -183,6 +205,8 @@ class Connection:
         if not retain:
             properties.MessageExpiryInterval = round(_TIMELY_SECONDS)
         info = self._client.publish(topic, payload, _QOS, retain=retain, properties=properties)
+        if not retain:
+            self._sent = time.monotonic(), info
         return info.rc in {mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_NO_CONN}  # the second is queued
 
     def _on_connect(
@@ -192,6 +216,7 @@ class Connection:
             self._say(f"{self._place}: refused: {reason}; see user, password_file and client_id")
             return
         self._connected = time.monotonic()
+        self._sent = None
         for topic in self._subscriptions:
             client.subscribe(topic, _QOS)
         client.publish(self._alive, "online", _QOS, retain=True)

@@ -19,7 +19,7 @@ from hearthlog.analyzer.bridge.mqtt.held_values import HeldValues
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.text import shortened
 
 _ONLINE = {True: "online", False: "offline"}
@@ -52,19 +52,17 @@ class MqttPublisher:
         self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
         self._held = HeldValues(topics)
-        self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)  # that were not told of yet
+        # Events that were not told of yet.
+        self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)
+        self._ended: deque[Event] = deque(maxlen=_MOST_BEGUN)
         self._is_born = False
         subscriptions = self._held.subscriptions
         if settings.home_assistant:
             subscriptions.append(self._birth_topic)
-        self._commands = None
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
         if settings.commands:
             subscriptions.append(self._command_topic)
-            self._commands = Commands(
-                home.folder, home.node, self._held.switch, self._answers.append
-            )
         client_id = settings.client_id or f"hearthlog-{home.node}"
         self._connection = Connection(
             settings,
@@ -74,6 +72,11 @@ class MqttPublisher:
             subscriptions=subscriptions,
             received=self._take,
         )
+        self._commands = None
+        if settings.commands:
+            self._commands = Commands(
+                home.folder, home.node, self._held.switch, self._answers.append
+            )
 
     def update(self, news: News) -> None:
         """Say what is new."""
@@ -85,9 +88,10 @@ class MqttPublisher:
             self._say_problem(microphone, news.state)
         self._clear_others(news.state)
         self._begun += news.begun
+        self._ended += news.ended
         if self._connection.is_ready():
             self._tell_begun(news)
-        self._send_events("event_ended", news.ended, news)
+            self._send_events("event_ended", self._recent(self._ended, news), news)
         self._obey(news.state)
         if self._is_born:
             self._is_born = False
@@ -96,14 +100,17 @@ class MqttPublisher:
 
     def _tell_begun(self, news: News) -> None:
         """Tell of the events that began, but for those that an earlier bridge told of."""
-        now = news.today.now
-        recent = [event for event in self._begun if now - event.end <= RECENT]
-        self._begun.clear()
-        events = self._held.new_events(recent)
+        events = self._held.new_events(self._recent(self._begun, news))
         self._send_events("event", events, news)
-        for event in events:
+        for event in (each for each in events if self._held.is_told(each.label)):
             topic = self._topics.of_microphone(event.microphone, "last_event")
             self._connection.keep(topic, json.dumps(event_fields(event, news)))
+
+    def _recent(self, waiting: deque[Event], news: News) -> list[Event]:
+        """Take the events that waited for a broker, but for those that are no news any more."""
+        recent = [event for event in waiting if news.today.now - event.end <= RECENT]
+        waiting.clear()
+        return recent
 
     def _send_events(self, kind: str, events: Sequence[Event], news: News) -> None:
         for event in (each for each in events if self._held.is_told(each.label)):
@@ -111,7 +118,7 @@ class MqttPublisher:
             self._connection.send(topic, json.dumps(event_fields(event, news)))
 
     def alert(self, name: str, text: str, time: int) -> bool:
-        """Say that an alert rings; tell whether there is a broker that takes it.
+        """Say that an alert rings, at each call, until the broker has it, which it tells.
 
         Parameters
         ----------
@@ -122,12 +129,9 @@ class MqttPublisher:
         time : int
             Since when, in nanoseconds of UTC.
         """
-        if not self._connection.is_open():
-            return False
         since = iso_time(time, self._home.zone)
         fields = {"event_type": "alert", "name": name, "text": text, "time": since}
-        self._connection.send(self._topics.of_home("alert"), json.dumps(fields))
-        return True
+        return self._connection.deliver(self._topics.of_home("alert"), json.dumps(fields))
 
     def close(self) -> None:
         """Say `offline`, and end."""
@@ -197,7 +201,8 @@ class MqttPublisher:
         if not microphone.label:
             return
         confidence = round(microphone.confidence, 3)
-        say("heard", json.dumps({"label": microphone.label, "confidence": confidence}))
+        label = microphone.label if self._held.is_told(microphone.label) else UNKNOWN
+        say("heard", json.dumps({"label": label, "confidence": confidence}))
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             say("level", f"{microphone.level_dbfs:.1f}")

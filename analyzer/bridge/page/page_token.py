@@ -6,6 +6,7 @@ import secrets
 from pathlib import Path
 
 from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.schemas.storage.small_file import read_whole
 
 _NAME = "page-token"
@@ -18,7 +19,8 @@ def page_token(file: Path | None, state: Path) -> str:
     Parameters
     ----------
     file : Path or None
-        That has it in one line; by default one is made in the folder of the state, and kept.
+        That has it in one line, as `secret_path` finds it; by default one is made in the folder of
+        the state, and kept.
     state : Path
         That folder.
 
@@ -28,7 +30,7 @@ def page_token(file: Path | None, state: Path) -> str:
         If the file cannot be used, or none can be made.
     """
     if file is not None:
-        return _read(file)
+        return _read(secret_path(file))
     path = state / _NAME
     if not path.exists():
         _make(path)

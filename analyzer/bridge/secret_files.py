@@ -1,0 +1,17 @@
+"""Where files of secrets are: where their name says, or among the credentials of systemd."""
+
+import os
+from pathlib import Path
+
+_CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
+
+
+def secret_path(path: Path) -> Path:
+    """Return where a file of a secret is.
+
+    Parameters
+    ----------
+    path : Path
+        A relative one is looked for among the credentials of the service, where it has some.
+    """
+    return Path(os.environ.get(_CREDENTIALS, "")) / path
