@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import threading
@@ -49,6 +50,12 @@ class Broker:
             else:
                 return
         pytest.fail(f"Mosquitto did not start: {self.said.read_text()}")
+
+    def hang(self):
+        self._process.send_signal(signal.SIGSTOP)
+
+    def go_on(self):
+        self._process.send_signal(signal.SIGCONT)
 
     def kill(self):
         self._process.kill()

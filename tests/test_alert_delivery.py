@@ -140,7 +140,9 @@ def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
     finally:
         delivery.close()
     assert len(set(said)) == 1
-    assert said[0].startswith(f"json://127.0.0.1:{port}/: an alert could not be told (")
+    assert said[0].startswith(
+        "line 2, json://127.0.0.1: an alert could not be told (no connection)"
+    )
     assert not list((tmp_path / "box").iterdir())
 
 
@@ -221,7 +223,11 @@ def test_a_file_of_secrets_that_everybody_may_read_is_said(tmp_path):
     assert said == [
         f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}"
     ]
-    assert target.place == "json://127.0.0.1/"
+    assert target.place == "line 2, json://127.0.0.1"
+
+
+@pytest.mark.parametrize("make", [lambda file: read_targets(file, pytest.fail), page_token])
+def test_files_of_secrets_are_looked_for_among_the_credentials(make, tmp_path, monkeypatch): ...
 
 
 def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):

@@ -6,7 +6,8 @@ import time
 from contextlib import contextmanager
 from datetime import UTC, date
 from itertools import chain, repeat
-from threading import Event, Thread
+from threading import Event, Lock, Thread
+from types import SimpleNamespace
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -22,7 +23,7 @@ from hearthlog.analyzer.bridge.alerts.open_run import Label
 from hearthlog.analyzer.bridge.alerts.outbox import Outbox
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-from hearthlog.analyzer.bridge.alerts.ring import RuleState
+from hearthlog.analyzer.bridge.alerts.ring import Ring, RuleState
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
@@ -42,6 +43,7 @@ SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
 CLASSES = ["silence", "speech", "coughing", "tap_water"]
 DAY = date(2026, 3, 2)
+AHEAD = 400 * 24 * HOUR * SECOND
 
 
 def rule(kind, name="it", **keys):
@@ -219,7 +221,28 @@ def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
     outbox = Outbox(tmp_path / "box", ["x"], said.append)
     watch = RuleWatch([COUGHS], UTC, outbox, memory, said.append, HOUR * SECOND)
     assert watch.start < HOUR * SECOND
-    assert said == ["coughs: was evaluated up to a time to come; did the clock run ahead?"]
+    assert said == ["alerts: the clock was ahead, and was set back; the rules begin anew"]
+
+
+def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_to_come(tmp_path):
+    said, now = [], midnight(DAY) + 4 * HOUR * SECOND
+    outbox = Outbox(tmp_path / "box", ["x"], said.append)
+    silent = rule("recorder_silent", "silent", silent_for="10m", cooldown="1m")
+    memory = Memory(tmp_path / "rules.json", said.append)
+    watch = RuleWatch([silent, QUIET, COUGHS], UTC, outbox, memory, said.append, now)
+    nothing = Gathered().heard()
+
+    def evaluate(until):
+        return watch.evaluate(lambda: nothing, pytest.fail, until, until)
+
+    assert evaluate(now + SECOND) == []
+    assert {ring.rule for ring in evaluate(now + AHEAD)} == {"silent", "quiet"}
+    assert len(outbox) == 2
+    assert evaluate(now + 2 * SECOND) == []
+    assert len(outbox) == 0
+    assert [ring.rule for ring in evaluate(now + 11 * MINUTE)] == ["silent"]
+    assert said == ["alerts: the clock was ahead, and was set back; the rules begin anew"]
+    assert all(own.until < now + HOUR * SECOND for own in memory.load([COUGHS]).values())
 
 
 class Recorder(Thread):
@@ -247,7 +270,22 @@ class Recorder(Thread):
         }
         self.writer.write_columns([TopicBatch("/mic/segment", ends, fields)])
         self.writer.flush()
+        self.lock = Lock()
         self.start()
+
+    def write_segment(self, end):
+        """Write a second of silence."""
+        ends = np.array([end])
+        fields = {
+            "header.stamp": ends - SECOND,
+            "header.frame_id": "mic",
+            "duration": np.array([SECOND]),
+            "label": ["silence"],
+            "confidence": np.array([0.9], np.float32),
+        }
+        with self.lock:
+            self.writer.write_columns([TopicBatch("/mic/segment", ends, fields)])
+            self.writer.flush()
 
     def run(self):
         while not self.stop.is_set():
@@ -261,8 +299,9 @@ class Recorder(Thread):
                 "novelty": np.zeros(1, np.float32),
                 "probabilities": np.zeros((1, len(CLASSES)), np.float32),
             }
-            self.writer.write_columns([TopicBatch("/mic/label", times, fields)])
-            self.writer.flush()
+            with self.lock:
+                self.writer.write_columns([TopicBatch("/mic/label", times, fields)])
+                self.writer.flush()
             self.stop.wait(0.5)  # as a recorder does
         self.writer.finish()
 
@@ -316,6 +355,90 @@ def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tm
         recorder.stop.set()
         recorder.join()
     assert said == []
+
+
+def news_of_water(time):
+    microphone = SimpleNamespace(
+        name="mic",
+        label="tap_water",
+        confidence=0.9,
+        classes=CLASSES,
+        heard=SimpleNamespace(time=time),
+    )
+    return SimpleNamespace(state=SimpleNamespace(microphones={"mic": microphone}))
+
+
+@pytest.mark.parametrize("starts_ahead", [True, False])
+def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path, monkeypatch):
+    """Also what was written, and labelled, in that time does not stop them."""
+    told, said, ahead = [], [], [0]
+    right = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: right() + ahead[0])
+    recorder = Recorder(tmp_path / "logs")
+    home = Home(tmp_path / "logs", "home", UTC)
+    newest = recorder.water
+
+    def tell(name, _text, rung):
+        told.append((name, rung))
+        return True
+
+    def hears(condition):
+        nonlocal newest
+        if newest < right() - 10 * SECOND:
+            newest += 10 * SECOND
+        own.update(news_of_water(newest + ahead[0]))
+        return condition()
+
+    try:
+        ahead[0] = AHEAD * starts_ahead
+        own = AlertsOutput(
+            [COUGHS, WATER], DeliverySettings(), home, tmp_path / "state", said.append, tell
+        )
+        if not starts_ahead:
+            wait_for(lambda: hears(lambda: len(told) == 2))
+            ahead[0] = AHEAD
+            newest = right()
+        wait_for(lambda: hears(lambda: own._watch.needed_from(0) > right() + AHEAD // 2))
+        recorder.write_segment(right() + ahead[0])
+        wait_for(lambda: hears(lambda: own._heard.known_until(1 << 62) > right() + AHEAD // 2))
+        ahead[0], newest = 0, recorder.water
+        told.clear()
+        wait_for(lambda: hears(lambda: len(told) == 2))
+        own.close()
+    finally:
+        recorder.stop.set()
+        recorder.join()
+    assert {name for name, _ in told} == {"coughs", "water"}
+    assert all(rung <= right() for _, rung in told)
+    assert len([line for line in said if "begin anew" in line]) == 1
+
+
+def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each(
+    tmp_path, monkeypatch
+):
+    calls = []
+
+    def tell(*ring):
+        calls.append(ring)
+        return calls.count(ring) == 3
+
+    home = Home(tmp_path / "logs", "home", UTC)
+    own = AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail, tell)
+    now, right = time.time_ns(), time.time_ns
+    own._outbox.put(
+        Ring("coughs", now + number, f"ring {number}", is_known=True, due=now) for number in (1, 2)
+    )
+    try:
+        for minutes in range(0, 60, 4):
+            monkeypatch.setattr(time, "time_ns", lambda m=minutes: right() + m * MINUTE)
+            own.update(SimpleNamespace(state=SimpleNamespace(microphones={})))
+            if minutes == 4:  # one that rang before those, and is found later
+                own._outbox.put([Ring("coughs", now, "ring 0", is_known=True, due=now)])
+    finally:
+        own.close()
+    numbers = [text.partition("ring ")[2][0] for _, text, _ in calls]
+    assert numbers == ["1"] * 3 + ["0"] * 3 + ["2"] * 3
+    assert len(set(calls)) == 3
 
 
 def test_rules_of_which_nobody_would_be_told_are_refused(tmp_path):

@@ -1,5 +1,8 @@
 """Outputs of the bridge are opened one by one, and again where that failed."""
 
+import json
+import threading
+import time
 from datetime import UTC
 
 import pytest
@@ -13,6 +16,7 @@ from hearthlog.analyzer.bridge.outputs import open_outputs
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.analyzer.ports import listen
+from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
@@ -44,6 +48,28 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
     assert opened["prometheus"].output is not None
     for output in opened.values():
         output.close()
+
+
+def test_an_output_that_is_tried_again_leaves_no_thread(home, tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "_AGAIN_SECONDS", 0.0)
+    mqtt = {"host": "127.0.0.1", "user": "x", "password_file": tmp_path / "none", "commands": True}
+    settings = BridgeSettings.model_validate({"mqtt": mqtt})
+    opened, _ = open_outputs(settings, home, tmp_path, Saying(lambda _: None))
+    count = threading.active_count()
+    for _ in range(5):
+        opened["mqtt"].update(NEWS)
+    assert threading.active_count() == count
+
+
+def test_what_was_heard_while_there_was_no_bridge_is_read(home, tmp_path):
+    now = time.time_ns()
+    day = 24 * 3600 * NANOSECONDS
+    (tmp_path / "totals.json").write_text(json.dumps({"time": now - 3 * day, "totals": []}))
+    with listen() as other:  # also while the port is taken
+        figures = {"port": other.getsockname()[1]}
+        settings = BridgeSettings.model_validate({"prometheus": figures})
+        _, since = open_outputs(settings, home, tmp_path, Saying(lambda _: None))
+    assert since <= now - 3 * day
 
 
 def test_without_a_table_nothing_is_opened(home, tmp_path):

@@ -162,9 +162,21 @@ def test_a_trouble_is_said_again_after_an_hour(monkeypatch):
     assert said == ["no broker", "a full disk", "no broker"]
 
 
+def test_who_cannot_be_told_of_a_trouble_ends_nothing():
+    def refuse(_line):
+        raise OSError(28, "No space left on device")
+
+    Saying(refuse)("no broker")
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
+        (
+            '[bridge.mqtt]\nhost = "broker..lan"',
+            "line 2: bridge.mqtt.host: 'broker..lan' cannot be",
+        ),
+        ('[bridge.mqtt]\nhost = ""', "line 2: bridge.mqtt.host: '' cannot be"),
         ('[bridge.mqtt]\nhots = "x"', "line 2: unknown key 'bridge.mqtt.hots'"),
         ("[bridge.mqtt]\nport = 1883", "line 1: bridge.mqtt.host: Field required"),
         ('[bridge.mqtt]\nhost = "x"\nport = 70000', "line 3: bridge.mqtt.port: Input should"),

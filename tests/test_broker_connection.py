@@ -179,3 +179,35 @@ def test_a_password_is_taken_from_a_file(tmp_path, broker):
     guarded.kill()
     assert "refused: " in said[0]
     assert "see user, password_file and client_id" in said[0]
+
+
+def test_a_broker_that_hung_is_not_told_of_what_is_old(broker, monkeypatch):
+    monkeypatch.setattr(connection, "_ANSWER_SECONDS", 0.2)
+    monkeypatch.setattr(connection, "_TIMELY_SECONDS", 1.0)
+    with connected(broker) as (link, _), Listener(broker.port) as listener:
+        flush_until(link, lambda: listener.values.get(ALIVE) == "online" and link.is_ready())
+        broker.hang()
+        link.send("a", "on its way")
+        link.flush()
+        time.sleep(0.3)
+        link.send("b", "waits")
+        link.flush()
+        time.sleep(1.1)
+        broker.go_on()
+        flush_until(link, lambda: "a" in listener.values)
+        link.send("c", "new")
+        flush_until(link, lambda: "c" in listener.values)
+        assert "b" not in listener.values
+
+
+def test_what_must_arrive_is_told_to_have_once_the_broker_has_it(broker):
+    broker.kill()
+    with connected(broker) as (link, _):
+        assert not link.deliver("alert", "1")
+        broker.start()
+        with Listener(broker.port) as listener:
+            flush_until(link, lambda: link.deliver("alert", "1"))
+            flush_until(link, lambda: "alert" in listener.values)
+            assert listener.payloads("alert") == ["1"]
+            flush_until(link, lambda: link.deliver("alert", "1"))  # another one with the same words
+            flush_until(link, lambda: listener.payloads("alert") == ["1", "1"])

@@ -2,14 +2,15 @@
 
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import ExitStack, closing, suppress
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from threading import Event
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_active, is_log, stem
+from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_active, is_log, log_name, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunks import (
     TopicChoice,
@@ -20,11 +21,15 @@ from hearthlog.schemas.mcap.chunks import (
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.storage.folder_changes import FolderChanges
+from hearthlog.schemas.times import NANOSECONDS, read_time
 
 _POLL_SECONDS = 0.2
 _LOOK_SECONDS = 1.0  # where the file system tells of news
 _MOST_MISSED = 3  # news of which it did not
 _SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change
+_LONGEST = 2 * 86_400 * NANOSECONDS  # a log lasts a day at most, and its clock may be set
+_NAME_TIME = len("20260301T120000Z")
+_NO_LOGS = {ENROLLED, "lost+found"}  # the latter, on many disks, only root may read
 
 
 def follow(
@@ -61,11 +66,12 @@ def follow(
     Raises
     ------
     LogError
-        If there is no such folder, if a log is damaged, or if its messages are not of the type that
-        it says.
+        If there is no such folder, or no more, if a folder or a log in it cannot be read, if a log
+        is damaged, or if its messages are not of the type that it says.
     """
     for _, messages in follow_messages(folder, topics, start, stop):
-        yield decode(messages, fields)
+        if messages:
+            yield decode(messages, fields)
 
 
 Damaged = Callable[[LogError], None]
@@ -99,8 +105,9 @@ def follow_messages(  # noqa: PLR0913
     stop : threading.Event, optional
         Ends the reading when it is set; by default it never ends.
     damaged : callable
-        Told the error of a log that is damaged, of which no more is read then; by default it is
-        raised.
+        Told the error of a log that is damaged, of which no more is read then; and once, until it
+        is over, of a log or a folder that cannot be read now or is gone, which is tried again and
+        again. By default it is raised.
     infos : bool
         Whether the `AudioStreamInfo` messages of the logs that are being written come first, also
         those that were written before.
@@ -113,7 +120,8 @@ def follow_messages(  # noqa: PLR0913
     path : Path
         A log.
     messages : list of RawMessages
-        What was written to it since the last time, perhaps nothing.
+        What was written to it since the last time, perhaps nothing: so after each log that is not
+        being written, for the caller to have a turn.
 
     Raises
     ------
@@ -123,18 +131,18 @@ def follow_messages(  # noqa: PLR0913
     stop = stop or Event()
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder")
-    watch = _Folder(folder)
+    watch = _Folder(folder, damaged)
     present = watch.new_logs()
-    finished = [path for path in present if start is not None and not is_active(path)]
-    yield from _read_finished(finished, topics, start, damaged)
-    growing = [g for path in present if is_active(path) for g in _open(path)]
+    if start is not None:
+        finished = [path for path in present if not is_active(path)]
+        yield from _read_finished(finished, topics, start, stop, damaged)
+    active = [path for path in present if is_active(path)]
+    growing: list[_Growing] = []
     with ExitStack() as opened:
         opened.callback(lambda: _close(growing))
         news = opened.enter_context(closing(_News(folder)))
-        if start is None:
-            _forget(growing)
-        if infos:
-            yield from ((log.file.path, log.infos_before(start, damaged)) for log in growing)
+        growing.extend(watch.open(active))
+        yield from _begin(growing, start, damaged, infos=infos)
         while not stop.is_set():
             has_news = False
             for log in growing:
@@ -142,7 +150,10 @@ def follow_messages(  # noqa: PLR0913
                     has_news = True
                     yield log.file.path, messages
             growing = [log for log in growing if log.is_open()]
-            growing += [log for path in watch.new_logs() for log in _open(path)]
+            known = len(growing)
+            growing.extend(watch.open(watch.new_logs()))
+            late = [log for log in growing[known:] if log.is_among(active)]
+            yield from _begin(late, start, damaged, infos=infos)
             news.expect(growing, has_news=has_news)
             is_due = has_news
             while not is_due:
@@ -156,21 +167,39 @@ def _close(growing: "Iterable[_Growing]") -> None:
         log.file.close()
 
 
-def _forget(growing: "Iterable[_Growing]") -> None:
-    """Pass over what was written before now."""
-    for log in growing:
-        log.file.scan_new()
+def _begin(
+    growing: "Sequence[_Growing]", start: int | None, damaged: Damaged, *, infos: bool
+) -> Iterator[tuple[Path, list[RawMessages]]]:
+    """Pass over what is not asked for of logs that were there before."""
+    if start is None:
+        for log in growing:
+            log.file.scan_new()
+    if infos:
+        yield from ((log.file.path, log.infos_before(start, damaged)) for log in growing)
 
 
 def _read_finished(
-    paths: list[Path], topics: TopicChoice | None, start: int | None, damaged: Damaged
+    paths: list[Path], topics: TopicChoice | None, start: int, stop: Event, damaged: Damaged
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     for path in paths:
+        if stop.is_set():
+            return
+        if not _may_reach(path, start):
+            continue
         try:
             for messages in iterate_messages([path], topics, start):
                 yield path, messages
         except LogError as error:
             damaged(error)
+        yield path, []
+
+
+def _may_reach(log: Path, start: int) -> bool:
+    """Tell by its name whether a log may have messages from a time on."""
+    try:
+        return read_time(log_name(log).time[:_NAME_TIME]) + _LONGEST >= start
+    except ValueError:  # no recorder gave the name
+        return True
 
 
 class _News:
@@ -220,7 +249,7 @@ class _Growing:
     ) -> Iterator[list[RawMessages]]:
         """Read what was written since the last time."""
         # Replaced by a recorder that was started again: asked first, so nothing comes in between.
-        self._replaced = not any(self.file.is_at(name) for name in _names(self.file.path))
+        self._replaced = self._is_replaced()
         try:
             for batch in read_in_batches(self.file, self.file.scan_new(), topics):
                 messages = [m for m in (raw.between(start, None) for raw in batch) if len(m)]
@@ -233,12 +262,12 @@ class _Growing:
     def infos_before(self, start: int | None, damaged: Damaged) -> list[RawMessages]:
         """Read the descriptions of the streams that were written before a time, or before now."""
         messages: list[RawMessages] = []
-        for log in _open(self.file.path):
-            with closing(log.file) as file:
-                try:
-                    messages = _read_infos(file)
-                except LogError as error:
-                    damaged(error)
+        try:
+            with _open(self.file.path) as file:
+                messages = _read_infos(file)
+        except LogError as error:
+            if not _has_vanished(error):
+                damaged(error)
         return [m for m in (raw.between(None, start) for raw in messages) if len(m)]
 
     def is_open(self) -> bool:
@@ -247,6 +276,18 @@ class _Growing:
             self.file.close()
             return False
         return True
+
+    def is_among(self, logs: Collection[Path]) -> bool:
+        """Tell whether this is one of some logs, whether they had their final names or not."""
+        return not set(_names(self.file.path)).isdisjoint(logs)
+
+    def _is_replaced(self) -> bool:
+        """Tell whether another file has the name, or none, though its folder is not gone."""
+        try:
+            is_there = any(self.file.is_at(name) for name in _names(self.file.path))
+            return not is_there and self.file.path.parent.is_dir()
+        except OSError:  # nobody may look at it now
+            return False
 
 
 def _read_infos(file: LogFile) -> list[RawMessages]:
@@ -262,11 +303,14 @@ def _names(path: Path) -> tuple[Path, Path]:
     return path.with_name(stem(path) + ACTIVE_SUFFIX), path.with_name(stem(path) + SUFFIX)
 
 
-def _open(path: Path) -> Iterator[_Growing]:
+def _open(path: Path) -> LogFile:
     """Open a log that may get its final name at any moment."""
     active, _ = _names(path)
-    with suppress(LogError):
-        yield _Growing(LogFile(active, indexed=False))
+    return LogFile(active, indexed=False)
+
+
+def _has_vanished(error: LogError) -> bool:
+    return isinstance(error.__cause__, FileNotFoundError)
 
 
 class _Folder:
@@ -275,35 +319,79 @@ class _Folder:
     Only the folders that changed are listed: a recorder leaves ten thousand files a year.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, damaged: Damaged) -> None:
+        self._root = root
+        self._damaged = damaged
         self._listed: dict[Path, int] = {root: -1}
-        self._listed_logs: set[str] = set()
+        self._listed_logs: set[Path] = set()
+        self._unreadable: set[Path] = set()  # folders and logs, as was told
 
     def new_logs(self) -> list[Path]:
         """Return the logs that were not there the last time, by name."""
-        new: dict[str, Path] = {}
-        todo = list(self._listed)
+        new: dict[Path, Path] = {}
+        todo = deque(self._listed)
         while todo:
-            folder = todo.pop()
-            try:
-                changed = folder.stat().st_mtime_ns
-                if changed == self._listed[folder]:
-                    continue
-                settled = time.time_ns() - changed > _SETTLED
-                self._listed[folder] = changed if settled else -1
-                entries = list(os.scandir(folder))
-            except OSError:
-                del self._listed[folder]  # it was removed
-                continue
-            for entry in entries:
-                path = Path(entry.path)
-                if entry.is_dir(follow_symlinks=False):
-                    if path not in self._listed and entry.name != ENROLLED:
+            folder = todo.popleft()
+            if self._unreadable and not self._unreadable.isdisjoint(folder.parents):
+                continue  # nor can this one be: one line says it
+            for path, is_folder in self._list_changed(folder):
+                if is_folder:
+                    if path not in self._listed and path.name not in _NO_LOGS:
                         self._listed[path] = -1
                         todo.append(path)
                 elif is_log(path):
-                    name = entry.path.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+                    _, name = _names(path)
                     if name not in self._listed_logs:
                         new[name] = path
         self._listed_logs |= new.keys()
         return [new[name] for name in sorted(new)]
+
+    def open(self, logs: Iterable[Path]) -> Iterator[_Growing]:
+        """Open logs; one that cannot be opened now is new the next time too."""
+        for path in logs:
+            try:
+                log = _Growing(_open(path))
+            except LogError as error:
+                if not _has_vanished(error):
+                    self._listed_logs.discard(_names(path)[1])
+                    self._listed[path.parent] = -1
+                    self._tell(path, error)
+            else:
+                self._unreadable.discard(path)
+                yield log
+
+    def _list_changed(self, folder: Path) -> list[tuple[Path, bool]]:
+        """Return what is in a folder that may have changed, and which of it are folders."""
+        try:
+            changed = folder.stat().st_mtime_ns
+            if changed == self._listed[folder]:
+                return []
+            settled = time.time_ns() - changed > _SETTLED
+            self._listed[folder] = changed if settled else -1
+            with os.scandir(folder) as entries:
+                inside = [(Path(e.path), e.is_dir(follow_symlinks=False)) for e in entries]
+        except OSError as error:
+            self._pass_over(folder, error)
+            return []
+        self._unreadable.discard(folder)
+        return inside
+
+    def _pass_over(self, folder: Path, error: OSError) -> None:
+        is_gone = isinstance(error, FileNotFoundError | NotADirectoryError)
+        if is_gone and folder != self._root:
+            del self._listed[folder]
+            self._unreadable.discard(folder)
+            return
+        self._listed[folder] = -1
+        problem = f"may not be read ({error.strerror}); let the user of this process read it"
+        if is_gone:
+            problem = "the folder is gone; waiting for it"
+        elif not isinstance(error, PermissionError):
+            problem = f"cannot be read ({error.strerror}); it is tried again"
+        self._tell(folder, LogError(f"{folder}: {problem}"))
+
+    def _tell(self, path: Path, error: LogError) -> None:
+        """Tell it once, until the folder or the log can be read."""
+        if path not in self._unreadable:
+            self._unreadable.add(path)
+            self._damaged(error)

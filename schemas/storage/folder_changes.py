@@ -25,14 +25,14 @@ class FolderChanges:
     def __init__(self) -> None:
         self._inotify: Any = None
         self._mask = 0
-        self._watched: set[Path] = set()
+        self._watches: dict[Path, int] = {}
         if sys.platform == "linux":
             from inotify_simple import INotify, flags  # noqa: PLC0415  elsewhere there is none
 
             with suppress(OSError):  # a machine has so many and no more
                 self._inotify = INotify()
-            changes = flags.CREATE | flags.MODIFY | flags.MOVED_TO | flags.DELETE_SELF
-            self._mask = changes | flags.ONLYDIR
+            changes = flags.CREATE | flags.MODIFY | flags.MOVED_TO
+            self._mask = changes | flags.DELETE_SELF | flags.MOVE_SELF | flags.ONLYDIR
 
     @property
     def tells(self) -> bool:
@@ -40,12 +40,17 @@ class FolderChanges:
         return self._inotify is not None
 
     def watch(self, folders: Iterable[Path]) -> None:
-        """Be told of these folders too."""
-        for folder in set(folders) - self._watched:
-            if self._inotify is not None:
-                with suppress(OSError):  # it was removed, or there are too many
-                    self._inotify.add_watch(folder, self._mask)
-                    self._watched.add(folder)
+        """Be told of these folders too, and of those that have the names of watched ones since."""
+        if self._inotify is None:
+            return
+        for folder in set(folders):
+            with suppress(OSError):  # it was removed, or there are too many
+                # Asked each time: no event tells that a disk was mounted over a watched folder.
+                watch = self._inotify.add_watch(folder, self._mask)
+                before = self._watches.get(folder, watch)
+                self._watches[folder] = watch
+                if before != watch:
+                    self._inotify.rm_watch(before)  # if it has moved away
 
     def wait(self, seconds: float, stop: Event) -> bool:
         """Wait until something changes, or for some time; tell whether something did.

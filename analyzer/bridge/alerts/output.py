@@ -181,7 +181,9 @@ class AlertsOutput:
             end = self._now() + _TO_COME
             known = [raw.between(None, end) for raw in batch]
             if sum(map(len, known)) < sum(map(len, batch)):
-                self._say(f"alerts: {path}: what is of a time to come is left out; was its clock ahead?")
+                self._say(
+                    f"alerts: {path}: was the clock ahead? what is of a time to come is left out"
+                )
             self._heard.push(_decoded(known))
         except LogError as error:
             self._damaged(LogError(f"{path}: {error}"))

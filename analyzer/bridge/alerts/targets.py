@@ -77,7 +77,9 @@ def _scheme_and_host(plugin: Any, address: str) -> str:
     scheme, host = address.partition("://")[0], plugin.host or ""
     # Many services have a token in the place of the host, or a topic, in which there is no dot.
     is_host = "host" in (plugin.template_tokens or {}) and _HOST.fullmatch(host)
-    return f"{scheme}://{host}" if is_host else scheme
+    # In a password that is not escaped, what follows an @ or precedes a / is taken for a host.
+    is_sure = "@" not in address or (address.count("@") == 1 and f"@{host}" in address)
+    return f"{scheme}://{host}" if is_host and is_sure else scheme
 
 
 def _reason(said: str) -> str:
@@ -86,7 +88,7 @@ def _reason(said: str) -> str:
     if code:
         return f"error {code[1]}"
     is_away = "connection error" in said.lower()
-    return "no connection" if is_away else "`apprise --body test ADDRESS` says why"
+    return "no connection" if is_away else "`apprise -v -b test ADDRESS` says why"
 
 
 def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
