@@ -10,6 +10,7 @@ import time
 from contextlib import contextmanager
 from datetime import UTC
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +19,7 @@ from hearthlog.analyzer.bridge.alerts.outbox import Outbox
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.analyzer.bridge.alerts.targets import read_targets
 from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.page.page_token import page_token
 
 # Apprise asks for it where there is one.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
@@ -37,15 +39,17 @@ def wait_for(condition):
 
 
 @contextmanager
-def server(port=0):
+def server(port=0, status=200):
     """A server that takes what is posted to it; yields its port and the texts."""
     texts = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self):
             length = int(self.headers["Content-Length"])
-            texts.append(json.loads(self.rfile.read(length))["message"])
-            self.send_response(200)
+            body = self.rfile.read(length)
+            if status == 200:
+                texts.append(json.loads(body)["message"])
+            self.send_response(status)
             self.send_header("Content-Length", "0")
             self.end_headers()
 
@@ -226,8 +230,56 @@ def test_a_file_of_secrets_that_everybody_may_read_is_said(tmp_path):
     assert target.place == "line 2, json://127.0.0.1"
 
 
-@pytest.mark.parametrize("make", [lambda file: read_targets(file, pytest.fail), page_token])
-def test_files_of_secrets_are_looked_for_among_the_credentials(make, tmp_path, monkeypatch): ...
+def test_files_of_secrets_are_looked_for_among_the_credentials_of_systemd(tmp_path, monkeypatch):
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    addresses(tmp_path, "json://127.0.0.1")
+    (tmp_path / "token").write_text("abcdefghijklmnop\n")
+    assert len(read_targets(Path("urls"), pytest.fail)) == 1
+    assert page_token(Path("token"), tmp_path) == "abcdefghijklmnop"
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", "/nowhere")
+    assert len(read_targets(tmp_path / "urls", pytest.fail)) == 1
+    assert page_token(tmp_path / "token", tmp_path) == "abcdefghijklmnop"
+
+
+@pytest.mark.parametrize(
+    ("address", "place"),
+    [
+        ("ntfy://ntfy.sh/hush", "ntfy://ntfy.sh"),
+        ("ntfys://hush:hush@ntfy.example.org:8443/hush?title=hush", "ntfys://ntfy.example.org"),
+        ("mailto://hush:hush@example.org", "mailto://example.org"),
+        ("json://[::1]:8080/hush", "json://[::1]"),
+        ("ntfy://hush", "ntfy"),  # a topic
+        ("ntfy://hush.hush", "ntfy"),
+        ("json://hush/hush", "json"),
+        ("pbul://o.hush", "pbul"),
+        ("discord://4174216298/hush-hush", "discord"),
+        ("https://discord.com/api/webhooks/4174216298/hush-hush", "https"),
+        ("json://hush:hu@sh.hush@example.org", "json"),  # not escaped
+        ("json://sh.hush/hush@example.org", "json"),
+    ],
+)
+def test_a_target_is_named_by_its_line_and_at_most_its_scheme_and_host(address, place, tmp_path):
+    (target,) = read_targets(addresses(tmp_path, address), pytest.fail)
+    assert target.place == f"line 2, {place}"
+
+
+def test_no_part_of_an_address_is_said_when_it_cannot_be_reached_or_refuses(tmp_path, capfd):
+    said = []
+    with server(status=403) as (port, _):
+        places = [f"127.0.0.1:{each}/hush-topic" for each in (port, free_port())]
+        kinds = ("ntfy", "json", "xml", "form", "gotify", "mmost")
+        lines = [f"{kind}://hush:hush@{place}" for kind in kinds for place in places]
+        targets = read_targets(addresses(tmp_path, *lines), said.append)
+        outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
+        outbox.put([ring(1)])
+        delivery = Delivery(outbox, targets, "home", UTC, said.append)
+        wait_for(lambda: len(set(said)) == len(lines))
+        delivery.close()
+    refused = {int(line.split(",")[0].split()[1]) for line in said if "(error 403)" in line}
+    away = {int(line.split(",")[0].split()[1]) for line in said if "(no connection)" in line}
+    assert (refused, away) == (set(range(2, 14, 2)), set(range(3, 14, 2)))
+    assert capfd.readouterr() == ("", "")
+    assert "hush" not in "".join(said)
 
 
 def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):

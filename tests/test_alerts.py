@@ -240,9 +240,9 @@ def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_t
     assert len(outbox) == 2
     assert evaluate(now + 2 * SECOND) == []
     assert len(outbox) == 0
+    assert memory.load([COUGHS])["coughs"].until == now + 2 * SECOND  # also after a kill
     assert [ring.rule for ring in evaluate(now + 11 * MINUTE)] == ["silent"]
     assert said == ["alerts: the clock was ahead, and was set back; the rules begin anew"]
-    assert all(own.until < now + HOUR * SECOND for own in memory.load([COUGHS]).values())
 
 
 class Recorder(Thread):
@@ -329,7 +329,7 @@ def bridge(root, rules, told, said):
 
 
 def wait_for(condition):
-    until = time.monotonic() + 60
+    until = time.monotonic() + 20
     while not condition():
         assert time.monotonic() < until, "waited for nothing"
         time.sleep(0.05)
@@ -384,8 +384,7 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
 
     def hears(condition):
         nonlocal newest
-        if newest < right() - 10 * SECOND:
-            newest += 10 * SECOND
+        newest = min(newest + MINUTE, right())
         own.update(news_of_water(newest + ahead[0]))
         return condition()
 
@@ -400,8 +399,9 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
             newest = right()
         wait_for(lambda: hears(lambda: own._watch.needed_from(0) > right() + AHEAD // 2))
         recorder.write_segment(right() + ahead[0])
-        wait_for(lambda: hears(lambda: own._heard.known_until(1 << 62) > right() + AHEAD // 2))
+        wait_for(lambda: hears(lambda: own._heard._run("mic").start > right() + AHEAD // 2))
         ahead[0], newest = 0, recorder.water
+        own.update(news_of_water(right() + AHEAD))  # known then, and looked at now
         told.clear()
         wait_for(lambda: hears(lambda: len(told) == 2))
         own.close()

@@ -1,5 +1,6 @@
 """A log is followed while it is written, across files, restarts and kills of the recorder."""
 
+import os
 import shutil
 import signal
 import subprocess
@@ -16,7 +17,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import decode
-from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.files import find_logs, log_path
 from hearthlog.schemas.logs.follow import follow, follow_messages
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
@@ -24,7 +25,9 @@ from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.raw_messages import in_order_of_time
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.storage import byte_ranges
 from hearthlog.schemas.storage.folder_changes import FolderChanges
+from hearthlog.schemas.times import read_time
 
 pytestmark = pytest.mark.fast
 
@@ -60,6 +63,17 @@ class Followed(Thread):
     def __exit__(self, *_):
         self.stop.set()
         self.join()
+
+
+class Told(Followed):
+    """A follower that is told what is wrong, and goes on."""
+
+    def run(self):
+        self.told = []
+        options = {"stop": self.stop, "damaged": lambda error: self.told.append(str(error))}
+        for _, messages in follow_messages(self.folder, [TOPIC], **options, **self.options):
+            for columns in decode(messages):
+                self.frames += columns["frame"].tolist()
 
 
 def log(folder, name):
@@ -318,3 +332,131 @@ def test_a_tick_comes_while_a_file_is_written_again_and_again(tmp_path):
     thread.join()
     writer.abandon()
     assert ticks == 5
+
+
+def test_the_folder_may_go_away_and_come_back(tmp_path):
+    logs, away = tmp_path / "logs", tmp_path / "away"
+    finished, writer = log(logs / "2026", "home_0.mcap"), log(logs / "2026", "home_1.mcap")
+    write(finished, 0)
+    finished.finish()
+    write(writer, 20)
+    with Told(logs, start=0) as followed:
+        assert followed.wait_for(range(40)) == list(range(40))
+        for first in (40, 100):
+            logs.rename(away)
+            sleep(2.5)
+            write(writer, first)
+            away.rename(logs)
+            write(writer, first + 20)
+            other = log(logs / "2026", f"home_{first}.mcap")
+            write(other, first + 40)
+            assert sorted(followed.wait_for(range(first + 60))) == list(range(first + 60))
+            other.finish()
+        assert followed.told == [f"{logs}: the folder is gone; waiting for it"] * 2
+    writer.abandon()
+
+
+def test_a_folder_of_the_same_name_is_watched_anew(tmp_path):
+    logs = tmp_path / "logs"
+    with FolderChanges() as changes:
+        for number in range(3):
+            logs.mkdir()
+            changes.watch([logs])
+            while changes.wait(0.1, Event()):
+                pass
+            (logs / "home.mcap").touch()
+            assert changes.wait(5, Event()) == changes.tells
+            logs.rename(tmp_path / f"{number}")
+
+
+def test_a_folder_that_may_not_be_read_is_told_once_and_tried_again(tmp_path, monkeypatch):
+    closed, is_open, scandir = tmp_path / "closed", Event(), os.scandir
+
+    def refuse(folder):
+        if folder == closed and not is_open.is_set():
+            raise PermissionError(13, "Permission denied", str(folder))
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    writer = log(closed, "home_0.mcap")
+    write(writer, 0)
+    with Told(tmp_path, start=0) as followed:
+        sleep(2.5)
+        is_open.set()
+        assert followed.wait_for(range(20)) == list(range(20))
+        problem = "may not be read (Permission denied); let the user of this process read it"
+        assert followed.told == [f"{closed}: {problem}"]
+    writer.abandon()
+
+
+@pytest.mark.parametrize(("start", "first"), [(0, 0), (None, 20)])
+def test_a_log_that_cannot_be_opened_is_told_once_and_tried_again(
+    tmp_path, monkeypatch, start, first
+):
+    is_free, open_regular = Event(), byte_ranges.open_regular
+
+    def refuse(path):
+        if not is_free.is_set():
+            raise OSError(24, "Too many open files", str(path))
+        return open_regular(path)
+
+    monkeypatch.setattr(byte_ranges, "open_regular", refuse)
+    writer = log(tmp_path, "home_0.mcap")
+    write(writer, 0)
+    with Told(tmp_path, start=start) as followed:
+        sleep(2.5)
+        is_free.set()
+        sleep(2.5)
+        write(writer, 20)
+        assert followed.wait_for(range(first, 40)) == list(range(first, 40))
+        assert followed.told == [f"{writer.active_path}: cannot be read (Too many open files)"]
+    writer.abandon()
+
+
+def test_a_log_that_vanishes_before_it_is_opened_is_passed_over(tmp_path, monkeypatch):
+    def vanish(path):
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+    monkeypatch.setattr(byte_ranges, "open_regular", vanish)
+    writer = log(tmp_path, "home_0.mcap")
+    with Told(tmp_path, start=0) as followed:
+        sleep(1)
+        assert followed.told == []
+    writer.abandon()
+
+
+def of_day(folder, day):
+    start = read_time(f"{day}T12:00")
+    path = log_path(folder, "home", start)
+    writer = log(path.parent, path.name)
+    write(writer, start)
+    return writer.finish()
+
+
+def test_old_logs_are_not_opened_and_after_each_other_one_the_caller_has_a_turn(
+    tmp_path, monkeypatch
+):
+    old, *others = [of_day(tmp_path, f"2026-03-{day:02}") for day in (1, 4, 5, 6)]
+    opened, open_regular = [], byte_ranges.open_regular
+    monkeypatch.setattr(
+        byte_ranges, "open_regular", lambda path: opened.append(path) or open_regular(path)
+    )
+    stop, turns = Event(), []
+    start = read_time("2026-03-05")
+    for path, messages in follow_messages(tmp_path, start=start, stop=stop, ticks=True):
+        turns.append((path, len(messages)))
+        if len(turns) == 3 or path == tmp_path:
+            stop.set()
+    assert turns == [(others[0], 0), (others[1], 1), (others[1], 0)]
+    assert old not in opened
+    assert others[2] not in opened
+
+
+def test_who_follows_columns_is_given_no_empty_lists(tmp_path):
+    for number in range(2):
+        writer = log(tmp_path, f"home_{number}.mcap")
+        write(writer, 20 * number)
+        writer.finish()
+    followed = follow(tmp_path, start=20)
+    assert [columns.topic for columns in next(followed)] == [TOPIC]
+    followed.close()

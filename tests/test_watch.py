@@ -9,8 +9,7 @@ import subprocess
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import islice
-from threading import Event
+from itertools import islice, takewhile
 
 import numpy as np
 import psutil
@@ -153,10 +152,9 @@ def news(folder, live=None, **options):
 
 
 def batches(folder, **options):
-    """Give what there is, and end where one who follows would wait."""
-    stop = Event()
-    stop.set()
-    return follow_messages(folder, start=0, stop=stop, **options)
+    """All that a folder has."""
+    followed = follow_messages(folder, start=0, ticks=True, **options)
+    return takewhile(lambda read: read[0] != folder, followed)
 
 
 def lane_states(found, kind):

@@ -137,6 +137,7 @@ def follow_messages(  # noqa: PLR0913
         finished = [path for path in present if not is_active(path)]
         yield from _read_finished(finished, topics, start, stop, damaged)
     active = [path for path in present if is_active(path)]
+    before = set(map(_name, active))
     growing: list[_Growing] = []
     with ExitStack() as opened:
         opened.callback(lambda: _close(growing))
@@ -152,7 +153,7 @@ def follow_messages(  # noqa: PLR0913
             growing = [log for log in growing if log.is_open()]
             known = len(growing)
             growing.extend(watch.open(watch.new_logs()))
-            late = [log for log in growing[known:] if log.is_among(active)]
+            late = [log for log in growing[known:] if _name(log.file.path) in before]
             yield from _begin(late, start, damaged, infos=infos)
             news.expect(growing, has_news=has_news)
             is_due = has_news
@@ -277,10 +278,6 @@ class _Growing:
             return False
         return True
 
-    def is_among(self, logs: Collection[Path]) -> bool:
-        """Tell whether this is one of some logs, whether they had their final names or not."""
-        return not set(_names(self.file.path)).isdisjoint(logs)
-
     def _is_replaced(self) -> bool:
         """Tell whether another file has the name, or none, though its folder is not gone."""
         try:
@@ -303,6 +300,11 @@ def _names(path: Path) -> tuple[Path, Path]:
     return path.with_name(stem(path) + ACTIVE_SUFFIX), path.with_name(stem(path) + SUFFIX)
 
 
+def _name(path: Path) -> str:
+    """Return what stays the same of a log when it gets its final name."""
+    return os.fspath(path).removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+
+
 def _open(path: Path) -> LogFile:
     """Open a log that may get its final name at any moment."""
     active, _ = _names(path)
@@ -323,12 +325,12 @@ class _Folder:
         self._root = root
         self._damaged = damaged
         self._listed: dict[Path, int] = {root: -1}
-        self._listed_logs: set[Path] = set()
+        self._listed_logs: set[str] = set()
         self._unreadable: set[Path] = set()  # folders and logs, as was told
 
     def new_logs(self) -> list[Path]:
         """Return the logs that were not there the last time, by name."""
-        new: dict[Path, Path] = {}
+        new: dict[str, Path] = {}
         todo = deque(self._listed)
         while todo:
             folder = todo.popleft()
@@ -340,7 +342,7 @@ class _Folder:
                         self._listed[path] = -1
                         todo.append(path)
                 elif is_log(path):
-                    _, name = _names(path)
+                    name = _name(path)
                     if name not in self._listed_logs:
                         new[name] = path
         self._listed_logs |= new.keys()
@@ -353,7 +355,7 @@ class _Folder:
                 log = _Growing(_open(path))
             except LogError as error:
                 if not _has_vanished(error):
-                    self._listed_logs.discard(_names(path)[1])
+                    self._listed_logs.discard(_name(path))
                     self._listed[path.parent] = -1
                     self._tell(path, error)
             else:

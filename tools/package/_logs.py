@@ -325,7 +325,7 @@ def follow(
     Raises
     ------
     LogError
-        If there is no such folder, or a log is damaged.
+        If there is no such folder, or no more, or if a log cannot be read or is damaged.
 
     Examples
     --------

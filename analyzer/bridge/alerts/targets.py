@@ -5,6 +5,7 @@ import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
+from threading import get_ident
 from typing import Any, Protocol
 
 from hearthlog.analyzer.bridge.errors import BridgeError
@@ -14,6 +15,7 @@ from hearthlog.schemas.storage.small_file import read_whole
 _LIMIT = 1 << 16  # bytes of the file
 _OTHERS = 0o004
 _HOST = re.compile(r"localhost|\[[0-9a-f:.]+\]|[\w-]+(\.[\w-]+)+", re.ASCII | re.IGNORECASE)
+_FORM = "%(thread)d %(message)s"  # other targets are told at the same time
 _CODE = re.compile(r"\berror=(\d{3})\b")
 
 
@@ -64,13 +66,14 @@ class AppriseTarget:
         """
         import apprise  # noqa: PLC0415  takes half a second, and few need it
 
-        with apprise.LogCapture(level=logging.WARNING, fmt="%(message)s") as said:
+        with apprise.LogCapture(level=logging.WARNING, fmt=_FORM) as said:
             done = self._plugin.notify(
                 title=title, body=text, notify_type=apprise.NotifyType.WARNING
             )
             if done:
                 return ""
-            return _reason(said.getvalue())
+            lines = said.getvalue().splitlines()
+        return _reason("\n".join(line for line in lines if line.startswith(f"{get_ident()} ")))
 
 
 def _scheme_and_host(plugin: Any, address: str) -> str:
