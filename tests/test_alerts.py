@@ -329,7 +329,7 @@ def bridge(root, rules, told, said):
 
 
 def wait_for(condition):
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < until, "waited for nothing"
         time.sleep(0.05)

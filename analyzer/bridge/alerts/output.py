@@ -163,6 +163,8 @@ class AlertsOutput:
         batches = follow_messages(logs, is_of_alerts, start, self._stop, self._damaged, ticks=True)
         caught_up = False
         for path, batch in batches:
+            if self._now() < self._latest - AHEAD:
+                return
             if path == logs:
                 caught_up = True
             elif log_name(path).node == self._followed.node:

@@ -1,14 +1,12 @@
 """A connection to a broker that may come and go: what it has to say is said again, or in time."""
 
 import math
-import os
 import ssl
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -18,6 +16,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.schemas.storage.small_file import read_whole
 
@@ -32,7 +31,6 @@ _QOS = 1
 _SHORT_SECONDS = 15.0  # so short a connection is no good one
 _TAKEN_OVER = 0x8E
 _LONGEST_PASSWORD = 4096  # bytes
-_CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
 
 Say = Callable[[str], None]
 Received = Callable[[mqtt.MQTTMessage], None]
@@ -278,7 +276,7 @@ def _port(settings: MqttSettings) -> int:
 def _password(settings: MqttSettings) -> str | None:
     if settings.password_file is None:
         return None
-    path = Path(os.environ.get(_CREDENTIALS, "")) / settings.password_file
+    path = secret_path(settings.password_file)
     data = read_whole(path, "password file", _LONGEST_PASSWORD, BridgeError)
     try:
         return data.decode().split("\n", 1)[0].rstrip("\r")
