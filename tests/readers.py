@@ -8,8 +8,8 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from itertools import takewhile
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,9 @@ from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.timeline.live import LiveTimeline
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.logs.columns import iterate_columns, read_columns
+from hearthlog.schemas.logs.columns import decode, iterate_columns, read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.logs.follow import follow
+from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.messages import message_types
 
@@ -63,17 +63,15 @@ def by_columns(_: Run) -> Any:
 
 
 def by_follow(_: Run) -> Any:
-    stop = Event()
     frames: Counter[str] = Counter()
     labels = []
-    for folder in ("logs", "left"):
-        stop.clear() if folder == "left" else stop.set()
-        for batch in follow(Path(folder), start=0, stop=stop):
-            for columns in batch:
+    for folder in (Path("logs"), Path("left")):
+        followed = follow_messages(folder, start=0, ticks=True)
+        for _, messages in takewhile(lambda read, folder=folder: read[0] != folder, followed):
+            for columns in decode(messages):
                 frames[f"{folder} {columns.topic}"] += len(columns)
                 if columns.type == message_types.LABEL:
                     labels += columns["label"].tolist()
-            stop.set()
     return frames, labels
 
 
