@@ -1,11 +1,14 @@
 """A home whose log is written as a test goes on, without sound."""
 
 import time
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta, timezone
+from threading import Event, Thread
 
 import numpy as np
 from homelife import GENERAL
 
+from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.logs.files import log_path
 from hearthlog.schemas.logs.log_stream import TopicBatch
@@ -105,3 +108,17 @@ class LiveHome:
     def _write(self, topic, times, fields):
         self._writer.write_columns([TopicBatch(topic, np.atleast_1d(times), fields)])
         self._writer.flush()
+
+
+@contextmanager
+def following(place, outputs, said):
+    """A bridge in a thread, which knows the events of the last day."""
+    stop = Event()
+    bridge = Bridge(place, time.time_ns() - 24 * 60 * MINUTE, dict(outputs), said.append)
+    thread = Thread(target=bridge.run, args=[stop], daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()

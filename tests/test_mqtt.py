@@ -4,19 +4,18 @@ import json
 import random
 import signal
 import time
+from datetime import datetime
 from pathlib import Path
-from threading import Event, Thread
 
 import pytest
 from brokers import Broker, Listener, settled_values, start_bridge
 from homelife import GENERAL
 from killed_bridge import ZONE, kill_at_random, start_recorder
-from livehome import LiveHome, midday_zone
+from livehome import LiveHome, following, midday_zone
 
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
-from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.rest import paused_until
@@ -34,21 +33,17 @@ class Bridged:
 
     def __init__(self, folder: Path, broker: Broker, outputs=(), **settings):
         self.said = []
-        self._stop = Event()
-        home = Home(folder, "home", midday_zone())
+        place = Home(folder, "home", midday_zone())
         mqtt = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
-        everybody = dict(outputs) | {"mqtt": MqttPublisher(mqtt, home, self.said.append)}
-        since = time.time_ns() - 24 * 3600 * NANOSECONDS
-        bridge = Bridge(home, since, everybody, self.said.append)
-        self._thread = Thread(target=bridge.run, args=[self._stop], daemon=True)
-        self._thread.start()
+        everybody = dict(outputs) | {"mqtt": MqttPublisher(mqtt, place, self.said.append)}
+        self._following = following(place, everybody, self.said)
 
     def __enter__(self):
+        self._following.__enter__()
         return self
 
-    def __exit__(self, *_):
-        self._stop.set()
-        self._thread.join()
+    def __exit__(self, *error):
+        self._following.__exit__(*error)
 
 
 @pytest.fixture
@@ -91,8 +86,6 @@ def test_events_since_midnight_are_counted_and_only_new_ones_are_told_of(home, b
 
 
 def _clock(nanoseconds):
-    from datetime import datetime  # noqa: PLC0415
-
     moment = datetime.fromtimestamp(nanoseconds / NANOSECONDS, midday_zone())
     return f"{moment:%Y-%m-%dT%H:%M:%S}"
 
@@ -192,6 +185,15 @@ def test_an_output_that_fails_stops_no_other(home, broker):
     ):
         listener.wait_for(f"{ROOT}/mic/listening", "online")
     assert set(bridged.said) == {"page: ZeroDivisionError: on purpose"}
+
+
+def test_no_event_ends_before_it_begins(home, broker):
+    home.heard("coughing", 0.5)
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{ROOT}/mic/event_ended")
+    kinds = [t.rpartition("/")[2] for _, t, _, _ in listener.messages if "/event" in t]
+    assert kinds == ["event", "event_ended"]
 
 
 @pytest.mark.fast

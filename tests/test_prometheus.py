@@ -2,19 +2,18 @@
 
 import http.client
 import time
+from contextlib import contextmanager
 from datetime import UTC
 from pathlib import Path
-from threading import Event, Thread
 
 import pytest
-from livehome import LiveHome
+from livehome import LiveHome, following
 from prometheus_client.parser import text_string_to_metric_families
 
 from hearthlog.analyzer.bridge import prometheus
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
-from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.ports import free_port
 from hearthlog.schemas.times import NANOSECONDS
@@ -31,26 +30,15 @@ def home(tmp_path):
     home.close()
 
 
-class Bridged:
+@contextmanager
+def bridged(home, folder, **settings):
     """A bridge in a thread that gives figures."""
-
-    def __init__(self, home, folder, **settings):
-        self.said = []
-        self._stop = Event()
-        since = time.time_ns() - 24 * HOUR
-        place = Home(home.folder, "home", UTC)
-        settings = PrometheusSettings(**settings)
-        output = PrometheusOutput(settings, place, folder, since, self.said.append)
-        bridge = Bridge(place, since, {"prometheus": output}, self.said.append)
-        self._thread = Thread(target=bridge.run, args=[self._stop], daemon=True)
-        self._thread.start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self._stop.set()
-        self._thread.join()
+    since, said = time.time_ns() - 24 * HOUR, []
+    place = Home(home.folder, "home", UTC)
+    output = PrometheusOutput(PrometheusSettings(**settings), place, folder, since, said.append)
+    with following(place, {"prometheus": output}, said):
+        yield
+    assert said == []
 
 
 def ask(port, path="/metrics", **fields):
@@ -95,7 +83,7 @@ def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
     home.hears("silence")
     home.says("mic", 1, "the microphone clips", level_dbfs="-40.5")
     port = free_port()
-    with Bridged(home, tmp_path, port=port):
+    with bridged(home, tmp_path, port=port):
         found = wait_for(lambda: known(port))
     assert found["hearthlog_events_total", "coughing", "mic"] == 2
     assert found["hearthlog_event_seconds_total", "coughing", "mic"] == 5
@@ -119,7 +107,7 @@ def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
 def test_the_port_answers_who_asks_for_an_address_in_digits(home, tmp_path, path, fields, status):
     home.hears("silence")
     port = free_port()
-    with Bridged(home, tmp_path, port=port):
+    with bridged(home, tmp_path, port=port):
         wait_for(lambda: known(port))
         assert ask(port, path, **fields)[0] == status
 
@@ -127,7 +115,7 @@ def test_the_port_answers_who_asks_for_an_address_in_digits(home, tmp_path, path
 def test_figures_that_are_old_are_not_given(home, tmp_path, monkeypatch):
     home.hears("silence")
     port = free_port()
-    with Bridged(home, tmp_path, port=port):
+    with bridged(home, tmp_path, port=port):
         wait_for(lambda: known(port))
         monkeypatch.setattr(prometheus, "_STALE_SECONDS", -1.0)
         assert ask(port)[0] == 503
@@ -135,7 +123,7 @@ def test_figures_that_are_old_are_not_given(home, tmp_path, monkeypatch):
 
 def test_the_port_is_of_loopback_alone(home, tmp_path):
     port = free_port()
-    with Bridged(home, tmp_path, port=port):
+    with bridged(home, tmp_path, port=port):
         rows = Path("/proc/net/tcp").read_text().splitlines()
         listening = [row.split()[1] for row in rows if f":{port:04X} " in row]
     assert f"0100007F:{port:04X}" in listening
@@ -144,15 +132,15 @@ def test_the_port_is_of_loopback_alone(home, tmp_path):
 
 def test_a_port_that_is_taken_is_named(home, tmp_path):
     port = free_port()
-    with Bridged(home, tmp_path, port=port), pytest.raises(BridgeError, match=f"port {port}"):
-        Bridged(home, tmp_path, port=port)
+    with bridged(home, tmp_path, port=port), pytest.raises(BridgeError, match=f"port {port}"):
+        bridged(home, tmp_path, port=port).__enter__()
 
 
 def test_a_text_file_is_there_while_the_bridge_is(home, tmp_path):
     home.heard("coughing", 30)
     home.hears("silence")
     path = tmp_path / "hearthlog.prom"
-    with Bridged(home, tmp_path, text_file=path):
+    with bridged(home, tmp_path, text_file=path):
         found = wait_for(lambda: path.read_text() if path.exists() else "")
         assert path.stat().st_mode & 0o777 == 0o644  # another user collects it
     assert found["hearthlog_events_total", "coughing", "mic"] == 1
