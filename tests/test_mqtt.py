@@ -241,6 +241,11 @@ def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, 
             event = json.loads(listener.wait_for(f"{ROOT}/mic/event"))
             assert event["event_type"] == "speech"
             assert listener.values[f"{COUGHING}/on"] == "OFF"
+            assert json.loads(listener.values[f"{ROOT}/mic/heard"])["label"] == "unknown"
+            last = [
+                json.loads(p)["event_type"] for p in listener.payloads(f"{ROOT}/mic/last_event")
+            ]
+            assert set(last) <= {"speech"}
             listener.publish(f"{ROOT}/command", json.dumps(command | {"told": True}))
             listener.wait_for(f"{ROOT}/told/coughing", "ON")
             home.hears("coughing")

@@ -137,6 +137,11 @@ def test_a_pause_file_that_cannot_be_read_pauses(tmp_path, content):
     assert Rest([], UTC, tmp_path).describe().startswith("paused until ")
 
 
+def test_a_pause_whose_end_nobody_lives_to_see_has_none(tmp_path):
+    (tmp_path / ".pause").write_text("9" * 400)
+    assert paused_until(tmp_path) is None
+
+
 def test_a_pipe_in_place_of_the_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / ".pause")
     assert paused_until(tmp_path) is None
