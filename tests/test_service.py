@@ -284,7 +284,7 @@ def test_a_service_takes_over_another_configuration_and_refuses_a_wrong_one(serv
     service.write("/etc/home.toml", "node = 'two'\n")
     service.run("systemctl", "reload", "hearthlog")
     service.wait(lambda: list(logs_of(service).rglob("two_*.active")))
-    assert service.shows("ActiveState") == "active"
+    service.wait(lambda: service.shows("ActiveState") == "active")
     assert (service.shows("MainPID"), service.shows("NRestarts")) == (process, "0")
     assert not errors(logs_of(service))
 
