@@ -1,8 +1,9 @@
 """Configuration of the recorder: command line, then environment, then file, then defaults."""
 
+import json
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -13,21 +14,11 @@ from pydantic import (
     field_serializer,
     field_validator,
 )
-from pydantic.fields import FieldInfo
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    InitSettingsSource,
-    SettingsConfigDict,
-)
-from pydantic_settings.sources import PydanticBaseSettingsSource
 
 from hearthlog.recorder.addresses import public_name
 from hearthlog.recorder.config_origins import DEFAULT, ENVIRONMENT, Key, Origins, key_lines
-from hearthlog.recorder.disk.keeping import KeepingRules
-from hearthlog.recorder.disk.retention import Limits
+from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
 from hearthlog.recorder.disk.sizes import Size
-from hearthlog.recorder.disk.thinning import ThinningDays
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.rest import Rest, check_quiet_hours, quiet_hours
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY
@@ -79,29 +70,10 @@ class MicrophoneSettings(BaseModel):
         return public_name(device)  # logs have no passwords
 
 
-class _Environment(EnvSettingsSource):
-    """The variables of the environment: one that is unknown, or no JSON, is refused by name."""
-
-    def __call__(self) -> dict[str, Any]:
-        fields = {ENVIRONMENT + name.upper() for name in self.settings_cls.model_fields}
-        ours = [name for name in os.environ if name.upper().startswith(ENVIRONMENT)]
-        unknown = min((name for name in ours if name.upper() not in fields), default=None)
-        if unknown is not None:
-            raise ConfigurationError(f"environment: unknown variable {unknown[:64]!r}")
-        return super().__call__()
-
-    def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:
-        try:
-            return super().decode_complex_value(field_name, field, value)
-        except (ValueError, RecursionError) as error:
-            name = ENVIRONMENT + field_name.upper()
-            raise ConfigurationError(f"environment: {name} is not JSON ({error})") from error
-
-
-class Settings(BaseSettings):
+class Settings(BaseModel):
     """Everything that can be configured; the field names are the keys of the TOML file."""
 
-    model_config = SettingsConfigDict(extra="forbid", env_prefix=ENVIRONMENT, validate_default=True)
+    model_config = ConfigDict(extra="forbid", validate_default=True)
 
     node: Annotated[str, _checked(check_node_name)] = Field(
         default="home", description="Name of this recorder, with which the names of its logs begin."
@@ -211,35 +183,6 @@ class Settings(BaseSettings):
             raise ValueError("at least 1M, which is some minutes; or 0, for any size")
         return size
 
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Put the file, which arrives as one of the arguments, below the environment.
-
-        Parameters
-        ----------
-        settings_cls : type of Settings
-        init_settings : InitSettingsSource
-            The arguments; `file`, the content of the file, is taken out of them.
-        env_settings, dotenv_settings, file_secret_settings : PydanticBaseSettingsSource
-            Not used.
-
-        Returns
-        -------
-        tuple of PydanticBaseSettingsSource
-            Arguments, environment, file: the first that has a value gives it.
-        """
-        del env_settings, dotenv_settings, file_secret_settings
-        assert isinstance(init_settings, InitSettingsSource)
-        file = init_settings.init_kwargs.pop("file", {})
-        return init_settings, _Environment(settings_cls), InitSettingsSource(settings_cls, file)
-
 
 def load_settings(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
@@ -286,7 +229,7 @@ def load_with_origins(
     lines = {} if file is None else key_lines(file.read_text("utf-8"))
     origins = Origins(command_line, content, file, lines)
     try:
-        settings = Settings(file=content, **command_line)  # type: ignore[call-arg]
+        settings = Settings(**(content | _environment() | command_line))
         _check_microphones(settings.microphone, origins)
         if not microphone:
             return settings, origins
@@ -300,6 +243,27 @@ def load_with_origins(
         return settings.model_copy(update=update), origins
     except ValidationError as error:
         raise refusal(error, origins) from error
+
+
+def _environment() -> dict[str, Any]:
+    """Read the variables of the environment: one that is unknown, or no JSON, is refused."""
+    values: dict[str, Any] = {}
+    for variable in (name for name in sorted(os.environ) if name.upper().startswith(ENVIRONMENT)):
+        name = variable[len(ENVIRONMENT) :].lower()
+        field = Settings.model_fields.get(name)
+        if field is None:
+            raise ConfigurationError(f"environment: unknown variable {variable[:64]!r}")
+        values[name] = os.environ[variable]
+        if get_origin(field.annotation) is list:
+            values[name] = _from_json(variable)
+    return values
+
+
+def _from_json(variable: str) -> Any:
+    try:
+        return json.loads(os.environ[variable])
+    except (ValueError, RecursionError) as error:
+        raise ConfigurationError(f"environment: {variable} is not JSON ({error})") from error
 
 
 def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> ConfigurationError:

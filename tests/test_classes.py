@@ -16,6 +16,7 @@ from hearthlog.analyzer.training.transitions import (
     expected_durations,
 )
 from hearthlog.models.classes import (
+    CLASS_NAME,
     CLASSES,
     class_name,
     find_class,
@@ -24,7 +25,7 @@ from hearthlog.models.classes import (
     translation,
 )
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import CLASS_NAME, MOST_CLASSES
+from hearthlog.models.classifiers.description import MOST_CLASSES
 from hearthlog.models.modelfile.modelfile import load_model
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"

@@ -25,7 +25,7 @@ from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.cli.main import app
+from hearthlog.tools.cli.main import make_app
 
 pytestmark = pytest.mark.fast
 
@@ -61,7 +61,7 @@ def copied(written, tmp_path):
 
 
 def command(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
+    return CliRunner().invoke(make_app(), [str(word) for word in words])
 
 
 def rows_of(name, folder, output, **options):

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 pytest.importorskip("hearthlog.tools.month", reason="the wheel leaves what developers run out")
 
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.cli.main import app
+from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.__main__ import home as simulate_home
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.month.__main__ import month as simulate_month
@@ -57,7 +57,7 @@ def commands(command, name=()):
         yield from commands(verb, (*name, word))
 
 
-VERBS = dict(commands(typer.main.get_command(app)))
+VERBS = dict(commands(typer.main.get_command(make_app())))
 LEAVES = {name: verb for name, verb in VERBS.items() if not hasattr(verb, "commands")}
 
 
@@ -357,7 +357,7 @@ def do_copy(source, target):
 
 
 def do(words):
-    result = CliRunner().invoke(app, shlex.split(words))
+    result = CliRunner().invoke(make_app(), shlex.split(words))
     assert result.exit_code in {0, 3}, f"{words}: {result.output} {result.exception}"
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from hearthlog import __version__
 from hearthlog.recorder.config import Settings
-from hearthlog.tools.cli.main import app
+from hearthlog.tools.cli.main import make_app
 
 _WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
 _TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
@@ -27,12 +27,12 @@ def commands(command, name=()):
         yield from commands(verb, (*name, word))
 
 
-VERBS = dict(commands(typer.main.get_command(app)))
+VERBS = dict(commands(typer.main.get_command(make_app())))
 
 
 def help_of(*verb):
     """What --help says, without frames and line breaks."""
-    result = CliRunner().invoke(app, [*verb, "--help"], env=_WIDE)
+    result = CliRunner().invoke(make_app(), [*verb, "--help"], env=_WIDE)
     assert result.exit_code == 0, result.output
     return " ".join(re.sub("[│╭╮╰╯─]", " ", result.output).split())
 

@@ -21,9 +21,10 @@ from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk.keeper import DiskKeeper
-from hearthlog.recorder.disk.keeping import KeepingRules, keep_disk
+from hearthlog.recorder.disk.keeping import keep_disk
+from hearthlog.recorder.disk.limits import KeepingRules, Limits
 from hearthlog.recorder.disk.recorded import RecordedDays, recorded_logs
-from hearthlog.recorder.disk.retention import Disk, Limits, plan_retention
+from hearthlog.recorder.disk.retention import Disk, plan_retention
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.recording import record
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES

@@ -14,9 +14,8 @@ from logs import read
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.recorder.disk.keeping import KeepingRules, keep_disk
-from hearthlog.recorder.disk.retention import Limits
-from hearthlog.recorder.disk.thinning import ThinningDays
+from hearthlog.recorder.disk.keeping import keep_disk
+from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, log_path
 from hearthlog.schemas.logs.provenance import provenance_records

@@ -16,7 +16,7 @@ import typer
 from typer.testing import CliRunner
 
 from hearthlog.analyzer.ports import free_port
-from hearthlog.tools.cli.main import app
+from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 pytestmark = pytest.mark.fast
@@ -138,12 +138,12 @@ def sprung(folder):
 def test_every_verb_is_tried_here():
     commands = (*MAKING, *READING, *DRAWING, *LISTENING, RECORDING, WATCHING, BRIDGING, INSTALLING)
     tried = {command.split()[0] for command in commands}
-    assert tried == set(typer.main.get_command(app).commands)
+    assert tried == set(typer.main.get_command(make_app()).commands)
 
 
 def test_every_verb_says_what_it_does():
-    for words, command in verbs(typer.main.get_command(app)):
-        result = CliRunner().invoke(app, [*words, "--help"])
+    for words, command in verbs(typer.main.get_command(make_app())):
+        result = CliRunner().invoke(make_app(), [*words, "--help"])
         assert result.exit_code == 0, result.output
         assert command.help.splitlines()[0][:40] in result.output
 

@@ -20,8 +20,7 @@ from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.models.classes import SILENCE, class_name
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME, SILENCE, class_name
 from hearthlog.models.features.feature_set import SILENCE_POWER
 from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource

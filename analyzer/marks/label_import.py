@@ -12,7 +12,7 @@ from hearthlog.analyzer.marks.formats.label_files import read_rows
 from hearthlog.analyzer.marks.formats.labels import Choice, PlacedMark, make_mark
 from hearthlog.analyzer.marks.formats.left_out import OTHER, OVERLAP, LeftOut, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 

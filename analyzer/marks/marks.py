@@ -15,7 +15,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import SUFFIX, review_path, stem

@@ -22,8 +22,7 @@ from hearthlog.analyzer.logs.labelling import (
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.spans import Spans, common, joined, one
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
-from hearthlog.models.classes import class_name
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME, class_name
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer

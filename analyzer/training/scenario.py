@@ -6,7 +6,8 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models import classes as sound
-from hearthlog.models.classifiers.description import CLASS_NAME, MOST_CLASSES, TEXT
+from hearthlog.models.classes import CLASS_NAME
+from hearthlog.models.classifiers.description import MOST_CLASSES, TEXT
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.storage.small_file import read_toml
 

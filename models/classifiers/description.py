@@ -6,11 +6,11 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
+from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.text import printable
 
-CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
 MOST_SPANS = 1000  # forty kilobytes
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads

@@ -8,9 +8,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from hearthlog.recorder.disk.keeping import DiskReport, KeepingRules, keep_disk
-from hearthlog.recorder.disk.retention import Limits, disk_of
-from hearthlog.recorder.disk.thinning import ThinningDays
+from hearthlog.recorder.disk.keeping import DiskReport, keep_disk
+from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
+from hearthlog.recorder.disk.retention import disk_of
 from hearthlog.recorder.events import OK, WARNING, SourceHealth
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.stream import rosout

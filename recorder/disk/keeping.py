@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.recorder.disk.limits import KeepingRules, ThinningDays
 from hearthlog.recorder.disk.recorded import (
     RecordedDays,
     RecordedLog,
@@ -11,38 +12,18 @@ from hearthlog.recorder.disk.recorded import (
     recorded_logs,
 )
 from hearthlog.recorder.disk.retention import (
-    Limits,
     Plan,
     carry_out,
     disk_of,
     plan_retention,
 )
 from hearthlog.recorder.disk.sizes import size_text
-from hearthlog.recorder.disk.thinning import ThinningDays, plan_thinning, thin
+from hearthlog.recorder.disk.thinning import plan_thinning, thin
 from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.schemas.errors import LogError
 
 _SHOWN = 300  # characters
 _AT_ONCE = 100  # logs that are thinned, so that nothing else waits for an hour
-
-
-class KeepingRules(NamedTuple):
-    """What a recorder keeps of which logs.
-
-    Attributes
-    ----------
-    root : str
-        Folder of logs.
-    node : str
-        Name of the node.
-    limits : Limits
-    thinning : ThinningDays
-    """
-
-    root: str
-    node: str
-    limits: Limits
-    thinning: ThinningDays = ThinningDays()
 
 
 class DiskReport(NamedTuple):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.recorder.disk.limits import Limits
 from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, RecordedLog
 from hearthlog.recorder.disk.sizes import size_text
 from hearthlog.schemas.errors import LogError
@@ -18,27 +19,6 @@ from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
 
 REVIEWED = "reviewed"
 _FEW = 2  # logs, all of which but the newest may go without a question
-
-
-class Limits(NamedTuple):
-    """What is kept at most; 0 for no limit.
-
-    Attributes
-    ----------
-    days : int
-        Days on which something was recorded.
-    files : int
-        Finished logs.
-    size : int
-        Bytes of finished logs and their layers.
-    free : int
-        Bytes that should be free on the disk.
-    """
-
-    days: int = 0
-    files: int = 0
-    size: int = 0
-    free: int = 0
 
 
 class Disk(NamedTuple):

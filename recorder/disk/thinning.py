@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.recorder.disk.limits import ThinningDays
 from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, RecordedLog
 from hearthlog.recorder.disk.retention import REVIEWED, is_reviewed, kept_because
 from hearthlog.schemas.errors import LogError
@@ -12,34 +13,6 @@ from hearthlog.schemas.salvage.thin import thin_log, thinned_step
 from hearthlog.schemas.storage.new_files import locked_folder, sync_file, sync_folder
 
 _STATISTICS = 1  # the step that lessons do not miss
-
-
-class ThinningDays(NamedTuple):
-    """After how many days with sound a log loses what; 0 for never.
-
-    Attributes
-    ----------
-    statistics : int
-    features : int
-        These, and the statistics.
-    rest : int
-        All but labels, segments and gaps.
-    """
-
-    statistics: int = 0
-    features: int = 0
-    rest: int = 0
-
-    def step(self, age: int) -> int:
-        """Return how far a log is to be thinned: a place in `hearthlog.schemas.salvage.thin.STEPS`.
-
-        Parameters
-        ----------
-        age : int
-            Days with sound since.
-        """
-        due = [step for step, days in enumerate(self, 1) if days and age >= days]
-        return max(due, default=0)
 
 
 class Thinned(NamedTuple):

@@ -10,7 +10,6 @@ import zlib
 from io import BytesIO
 from typing import Any, NamedTuple
 
-import lz4.frame
 import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -211,6 +210,8 @@ def _zstd(data: bytes | memoryview, out: memoryview) -> int:
 
 
 def _lz4(data: bytes | memoryview, out: memoryview) -> int:
+    import lz4.frame  # noqa: PLC0415  only others write such files
+
     raw = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=len(out) + 1)
     return _stored(raw, out)
 

@@ -259,7 +259,8 @@ def rows_by_layout(
 def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
     if len(sizes) and (sizes == sizes[0]).all():  # most often, and quicker
         return [(int(sizes[0]), np.arange(len(sizes)))]
-    return [(size, np.flatnonzero(sizes == size)) for size in np.unique(sizes).tolist()]
+    # np.unique would be no quicker, and imports a megabyte of masked arrays.
+    return [(size, np.flatnonzero(sizes == size)) for size in sorted(set(sizes.tolist()))]
 
 
 def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[Layout, Indices]]:

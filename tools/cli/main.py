@@ -3,8 +3,9 @@
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Annotated, Any
 
 from hearthlog.schemas.blas import kernel_environment
@@ -17,68 +18,37 @@ import typer
 
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
-from hearthlog.tools.cli.alerts import alerts
-from hearthlog.tools.cli.annotate import annotate
-from hearthlog.tools.cli.bridge import bridge
-from hearthlog.tools.cli.cat import cat
-from hearthlog.tools.cli.catalog import catalog
-from hearthlog.tools.cli.config import config
-from hearthlog.tools.cli.cut import cut
-from hearthlog.tools.cli.demo import demo
-from hearthlog.tools.cli.devices import devices
-from hearthlog.tools.cli.diff import diff
-from hearthlog.tools.cli.doctor import doctor
-from hearthlog.tools.cli.enrol import enrol
-from hearthlog.tools.cli.evaluate import evaluate
-from hearthlog.tools.cli.export import export
-from hearthlog.tools.cli.info import info
-from hearthlog.tools.cli.install_service import install_service
-from hearthlog.tools.cli.manifest import manifest
-from hearthlog.tools.cli.merge import merge
-from hearthlog.tools.cli.models import models
 from hearthlog.tools.cli.output import OutputClosedError, checked_output
-from hearthlog.tools.cli.pause import pause, resume
-from hearthlog.tools.cli.record import record
-from hearthlog.tools.cli.recover import recover
-from hearthlog.tools.cli.relabel import relabel
-from hearthlog.tools.cli.replay import replay
-from hearthlog.tools.cli.report import report
-from hearthlog.tools.cli.retain import retain
-from hearthlog.tools.cli.review import ReviewCommand, review
 from hearthlog.tools.cli.text import tell
-from hearthlog.tools.cli.train import train
-from hearthlog.tools.cli.watch import watch
 
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+# In the order of the help; each is a function, or an app of its own, in the module of its name.
+VERBS = (
+    *("record", "pause", "resume", "install_service", "devices", "info", "catalog", "cat"),
+    *("export", "merge", "cut", "doctor", "recover", "retain", "manifest", "train", "enrol"),
+    *("diff", "review", "watch", "bridge", "report", "replay", "relabel", "demo"),
+    *("alerts", "annotate", "config", "evaluate", "models"),
 )
-_ON_LOGS = (
-    record,
-    pause,
-    resume,
-    install_service,
-    devices,
-    info,
-    catalog,
-    cat,
-    export,
-    merge,
-    cut,
-    doctor,
-    recover,
-    retain,
-)
-_LEARNING = (manifest, train, enrol)
+_MODULES = {"resume": "pause"}  # of a verb that shares one
 _NAMED = 10  # of many files with the same fault
-for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, bridge, report, replay, relabel, demo):
-    app.command(cls=ReviewCommand if verb is review else None)(verb)
-app.add_typer(alerts, name="alerts")
-app.add_typer(annotate, name="annotate")
-app.add_typer(config, name="config")
-app.add_typer(evaluate, name="evaluate")
-app.add_typer(models, name="models")
+_debug = {"on": False}
+
+
+def make_app(verbs: Iterable[str] = VERBS) -> typer.Typer:
+    """Make the app of some verbs; only their modules are imported."""
+    app = typer.Typer(
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(_options)
+    for verb in verbs:
+        module = import_module(f"hearthlog.tools.cli.{_MODULES.get(verb, verb)}")
+        command = getattr(module, verb)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=verb)
+        else:
+            app.command(cls=getattr(module, "COMMAND_CLASS", None))(command)
+    return app
 
 
 def _print_version(shown: bool) -> None:
@@ -87,8 +57,7 @@ def _print_version(shown: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def options(
+def _options(
     *,
     version: Annotated[
         bool,
@@ -105,15 +74,19 @@ def options(
     _debug["on"] = debug
 
 
-_debug = {"on": False}
-
-
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
     with checked_output(), _warnings_shown() as warned:
+        app = make_app(_wanted_verbs())
         status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
+
+
+def _wanted_verbs() -> Iterable[str]:
+    """Return the verb of the command line; all where it has none, as for help and completion."""
+    words = [word.replace("-", "_") for word in sys.argv[1:] if not word.startswith("-")]
+    return words[:1] if words and words[0] in VERBS else VERBS
 
 
 def _status_of(step: Callable[[], Any]) -> str | int | None:

@@ -15,7 +15,7 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.text import end_with_warnings, number, print_json, print_lines, tell
 
 if TYPE_CHECKING:
-    from hearthlog.recorder.disk.keeping import KeepingRules
+    from hearthlog.recorder.disk.limits import KeepingRules
     from hearthlog.recorder.disk.retention import Deletion
     from hearthlog.recorder.disk.thinning import Thinned
 

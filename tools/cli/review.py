@@ -139,6 +139,9 @@ class ReviewCommand(TyperCommand):
         return super().parse_args(ctx, args)
 
 
+COMMAND_CLASS = ReviewCommand
+
+
 def _end(number: int, _frame: object) -> None:
     raise SystemExit(128 + number)
 

@@ -4,6 +4,7 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
 
@@ -12,7 +13,6 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
-from hearthlog.analyzer.bridge.mqtt.commands import Answer, Commands
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.held_values import HeldValues
@@ -21,6 +21,9 @@ from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.text import shortened
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.bridge.mqtt.commands import Answer, Commands
 
 _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
@@ -72,11 +75,7 @@ class MqttPublisher:
             subscriptions=subscriptions,
             received=self._take,
         )
-        self._commands = None
-        if settings.commands:
-            self._commands = Commands(
-                home.folder, home.node, self._held.switch, self._answers.append
-            )
+        self._commands = self._take_commands() if settings.commands else None
 
     def update(self, news: News) -> None:
         """Say what is new."""
@@ -138,6 +137,13 @@ class MqttPublisher:
         if self._commands is not None:
             self._commands.close()
         self._connection.close()
+
+    def _take_commands(self) -> "Commands":
+        # Imported here: who commands nothing needs nothing that corrects logs.
+        from hearthlog.analyzer.bridge.mqtt.commands import Commands  # noqa: PLC0415
+
+        home = self._home
+        return Commands(home.folder, home.node, self._held.switch, self._answers.append)
 
     def _obey(self, state: HomeState) -> None:
         """Have the commands carried out that came, and answer those that are."""

@@ -10,8 +10,7 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.page.words import class_words
 from hearthlog.analyzer.marks.marks import Mark, read_marks
-from hearthlog.models.classes import CLASSES, SILENCE, class_name
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME, CLASSES, SILENCE, class_name
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import find_logs, log_name, review_path
 from hearthlog.schemas.messages.labels import spelt

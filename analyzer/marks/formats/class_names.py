@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.models.classes import find_class
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME, find_class
 from hearthlog.schemas.storage.small_file import read_toml
 
 _LONGEST = 200  # characters of a label; to normalise many accents takes the square of their number

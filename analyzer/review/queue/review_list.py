@@ -14,7 +14,7 @@ from hearthlog.analyzer.logs.spans import Spans, one, pieces
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.queue.ranking import USEFUL, ReviewQueue
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.topics import LABELLING, check_microphone_name
 from hearthlog.schemas.storage.new_files import new_file
