@@ -25,8 +25,10 @@
 #include <time.h>
 #include <unistd.h>
 
-/* A poll wakes the reader so often in a period; a sound card does it once. */
+/* A poll wakes the reader when a period is full, as a sound card does; one that has not read it
+ * then, or is unplugged, so often in a period. */
 #define TICKS_PER_PERIOD 4
+#define LEAST_TICK 1000000LL /* nanoseconds */
 
 enum condition { NORMAL, UNPLUGGED, FROZEN };
 
@@ -80,10 +82,19 @@ static int16_t sample_at(const labmic_t *mic, uint64_t index)
     return (int16_t)((int)(index % 65536) - 32768);
 }
 
-static void set_tick(const snd_pcm_ioplug_t *io, long long nanoseconds)
+static struct timespec duration_of(const snd_pcm_ioplug_t *io, snd_pcm_sframes_t frames)
 {
-    struct timespec time = {nanoseconds / 1000000000, nanoseconds % 1000000000};
-    struct itimerspec tick = {time, time};
+    long long nanoseconds = 1000000000LL * frames / io->rate;
+    if (nanoseconds < LEAST_TICK)
+        nanoseconds = LEAST_TICK;
+    return (struct timespec){nanoseconds / 1000000000, nanoseconds % 1000000000};
+}
+
+/* Wake the reader when so many more samples are there. */
+static void set_tick(const snd_pcm_ioplug_t *io, snd_pcm_sframes_t missing)
+{
+    struct itimerspec tick = {.it_value = duration_of(io, missing),
+                              .it_interval = duration_of(io, io->period_size / TICKS_PER_PERIOD)};
     timerfd_settime(io->poll_fd, 0, &tick, NULL);
 }
 
@@ -99,7 +110,7 @@ static int mic_start(snd_pcm_ioplug_t *io)
         return -ENODEV;
     mic->first = index_now(mic);
     mic->running = 1;
-    set_tick(io, 1000000000LL * io->period_size / io->rate / TICKS_PER_PERIOD);
+    set_tick(io, io->period_size);
     return 0;
 }
 
@@ -107,7 +118,7 @@ static int mic_stop(snd_pcm_ioplug_t *io)
 {
     labmic_t *mic = io->private_data;
     mic->running = 0;
-    set_tick(io, 0);
+    timerfd_settime(io->poll_fd, 0, &(struct itimerspec){0}, NULL);
     return 0;
 }
 
@@ -167,10 +178,14 @@ static int mic_poll_revents(snd_pcm_ioplug_t *io, struct pollfd *descriptors, un
         return 0;
     }
     snd_pcm_sframes_t available = snd_pcm_avail_update(io->pcm);
-    if (available < 0)
+    snd_pcm_sframes_t wanted = wanted_frames(io->pcm);
+    if (available < 0) {
         *events = POLLIN | POLLERR;
-    else
-        *events = available >= wanted_frames(io->pcm) ? POLLIN : 0;
+        return 0;
+    }
+    int is_full = available >= wanted;
+    *events = is_full ? POLLIN : 0;
+    set_tick(io, (is_full ? 2 * wanted : wanted) - available); /* a full one is read now */
     return 0;
 }
 
