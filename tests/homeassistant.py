@@ -198,6 +198,15 @@ class HomeAssistant:
         found = self.states().get(entity)
         return None if found is None else found["state"]
 
+    def any_state(self, entity):
+        """Return the state of an entity of any device; None if there is none."""
+        states = {each["entity_id"]: each["state"] for each in self.call("/api/states")}
+        return states.get(entity)
+
+    def act(self, domain, action, entity):
+        """Call an action on an entity, as a button on a dashboard does."""
+        self.call(f"/api/services/{domain}/{action}", {"entity_id": entity})
+
     def automate(self, name, **content):
         """Add an automation, as the editor does, and wait until it waits for its triggers."""
         content = {"alias": name, "id": name, "mode": "queued", **content}
@@ -286,6 +295,7 @@ class Household:
         self.configuration.write_text(
             f'node = "home"\noutput = "{folder / "logs"}"\ntimezone = "Europe/Vienna"\n'
             f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {port}\n'
+            "commands = true\n"
         )
 
     def _write_sound(self):

@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 from homelife import HOUR, midnight, write_day
+from livehome import following
 from pydantic import TypeAdapter
 
 from hearthlog.analyzer.bridge.alerts.evaluate import rings
@@ -29,7 +30,6 @@ from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.analyzer.bridge.state_folder import state_folder
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
@@ -309,7 +309,7 @@ class Recorder(Thread):
 @contextmanager
 def bridge(root, rules, told, said):
     """A bridge that tells of rings of some rules."""
-    home, stop = Home(root / "logs", "home", ZoneInfo("Europe/Vienna")), Event()
+    home = Home(root / "logs", "home", ZoneInfo("Europe/Vienna"))
 
     def tell(*ring):
         is_taken = next(connected)
@@ -318,14 +318,8 @@ def bridge(root, rules, told, said):
 
     connected = chain([False, False], repeat(True))  # the broker comes after the first ring
     own = AlertsOutput(rules, DeliverySettings(), home, root / "state", said.append, tell)
-    running = Bridge(home, time.time_ns() - HOUR * SECOND, {"alerts": own}, said.append)
-    thread = Thread(target=running.run, args=(stop,), daemon=True)
-    thread.start()
-    try:
+    with following(home, {"alerts": own}, said):
         yield
-    finally:
-        stop.set()
-        thread.join(30)
 
 
 def wait_for(condition):
@@ -518,6 +512,17 @@ def test_a_replay_as_json_is_of_the_span_that_is_asked_for(two_days, hearthlog):
     assert result["start"] == "2026-03-02T13:00:00.000+01:00"
     assert result["rules"]["coughs"] == []
     assert [ring["known"] for ring in result["rules"]["no speech"]] == [False]
+
+
+def test_a_replay_goes_by_the_time_zone_of_the_configuration_before_that_of_the_logs(
+    two_days, hearthlog, tmp_path
+):
+    (tmp_path / "home.toml").write_text(f'timezone = "Asia/Tokyo"\n{CONFIG}')
+    options = ["--json", "--config", tmp_path / "home.toml"]
+    done = hearthlog("alerts", "replay", two_days / "logs", *options)
+    result = json.loads(done.stdout)
+    assert result["timezone"] == "Asia/Tokyo"
+    assert {ring["time"][10:] for ring in result["rules"]["no speech"]} == {"T03:30:00.000+09:00"}
 
 
 def test_a_replay_with_a_damaged_log_uses_the_others_and_ends_with_status_3(

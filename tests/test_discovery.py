@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
+from hearthlog.analyzer.bridge.mqtt.discovery import (
+    command_discovery,
+    device_id,
+    discovery,
+    home_id,
+)
 from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
 from hearthlog.models.modelfile.modelfile import load_model
 
@@ -56,6 +61,17 @@ def test_every_component_has_a_name_of_its_own_whatever_the_classes_are_called()
     assert len({*names}) == len(names)
     for name in [*names, *components]:
         assert re.fullmatch("[a-zA-Z0-9_-]+", name)
+
+
+def test_every_class_has_a_switch_of_its_own_and_one_that_is_gone_has_none():
+    components = command_discovery(HOME, HOSTILE, ["a c"])["components"]
+    assert components.pop("told_a_20_c") == {"p": "switch"}
+    switches = [each for each in components.values() if each["p"] == "switch"]
+    assert len({each["unique_id"] for each in switches}) == len(switches) == len(HOSTILE) - 1
+    assert len({each["name"] for each in switches}) == len(switches)
+    told = [json.loads(each["payload_off"])["label"] for each in switches]
+    assert sorted(told) == sorted({*HOSTILE} - {"silence"})
+    assert home_id("home") not in {device_id("home", name) for name in HOSTILE}
 
 
 def test_no_two_triggers_are_called_the_same():

@@ -181,6 +181,25 @@ def test_counts_and_times_are_numbers_and_times_for_long_term_statistics(home):
     assert home.ask(type="recorder/validate_statistics") == {}
 
 
+def test_a_class_is_switched_off_and_on_and_a_pause_is_asked_for_by_a_button(home):
+    switch = "switch.hearthlog_home_tell_of_coughing"
+    assert home.any_state(switch) == "on"
+    home.act("switch", "turn_off", switch)
+    wait_for(lambda: home.any_state(switch) == "off", 10)
+    wait_for(lambda: home.state(f"{ON}coughing") == "off", 5)
+    time.sleep(40)  # a cough
+    assert home.state(f"{ON}coughing") == "off"
+    home.act("switch", "turn_on", switch)
+    wait_for(lambda: home.state(f"{ON}coughing") == "on", 60)
+    with Listener(home.broker.port, "hearthlog/home/command/answer") as listener:
+        home.act("button", "press", "button.hearthlog_home_pause_for_an_hour")
+        answer = json.loads(listener.wait_for("hearthlog/home/command/answer"))
+        assert answer == {"done": True, "text": "paused for 60 minutes by Home Assistant"}
+        home.act("button", "press", "button.hearthlog_home_listen_again")
+        listener.wait_until(lambda: "it listens again" in str(listener.values))
+    wait_for(lambda: is_well(home), 60)
+
+
 def test_a_blueprint_notifies_of_a_sound_that_is_heard_again_and_again(home):
     if home.version < "2025.4":
         pytest.skip("the blueprint is for Home Assistant 2025.4 and later")
@@ -310,6 +329,8 @@ def test_classes_that_go_with_another_model_are_gone_and_new_ones_are_there(home
     assert triggers(home) == {("heard", name) for name in words(BATHROOM)}
     assert classes(home) == list(BATHROOM)
     wait_for(lambda: home.state(f"{ON}toilet_flush") == "off", 20)
+    wait_for(lambda: home.any_state("switch.hearthlog_home_tell_of_coughing") is None, 20)
+    assert home.any_state("switch.hearthlog_home_tell_of_toilet_flush") == "on"
 
 
 def test_classes_that_went_while_there_was_no_bridge_are_gone_too(home):

@@ -25,6 +25,7 @@ from hearthlog.schemas.times import NANOSECONDS
 ROOT = "hearthlog/home"
 COUGHING = f"{ROOT}/mic/class/coughing"
 DISCOVERY = f"homeassistant/device/{device_id('home', 'mic')}/config"
+COMMANDS = "homeassistant/device/hearthlog-home/config"
 _CLIPS = Path(__file__).parent / "data" / "household"
 
 
@@ -250,6 +251,23 @@ def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, 
             listener.wait_for(f"{ROOT}/told/coughing", "ON")
             home.hears("coughing")
             listener.wait_for(f"{COUGHING}/on", "ON")
+
+
+def test_home_assistant_has_switches_and_buttons_only_where_commands_are_taken(home, broker):
+    home.hears("coughing")
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker, commands=True):
+            parts = json.loads(listener.wait_for(COMMANDS))["components"]
+            switch, button = parts["told_coughing"], parts["resume"]
+            listener.wait_for(switch["state_topic"], switch["state_on"])
+            listener.publish(switch["command_topic"], switch["payload_off"])
+            listener.wait_for(switch["state_topic"], switch["state_off"])
+            listener.publish(button["command_topic"], button["payload_press"])
+            listener.wait_for(
+                f"{ROOT}/command/answer", '{"done": true, "text": "it was not paused"}'
+            )
+        with Bridged(home.folder, broker):
+            listener.wait_for(COMMANDS, "")
 
 
 def test_a_bridge_that_is_started_again_tells_of_no_event_twice(home, broker):

@@ -62,6 +62,8 @@ def replay(
         wrong_use(f"{config}: has no rule; docs/alerts.md says how to write a [[bridge.alert]]")
     home = find_home_logs(logs)
     _check_node(home, settings.node)
+    if timezone is None and "timezone" in settings.model_fields_set:
+        timezone = settings.timezone  # by which the bridge goes
     zone = home_zone(timezone, home.records())
     first, last = _span(home, settings.node, first, last)
     losses = list(home.losses)

@@ -4,7 +4,7 @@ import os
 import pwd
 from pathlib import Path
 
-from hearthlog.analyzer.bridge.settings import load_bridge_settings
+from hearthlog.analyzer.bridge.settings import BridgeSettings, load_bridge_settings
 from hearthlog.tools.service.errors import ServiceError
 from hearthlog.tools.service.needs import STATE
 from hearthlog.tools.service.unit import BRIDGE_NAME, bridge_unit
@@ -61,6 +61,7 @@ def install_bridge(config: Path, account: str | None) -> Installed:
             f"{config}: the bridge has a user of its own, who may not read the logs; say there "
             f'readable_by = "group", or give it the user of the recorder: --account {RECORDER}'
         )
+    _check_files(bridge)
     _check_person(account or RECORDER)
     figures = None if bridge.prometheus is None else bridge.prometheus.text_file
     written = [] if figures is None else [figures.absolute().parent]
@@ -68,6 +69,15 @@ def install_bridge(config: Path, account: str | None) -> Installed:
     text = bridge_unit(verb_command("bridge", config), account, RECORDER, logs, written)
     write_unit(unit, text)
     return Installed(unit, start_unit(BRIDGE_NAME, is_running=is_systemd_running()))
+
+
+def _check_files(bridge: BridgeSettings) -> None:
+    """Check that the service sees what it reads besides; a relative name is of a credential."""
+    tables = bridge.mqtt, bridge.page, bridge.delivery
+    for table in (each for each in tables if each is not None):
+        for key, path in table:
+            if isinstance(path, Path) and path.is_absolute():
+                check_seen(key, path)
 
 
 def _check_person(account: str) -> None:

@@ -1,4 +1,4 @@
-"""What Home Assistant is told of a microphone: its device, and everything that it shows of it."""
+"""What Home Assistant is told of: a device for each microphone, and one for what it may command."""
 
 import json
 from collections import Counter
@@ -9,10 +9,18 @@ from hearthlog._version import __version__
 from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
+_BY = "Home Assistant"
+_PAUSE_MINUTES = 60
+
 
 def device_id(node: str, microphone: str) -> str:
     """Return what names the device of a microphone in Home Assistant: no other has this name."""
-    return f"hearthlog-{identifier(node)}-{microphone}"
+    return f"{home_id(node)}-{microphone}"
+
+
+def home_id(node: str) -> str:
+    """Return what names the device of a recorder in Home Assistant."""
+    return f"hearthlog-{identifier(node)}"
 
 
 def discovery(
@@ -45,21 +53,89 @@ def discovery(
         removed = _of_class(topics, microphone, name, name)
         components |= {key: {"p": component["p"]} for key, component in removed.items()}
     return {
-        "device": {
-            "identifiers": [own],
-            "name": f"Hearthlog {topics.node} {microphone}",
-            "manufacturer": "hearthlog",
-            "model": "sounds of a home",
-        },
-        "origin": {"name": "hearthlog", "sw_version": __version__},
+        **_device(own, f"Hearthlog {topics.node} {microphone}"),
         "availability": [
             {"topic": topics.of_home("bridge")},
             {"topic": topics.of_microphone(microphone, "listening")},
         ],
         "availability_mode": "all",
-        "qos": 1,
         "components": components,
     }
+
+
+def command_discovery(
+    topics: Topics, classes: Sequence[str], gone: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Describe the device of a recorder, by which Home Assistant commands the bridge.
+
+    Parameters
+    ----------
+    topics : Topics
+    classes : sequence of str
+        Those of the models of all microphones.
+    gone : sequence of str, optional
+        Classes that earlier models had, whose switches are removed.
+
+    Returns
+    -------
+    dict
+        As `discovery`, of the topic `<prefix>/device/<home id>/config`.
+    """
+    own = home_id(topics.node)
+    command = {"command_topic": topics.of_home("command")}
+    components: dict[str, dict[str, Any]] = {
+        "pause": {
+            "p": "button",
+            "name": "Pause for an hour",
+            "payload_press": _command(pause_minutes=_PAUSE_MINUTES),
+            "icon": "mdi:microphone-off",
+            **command,
+        },
+        "resume": {
+            "p": "button",
+            "name": "Listen again",
+            "payload_press": _command(resume=True),
+            "icon": "mdi:microphone",
+            **command,
+        },
+    }
+    for name, words in _words([name for name in classes if name != SILENCE]).items():
+        components[f"told_{identifier(name)}"] = {
+            "p": "switch",
+            "name": f"Tell of {words}",
+            "entity_category": "config",
+            "state_topic": topics.of_told(name),
+            "state_on": "ON",
+            "state_off": "OFF",
+            "payload_on": _command(told=True, label=name),
+            "payload_off": _command(told=False, label=name),
+            **command,
+        }
+    for key, component in components.items():
+        component["unique_id"] = f"{own}-{key}"
+    components |= {f"told_{identifier(name)}": {"p": "switch"} for name in gone}
+    return {
+        **_device(own, f"Hearthlog {topics.node}"),
+        "availability": [{"topic": topics.of_home("bridge")}],
+        "components": components,
+    }
+
+
+def _device(own: str, name: str) -> dict[str, Any]:
+    return {
+        "device": {
+            "identifiers": [own],
+            "name": name,
+            "manufacturer": "hearthlog",
+            "model": "sounds of a home",
+        },
+        "origin": {"name": "hearthlog", "sw_version": __version__},
+        "qos": 1,
+    }
+
+
+def _command(**fields: Any) -> str:
+    return json.dumps({**fields, "by": _BY})
 
 
 def _of_microphone(

@@ -26,7 +26,8 @@ class HeldValues:
         self._lock = Lock()
         self._classes: set[tuple[str, str]] = set()  # microphones and classes
         self._microphones: set[str] = set()
-        self._untold: set[str] = set()  # classes
+        self._switched: set[str] = set()  # classes that there may be a switch of
+        self._untold: set[str] = set()  # those that are switched off
         self._last_events: set[str] = set()  # ids
 
     @property
@@ -48,13 +49,16 @@ class HeldValues:
                 self._microphones.add(name)
             elif self._topics.parse_microphone(topic, "last_event"):
                 self._last_events.add(_id_of(payload))
-            elif (label := self._topics.parse_told(topic)) and payload == _OFF:
-                self._untold.add(label)
+            elif label := self._topics.parse_told(topic):
+                self._switched.add(label)
+                if payload == _OFF:
+                    self._untold.add(label)
 
     def add_classes(self, microphone: str, labels: Collection[str]) -> None:
         """Note the classes of a microphone of which the broker was told by this bridge."""
         with self._lock:
             self._classes.update((microphone, label) for label in labels)
+            self._switched.update(labels)
 
     def other_microphones(self, known: Collection[str]) -> list[str]:
         """Return the microphones that are not known any more, each once."""
@@ -87,6 +91,11 @@ class HeldValues:
             }
         last = {name: max(n for m, n in told if m == name) for name, _ in told}
         return [e for n, e in enumerate(events) if n > last.get(e.microphone, -1)]
+
+    def other_switches(self, known: Collection[str]) -> list[str]:
+        """Return the classes that there may be switches of, and that are not known any more."""
+        with self._lock:
+            return sorted(self._switched.difference(known))
 
     def is_told(self, label: str) -> bool:
         """Tell whether the broker is told when a class is heard."""

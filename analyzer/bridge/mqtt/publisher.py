@@ -14,7 +14,12 @@ from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
-from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
+from hearthlog.analyzer.bridge.mqtt.discovery import (
+    command_discovery,
+    device_id,
+    discovery,
+    home_id,
+)
 from hearthlog.analyzer.bridge.mqtt.held_values import HeldValues
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
@@ -54,6 +59,7 @@ class MqttPublisher:
         self._home = home
         self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
+        self._switches: tuple[list[str], list[str]] = [], []  # and of which no more are told
         self._held = HeldValues(topics)
         # Events that were not told of yet.
         self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)
@@ -86,6 +92,7 @@ class MqttPublisher:
             self._say_state(microphone, news)
             self._say_problem(microphone, news.state)
         self._clear_others(news.state)
+        self._describe_switches()
         self._begun += news.begun
         self._ended += news.ended
         if self._connection.is_ready():
@@ -182,10 +189,27 @@ class MqttPublisher:
 
     def _tell_home_assistant(self, microphone: str, gone: tuple[str, ...] = ()) -> None:
         if self._settings.home_assistant:
-            node = self._topics.node
-            topic = f"{self._settings.discovery_topic}/device/{device_id(node, microphone)}/config"
+            topic = self._config_topic(device_id(self._topics.node, microphone))
             config = discovery(self._topics, microphone, self._classes[microphone], gone)
             self._connection.keep(topic, json.dumps(config))
+
+    def _describe_switches(self) -> None:
+        """Tell Home Assistant what it may command; nothing where it may not."""
+        if not self._settings.home_assistant:
+            return
+        topic = self._config_topic(home_id(self._topics.node))
+        if not self._settings.commands:
+            self._connection.forget(topic)
+            return
+        classes = sorted({name for names in self._classes.values() for name in names})
+        switches = classes, self._held.other_switches(classes)
+        if switches != self._switches:
+            self._switches = switches
+            config = command_discovery(self._topics, *switches)
+            self._connection.keep(topic, json.dumps(config))
+
+    def _config_topic(self, device: str) -> str:
+        return f"{self._settings.discovery_topic}/device/{device}/config"
 
     def _clear_others(self, state: HomeState) -> None:
         """Have the broker forget the classes that earlier models had."""
