@@ -24,10 +24,12 @@ test-fast: $(VENV)/.dev
 # Every verb of the wheel, in an environment of its own: without Rerun, and with it.
 test-wheel: dist
 	$(PYTHON) -m venv --clear build/wheel
-	build/wheel/bin/pip install --quiet "$$(ls build/dist/*.whl)[headless]" \
-		pytest pytest-timeout pytest-xdist
+	build/wheel/bin/pip install --quiet uv
+	build/wheel/bin/uv pip install --quiet --python build/wheel/bin/python \
+		"$$(ls build/dist/*.whl)[headless]" pytest pytest-timeout pytest-xdist
 	build/wheel/bin/pytest -n 2 tests/test_verbs.py
-	build/wheel/bin/pip install --quiet "$$(ls build/dist/*.whl)[analyzer]"
+	build/wheel/bin/uv pip install --quiet --python build/wheel/bin/python \
+		"$$(ls build/dist/*.whl)[analyzer]"
 	build/wheel/bin/pytest -n 2 tests/test_verbs.py
 
 # The fast part of the tests, with the oldest libraries that pyproject.toml allows, and on the
@@ -37,13 +39,14 @@ test-lowest: dist
 	build/lowest/bin/pip install --quiet uv
 	build/lowest/bin/uv pip compile --quiet --python build/lowest/bin/python pyproject.toml \
 		--extra analyzer --extra bridge --extra cluster --resolution lowest-direct -o build/lowest/versions.txt
-	build/lowest/bin/pip install --quiet "$$(ls build/dist/*.whl)[dev]" \
-		--constraint build/lowest/versions.txt
+	build/lowest/bin/uv pip install --quiet --python build/lowest/bin/python \
+		"$$(ls build/dist/*.whl)[dev]" --constraint build/lowest/versions.txt
 	build/lowest/bin/pytest -n 2 -m fast
 
 test-3.13: dist
 	python=$$(.ci/python 3.13) && $$python -m venv --clear build/3.13
-	build/3.13/bin/pip install --quiet "$$(ls build/dist/*.whl)[dev]"
+	build/3.13/bin/pip install --quiet uv
+	build/3.13/bin/uv pip install --quiet --python build/3.13/bin/python "$$(ls build/dist/*.whl)[dev]"
 	build/3.13/bin/pytest -n 2 -m fast
 
 # The nodes of tools/ros and topics as microphones, on two distributions of ROS 2 that come from PyPI.

@@ -74,7 +74,7 @@ def follow_home(
             return
     state.caught_up = False
     messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
-    yielded, checked = -math.inf, folder
+    yielded, current = -math.inf, folder
     for path, batch in messages:
         if path == folder:  # all that was written has been read
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
@@ -82,19 +82,25 @@ def follow_home(
                 yielded = time.monotonic()
                 yield state, []
         elif log_name(path).node == home.node:
-            try:
-                if path != checked:
-                    checked = path
-                    state.begin_log()
-                    _check_version(path, damaged)
-                begun = state.push(_decode(batch))
-            except LogError as error:
-                damaged(LogError(f"{path}: {error}"))
-                continue
+            if path != current:
+                current = path
+                state.begin_log()
+                _check_version(path, damaged)
             yielded = time.monotonic()
-            yield state, begun
+            yield state, _push(state, path, batch, damaged)
         if stop.is_set():
             return
+
+
+def _push(
+    state: HomeState, log: Path, batch: list[RawMessages], damaged: Callable[[LogError], None]
+) -> list[Event]:
+    """Add what was read of a log; return the events that begin with it."""
+    try:
+        return state.push(_decode(batch))
+    except LogError as error:
+        damaged(LogError(f"{log}: {error}"))
+        return []
 
 
 def _check_version(log: Path, damaged: Callable[[LogError], None]) -> None:
