@@ -1,6 +1,7 @@
 """Figures for Prometheus, on a port of loopback and in a text file."""
 
 import http.client
+import math
 import time
 from contextlib import contextmanager
 from datetime import UTC
@@ -10,7 +11,7 @@ import pytest
 from livehome import LiveHome, following
 from prometheus_client.parser import text_string_to_metric_families
 
-from hearthlog.analyzer.bridge import prometheus
+from hearthlog.analyzer.bridge import home_state, prometheus
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
@@ -87,10 +88,30 @@ def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
         found = wait_for(lambda: known(port))
     assert found["hearthlog_events_total", "coughing", "mic"] == 2
     assert found["hearthlog_event_seconds_total", "coughing", "mic"] == 5
+    assert found["hearthlog_level_dbfs", "mic"] == -40.5
     assert found["hearthlog_listening", "mic"] == found["hearthlog_recording",] == 1
     assert found["hearthlog_problem", "mic"] == 1
     assert found["hearthlog_free_bytes",] > 0
     assert abs(found["hearthlog_last_label_timestamp_seconds", "mic"] - time.time()) < 60
+
+
+def test_a_class_counts_from_0_so_that_its_first_event_is_an_increase(home, tmp_path):
+    home.hears("silence")
+    port = free_port()
+    with bridged(home, tmp_path, port=port):
+        found = wait_for(lambda: known(port))
+    assert found["hearthlog_events_total", "coughing", "mic"] == 0
+    assert ("hearthlog_events_total", "silence", "mic") not in found
+
+
+def test_a_microphone_that_is_away_has_no_level(home, tmp_path, monkeypatch):
+    home.hears("silence")
+    home.says("mic", 0, "well", level_dbfs="-40.5")
+    monkeypatch.setattr(home_state, "_AWAY_SECONDS", -1.0)
+    port = free_port()
+    with bridged(home, tmp_path, port=port):
+        found = wait_for(lambda: known(port))
+    assert math.isnan(found["hearthlog_level_dbfs", "mic"])
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from prometheus_client.registry import Collector
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.home_state import MicrophoneState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
@@ -171,12 +172,13 @@ class _Figures(Collector):
         def each(value: Callable[[Any], float]) -> list[tuple[tuple[str, ...], float]]:
             return [((node, microphone.name), value(microphone)) for microphone in microphones]
 
+        def level(microphone: MicrophoneState) -> float:
+            return microphone.level_dbfs if microphone.is_listening() else math.nan
+
         yield _gauge(
             "listening", "Whether labels come.", each(lambda m: m.is_listening()), "microphone"
         )
-        yield _gauge(
-            "level_dbfs", "Mean level of ten seconds.", each(lambda m: m.level_dbfs), "microphone"
-        )
+        yield _gauge("level_dbfs", "Mean level of ten seconds.", each(level), "microphone")
         yield _gauge(
             "last_label_timestamp_seconds",
             "When the newest label was known.",

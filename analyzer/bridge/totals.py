@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
@@ -58,18 +59,11 @@ class Totals:
     def __init__(self, path: Path, time: int) -> None:
         self._path = path
         self.time, self._kept = time, list[Total]()
-        if path.exists():
-            data = read_whole(path, "file of totals", _LIMIT, BridgeError)
-            try:
-                kept = _Kept.model_validate_json(data)
-            except ValidationError as error:
-                raise BridgeError(
-                    f"{path}: is damaged; delete it, and counts begin anew"
-                ) from error
+        if (kept := _read(path)) is not None:
             self.time, self._kept = kept.time, kept.totals
 
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
-        """Return what was heard, by microphone and class.
+        """Return what was heard, by microphone and class; 0 of a class that was not yet.
 
         Parameters
         ----------
@@ -80,7 +74,8 @@ class Totals:
         """
         sums = {total[:2]: total for total in self._kept}
         for microphone in state.microphones.values():
-            for label in microphone.labels():
+            known = (label for label in microphone.classes if label != SILENCE)
+            for label in dict.fromkeys([*known, *microphone.labels()]):
                 events = [
                     event
                     for event in microphone.events(label, self.time)

@@ -47,8 +47,15 @@ _SPAN = ("header.stamp", "duration", "label")
 _ORIGIN = ("reviewer", "made", "corrects")
 _FIELDS = {
     message_types.SEGMENT: _SPAN,
-    message_types.MARK: (*_SPAN, *_ORIGIN),
+    message_types.MARK: (*_SPAN, *_ORIGIN, "reason"),
     message_types.REVIEWED: ("header.stamp", "duration", *_ORIGIN, "chosen"),
+}
+
+
+_OWN_TEXTS = {
+    message_types.SEGMENT: ("label",),
+    message_types.MARK: ("label", "reason"),
+    message_types.REVIEWED: ("chosen",),
 }
 
 
@@ -67,6 +74,8 @@ class Mark(NamedTuple):
         When the mark was made, in nanoseconds of UTC; 0 if unknown.
     corrects : str
         The labelling that it corrects: `live`, or the name of a model; empty if unknown.
+    reason : str
+        Why, of a mark that was made with others, such as `group 3`; else empty.
     """
 
     microphone: str
@@ -76,6 +85,7 @@ class Mark(NamedTuple):
     reviewer: str = ""
     made: int = 0
     corrects: str = ""
+    reason: str = ""
 
 
 class MarkedSpan(NamedTuple):
@@ -281,7 +291,8 @@ def _marks(columns: Columns) -> Iterator[Mark]:
     microphone = columns.topic.split("/")[1]
     starts = columns["header.stamp"]
     ends = starts + columns["duration"]
-    origin = [columns[name].tolist() for name in _ORIGIN if columns.type == message_types.MARK]
+    names = (*_ORIGIN, "reason") if columns.type == message_types.MARK else ()
+    origin = [columns[name].tolist() for name in names]
     for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), *origin, strict=True):
         yield Mark(microphone, *row)
 
@@ -321,7 +332,8 @@ def _checked_reviewed(spans: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:
 def _check(span: Mark | ReviewedSpan, what: str) -> None:
     if not 0 <= span.start < span.end <= LATEST:
         raise DataError(f"a {what} from {span.start} to {span.end} ns is no span of time")
-    names = PERSON_NAME.fullmatch(span.reviewer) and PERSON_NAME.fullmatch(span.corrects)
+    own = span.reason if isinstance(span, Mark) else ""
+    names = all(map(PERSON_NAME.fullmatch, (span.reviewer, span.corrects, own)))
     if not (0 <= span.made <= LATEST and names):
         raise DataError(f"a {what} cannot be made by {span.reviewer[:64]!r} at {span.made} ns")
     check_microphone_name(span.microphone)
@@ -391,6 +403,6 @@ def _rows(topic: Topic, spans: Sequence[Mark | ReviewedSpan]) -> TopicBatch:
         for name in ("reviewer", "corrects"):
             fields[name] = [getattr(span, name) for span in spans]
         fields["made"] = np.array([span.made for span in spans])
-    own = "chosen" if topic.type == message_types.REVIEWED else "label"
-    fields[own] = [getattr(span, own) for span in spans]
+    for own in _OWN_TEXTS[topic.type]:
+        fields[own] = [getattr(span, own) for span in spans]
     return TopicBatch(topic.name, ends, fields)

@@ -6,7 +6,7 @@ type. Who appends one raises `SCHEMA_VERSION` and enters the field in `APPENDED`
 
 from typing import NamedTuple
 
-SCHEMA_VERSION = 2  # of the messages and records that this version writes
+SCHEMA_VERSION = 3  # of the messages and records that this version writes
 
 
 class Appended(NamedTuple):
@@ -20,4 +20,7 @@ class Appended(NamedTuple):
     default: float | str | None = None
 
 
-APPENDED: dict[str, dict[str, Appended]] = {}  # by type and name of the field
+# By type and name of the field.
+APPENDED: dict[str, dict[str, Appended]] = {
+    "hearthlog_msgs/msg/AudioMark": {"reason": Appended(since=3)},
+}

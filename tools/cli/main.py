@@ -25,7 +25,7 @@ from hearthlog.tools.cli.text import tell
 VERBS = (
     *("record", "pause", "resume", "install_service", "devices", "info", "catalog", "cat"),
     *("export", "merge", "cut", "doctor", "recover", "retain", "manifest", "train", "enrol"),
-    *("diff", "review", "watch", "bridge", "report", "replay", "relabel", "demo"),
+    *("diff", "discover", "review", "watch", "bridge", "report", "replay", "relabel", "demo"),
     *("alerts", "annotate", "config", "evaluate", "models"),
 )
 _MODULES = {"resume": "pause"}  # of a verb that shares one

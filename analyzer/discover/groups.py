@@ -1,0 +1,138 @@
+"""Groups of sounds that are alike: found among descriptors, and known again."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hearthlog.schemas.arrays import Float32, Float64, Int64
+
+LEAST = 8  # sounds of a group, by default
+_DIMENSIONS = 16
+_CLOSE = 3  # neighbours by which a density is judged
+_EXAMPLES = 200  # that are kept of a group
+_RADIUS = 95  # percentile of the distances of its examples to the next one
+NO_GROUP = -1
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Groups, and the space in which they lie.
+
+    Attributes
+    ----------
+    features : tuple of str
+        The names of the features that the sounds are described by.
+    mean, scale : np.ndarray [shape=(width,)], float64
+        Of the descriptors that the space was made of.
+    axes : np.ndarray [shape=(d, width)], float64
+        Their principal axes.
+    examples : np.ndarray [shape=(k, d)], float64
+        Points of sounds of the groups.
+    of : np.ndarray [shape=(k,)], int64
+        The row of the group of each example, ascending.
+    numbers : np.ndarray [shape=(g,)], int64
+        Of the groups; a number is never used again.
+    radii : np.ndarray [shape=(g,)], float64
+        A sound within this distance of an example is of the group.
+    names : list of str
+        Classes that a person named groups; empty where nobody did.
+    """
+
+    features: tuple[str, ...]
+    mean: Float64
+    scale: Float64
+    axes: Float64
+    examples: Float64
+    of: Int64
+    numbers: Int64
+    radii: Float64
+    names: list[str] = field(default_factory=list)
+
+    def points(self, descriptors: Float32) -> Float64:
+        """Return where described sounds lie, shape (n, d)."""
+        return ((descriptors - self.mean) / self.scale) @ self.axes.T
+
+    def find(self, points: Float64) -> Int64:
+        """Return the row of the group of each point; `NO_GROUP` for one that is of none.
+
+        Of several groups it is that to whose examples a point is nearest, by their radii.
+        """
+        from scipy.spatial import cKDTree  # noqa: PLC0415  takes long, and not always needed
+
+        nearest, found = np.full(len(points), np.inf), np.full(len(points), NO_GROUP)
+        for row, radius in enumerate(self.radii):
+            away = cKDTree(self.examples[self.of == row]).query(points)[0] / radius
+            closer = (away <= 1.0) & (away < nearest)
+            nearest[closer], found[closer] = away[closer], row
+        return found
+
+
+def make_space(features: Sequence[str], descriptors: Float32) -> Groups:
+    """Make a space of descriptors, in which there is no group yet.
+
+    Parameters
+    ----------
+    features : sequence of str
+        Their names.
+    descriptors : np.ndarray [shape=(n, width)], float32
+        At least two, of which some differ.
+    """
+    from sklearn.decomposition import PCA  # noqa: PLC0415
+
+    x = descriptors.astype(np.float64)
+    mean, scale = x.mean(axis=0), x.std(axis=0)
+    scale[scale == 0.0] = 1.0
+    dimensions = min(_DIMENSIONS, *x.shape)
+    axes = PCA(dimensions, svd_solver="full").fit((x - mean) / scale).components_
+    nothing = np.empty(0)
+    return Groups(
+        tuple(features),
+        mean,
+        scale,
+        axes,
+        np.empty((0, dimensions)),
+        nothing.astype(np.int64),
+        nothing.astype(np.int64),
+        nothing,
+    )
+
+
+def add_groups(groups: Groups, points: Float64, least: int = LEAST) -> Groups:
+    """Add the groups of points that are of none yet: HDBSCAN, the largest group first.
+
+    Parameters
+    ----------
+    groups : Groups
+    points : np.ndarray [shape=(n, d)], float64
+        In the order of time.
+    least : int, optional
+        Sounds of a group, at least.
+    """
+    from sklearn.cluster import HDBSCAN  # noqa: PLC0415
+
+    if len(points) < max(2 * least, _CLOSE + 1):
+        return groups
+    clusters = HDBSCAN(min_cluster_size=least, min_samples=_CLOSE, copy=True)
+    labels = clusters.fit_predict(points)
+    sizes = np.bincount(labels[labels >= 0])
+    for label in np.argsort(-sizes, kind="stable"):
+        groups = _add(groups, points[labels == label])
+    return groups
+
+
+def _add(groups: Groups, points: Float64) -> Groups:
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    examples = points[np.linspace(0, len(points) - 1, min(len(points), _EXAMPLES)).astype(int)]
+    steps = cKDTree(examples).query(examples, 2)[0][:, 1]
+    radius = max(float(np.percentile(steps, _RADIUS)), np.finfo(np.float64).tiny)
+    number = groups.numbers.max(initial=0) + 1
+    return replace(
+        groups,
+        examples=np.concatenate([groups.examples, examples]),
+        of=np.append(groups.of, np.full(len(examples), len(groups.numbers))),
+        numbers=np.append(groups.numbers, number),
+        radii=np.append(groups.radii, radius),
+        names=[*groups.names, ""],
+    )

@@ -1,0 +1,157 @@
+"""The sounds of a home, log by log, with what describes them."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
+from hearthlog.analyzer.discover.sound_spans import (
+    FEATURE_FIELDS,
+    LABEL_FIELDS,
+    SoundSpans,
+    find_sounds,
+)
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.progress import Progress, ignore_progress
+
+_FIELDS = {*FEATURE_FIELDS, *LABEL_FIELDS}
+_NEVER = 1 << 62
+
+
+@dataclass(frozen=True)
+class HomeSounds:
+    """Sounds of a home, in the order of their logs and of time.
+
+    Attributes
+    ----------
+    features : tuple of str
+        Names of the features that they are described by.
+    logs : list of Path
+    microphones : list of str
+    log, microphone : np.ndarray [shape=(n,)], int64
+        Of each sound: where it is in these lists.
+    spans : SoundSpans
+        Its rows of features are those of its log.
+    descriptors : np.ndarray [shape=(n, width)], float32
+        On the disk.
+    losses : list of str
+        What cannot be read, a log in a line.
+    """
+
+    features: tuple[str, ...]
+    logs: list[Path]
+    microphones: list[str]
+    log: Int64
+    microphone: Int64
+    spans: SoundSpans
+    descriptors: Float32
+    losses: list[str]
+
+
+@contextmanager
+def read_sounds(
+    home: HomeLogs,
+    choice: str,
+    start: int | None = None,
+    end: int | None = None,
+    progress: Progress = ignore_progress,
+) -> Iterator[HomeSounds]:
+    """Read the sounds of a home; what describes them is on the disk meanwhile.
+
+    Parameters
+    ----------
+    home : HomeLogs
+    choice : str
+        One of `hearthlog.analyzer.discover.sound_spans.CHOICES`.
+    start, end : int, optional
+        In nanoseconds of UTC.
+    progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
+
+    Yields
+    ------
+    HomeSounds
+
+    Raises
+    ------
+    DataError
+        If no log has features and labels.
+    """
+    entries = home.between(start or 0, end or _NEVER)
+    reader = _Reader(choice, start, end)
+    with tempfile.TemporaryFile(prefix="hearthlog-sounds") as store:
+        # The last log first: what it has been described by, the others have to be, too.
+        for number, entry in enumerate(reversed(entries), 1):
+            try:
+                reader.read(entry.path, store)
+            except LogError as error:
+                reader.losses.append(str(error))
+            progress(number / len(entries))
+        yield reader.sounds(store, home.losses)
+
+
+class _Reader:
+    def __init__(self, choice: str, start: int | None, end: int | None) -> None:
+        self.losses: list[str] = []
+        self._choice = choice
+        self._span = start, end
+        self._features: tuple[str, ...] = ()
+        self._logs: list[Path] = []
+        self._microphones: list[str] = []
+        self._parts: list[tuple[Int64, Int64, SoundSpans]] = []
+
+    def read(self, log: Path, store: IO[bytes]) -> None:
+        columns = read_columns([log], None, *self._span, fields=_FIELDS)
+        for features in columns.values():
+            name = features.topic.split("/")[1]
+            labels = columns.get(topic(name, "label"))
+            if features.type != message_types.FEATURES or labels is None or not len(labels):
+                continue
+            names = checked_array_names(log, features, "values")
+            self._features = self._features or names
+            if names != self._features:
+                raise LogError(f"{log}: has other features than the later logs; left out")
+            spans = find_sounds(features, labels).chosen(self._choice)
+            store.write(describe(features["values"], names, spans.first, spans.last).tobytes())
+            self._add(log, name, spans)
+
+    def _add(self, log: Path, microphone: str, spans: SoundSpans) -> None:
+        if microphone not in self._microphones:
+            self._microphones.append(microphone)
+        count, place = len(spans.starts), self._microphones.index(microphone)
+        self._parts.append((np.full(count, len(self._logs)), np.full(count, place), spans))
+        self._logs.append(log)
+
+    def sounds(self, store: IO[bytes], losses: Sequence[str]) -> HomeSounds:
+        if not self._features:
+            what = self.losses[0] if self.losses else "no log has features and labels"
+            raise DataError(what)
+        store.flush()
+        width = descriptor_width(self._features)
+        logs, microphones, spans = zip(*self._parts, strict=True)
+        count = sum(map(len, logs))
+        descriptors: Float32 = np.empty((0, width), np.float32)
+        if count:
+            descriptors = np.memmap(store, np.float32, "r", shape=(count, width))
+        return HomeSounds(
+            self._features,
+            self._logs,
+            self._microphones,
+            np.concatenate(logs),
+            np.concatenate(microphones),
+            SoundSpans(*(np.concatenate(each) for each in zip(*spans, strict=True))),
+            descriptors,
+            [*losses, *self.losses],
+        )
