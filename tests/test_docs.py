@@ -46,7 +46,7 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 NOT_HERE = re.compile(
     r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch| demo| install-service"
     r"| evaluate adaptation|.* s3://|.*tcp:|.* --web|.* --microphone USB|.* --folds collection"
-    r"|.* --live|.*octaves|.*--config|.*--queue spans.csv$| review(?!.* --save))"
+    r"| discover|.* --live|.*octaves|.*--config|.*--queue spans.csv$| review(?!.* --save))"
 )
 
 

@@ -379,7 +379,7 @@ def test_segments_that_cannot_be_read_are_named(capfd, arguments, rest):
     assert "recorded without a model" not in done.stderr
 
 
-@pytest.mark.parametrize("text", ["3", "0", "-1", "1.5", "banana \x1b[31m", "9" * 5000, ""])
+@pytest.mark.parametrize("text", [str(NEXT), "0", "-1", "1.5", "banana \x1b[31m", "9" * 5000, ""])
 def test_a_version_that_is_not_known_is_said_in_one_line(golden, capfd, text):
     log = Log(golden)
     log.metadata("hearthlog").metadata["schema_version"] = text

@@ -49,6 +49,7 @@ READING = (
     "train --base first.safetensors --home logs --output adapted.safetensors",
     "evaluate model first.safetensors --data clips",
     "diff logs live first",
+    "discover logs --least 2",
     "report logs --day 2026-03-01 --output day.html",
     "replay logs --model first.safetensors",
     "models list --folder .",

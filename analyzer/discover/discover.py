@@ -59,8 +59,9 @@ def discover(
         ]
     )
     of = groups.find(points)
-    rest = np.flatnonzero(of == NO_GROUP)
-    groups = add_groups(groups, points[_drawn(sounds, rest, _MOST)], least)
+    drawn = _drawn(sounds, np.arange(count), _MOST)
+    groups = add_groups(groups, points[drawn], of[drawn], least)
+    rest = of == NO_GROUP
     of[rest] = groups.find(points[rest])
     return groups, of, points
 

@@ -98,14 +98,20 @@ def make_space(features: Sequence[str], descriptors: Float32) -> Groups:
     )
 
 
-def add_groups(groups: Groups, points: Float64, least: int = LEAST) -> Groups:
-    """Add the groups of points that are of none yet: HDBSCAN, the largest group first.
+def add_groups(groups: Groups, points: Float64, of: Int64, least: int = LEAST) -> Groups:
+    """Add the clusters of points that no group knows yet, the largest first: HDBSCAN.
+
+    Those of all points are looked for, for what is left beside the groups of an earlier time would
+    fall into others than it did among all.
 
     Parameters
     ----------
     groups : Groups
     points : np.ndarray [shape=(n, d)], float64
         In the order of time.
+    of : np.ndarray [shape=(n,)], int64
+        The row of the group that knows a point, or `NO_GROUP`. A cluster is new if most of its
+        points are of none.
     least : int, optional
         Sounds of a group, at least.
     """
@@ -117,7 +123,10 @@ def add_groups(groups: Groups, points: Float64, least: int = LEAST) -> Groups:
     labels = clusters.fit_predict(points)
     sizes = np.bincount(labels[labels >= 0])
     for label in np.argsort(-sizes, kind="stable"):
-        groups = _add(groups, points[labels == label])
+        own = labels == label
+        new = own & (of == NO_GROUP)
+        if 2 * new.sum() > own.sum() and new.sum() >= least:
+            groups = _add(groups, points[new])
     return groups
 
 

@@ -14,7 +14,7 @@ from hearthlog.schemas.logs.columns import Columns
 ALL, UNSURE, NOT_KNOWN = CHOICES = ("all", "unsure", "unknown")
 LABEL_FIELDS = ("frame", "label", "confidence")
 FEATURE_FIELDS = ("header.stamp", "frame", "values")
-_PAUSE_FRAMES = 8  # that a sound may have within it
+_PAUSE_FRAMES = 2  # that a sound may have within it
 _LEAST_FRAMES = 4
 _BEFORE = np.int64(-1 << 62)  # any frame
 _UNSURE_CONFIDENCE = 0.5  # as of the clips of what a model is unsure of

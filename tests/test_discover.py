@@ -1,0 +1,242 @@
+"""Sounds that recur are grouped whatever their labels say, are known again, and get a name."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recurring import RECURRING, names_of, record_recurring
+from sklearn.metrics import adjusted_rand_score
+
+from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
+from hearthlog.analyzer.discover.discover import discover
+from hearthlog.analyzer.discover.groups import NO_GROUP
+from hearthlog.analyzer.discover.groups_file import GROUPS, load_groups, save_groups
+from hearthlog.analyzer.discover.read_sounds import read_sounds
+from hearthlog.analyzer.discover.summary import usual_hours
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
+from hearthlog.schemas.times import NANOSECONDS, read_time
+
+START = 1_772_352_000 * NANOSECONDS
+DAY = 86_400 * NANOSECONDS
+
+
+@pytest.fixture(scope="module")
+def two_days(tmp_path_factory):
+    """Logs of some minutes on each of two days, and when what recurs was."""
+    folder = tmp_path_factory.mktemp("recurring") / "logs"
+    truth = [record_recurring(folder, START + day * DAY, seed=day) for day in range(2)]
+    return folder, truth
+
+
+@pytest.fixture
+def home(two_days, tmp_path):
+    """A copy of the logs."""
+    return shutil.copytree(two_days[0], tmp_path / "logs")
+
+
+def logs_of(folder):
+    return [log for log in find_logs(folder) if not is_layer(log)]
+
+
+def grouped(logs, groups=None):
+    """Group the sounds of logs; return the groups, and of each sound its group and span."""
+    with read_sounds(find_home_logs(logs), "all") as sounds:
+        found, of, _ = discover(sounds, groups)
+    return found, of, sounds.spans
+
+
+def run(hearthlog, *arguments):
+    done = hearthlog("discover", *arguments)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def as_json(hearthlog, *arguments):
+    return json.loads(run(hearthlog, *arguments, "--json").stdout)
+
+
+def test_each_sound_that_recurs_is_a_group_of_its_own(two_days):
+    folder, (first, second) = two_days
+    _, of, spans = grouped([folder])
+    names = names_of(spans, [*first, *second])
+    recurs = names != "other"
+    assert adjusted_rand_score(names[recurs], of[recurs]) > 0.7
+    rows = set()
+    for name in RECURRING:
+        own = of[names == name]
+        row = np.bincount(own[own != NO_GROUP]).argmax()
+        assert (own == row).mean() > 0.7
+        assert (names[of == row] == name).mean() > 0.7
+        rows.add(row)
+    assert len(rows) == len(RECURRING)
+
+
+def test_groups_of_one_day_are_known_again_on_the_next(two_days):
+    folder, (_, second) = two_days
+    early, late = logs_of(folder)
+    groups, _, _ = grouped([early])
+    later, of, spans = grouped([late], groups)
+    assert later.numbers[: len(groups.numbers)].tolist() == groups.numbers.tolist()
+    names = names_of(spans, second)
+    for name in RECURRING:
+        own = of[names == name]
+        row = np.bincount(own[own != NO_GROUP]).argmax()
+        assert row < len(groups.numbers)
+        assert (own == row).mean() > 0.6
+
+
+def test_the_same_logs_give_the_same_groups_again_and_again(home, hearthlog):
+    first = run(hearthlog, home)
+    content = (home / GROUPS).read_bytes()
+    again = run(hearthlog, home)
+    assert again.stdout == first.stdout
+    assert (home / GROUPS).read_bytes() == content
+
+
+def test_a_group_gets_a_name_and_each_of_its_sounds_a_mark_which_undo_takes_back(home, hearthlog):
+    largest = as_json(hearthlog, home)["groups"][0]
+    example = largest["examples"][0]
+    start = read_time(example["start"])
+    own = Mark("mic", start, start + NANOSECONDS // 10, "kettle", "Berta")
+    write_marks(Path(example["log"]), [own])
+    name = f"{largest['number']}=Front door"
+    done = run(hearthlog, home, "--name", name, "--reviewer", "Anna")
+    count = largest["times"] - 1
+    assert (
+        f"group {largest['number']}: {count} marks of front_door; 1 have a mark of" in done.stderr
+    )
+    marks = [mark for log in logs_of(home) for mark in read_marks(log)]
+    assert own in marks
+    said = [mark for mark in marks if mark != own]
+    reason = f"group {largest['number']}"
+    assert {mark[3:5] + mark[6:] for mark in said} == {("front_door", "Anna", "live", reason)}
+    assert len(said) == count
+    assert as_json(hearthlog, home)["groups"][0]["name"] == "front_door"
+    done = run(hearthlog, home, "--undo", largest["number"])
+    assert f"{count} marks taken back" in done.stderr
+    assert [mark for log in logs_of(home) for mark in read_marks(log)] == [own]
+    assert as_json(hearthlog, home)["groups"][0]["name"] == ""
+    layers = [review_path(log) for log in logs_of(home) if str(log) != example["log"]]
+    assert not any(layer.exists() for layer in layers)
+
+
+def test_naming_again_marks_what_is_new(home, hearthlog):
+    early, late = logs_of(home)
+    file = home / GROUPS
+    number = as_json(hearthlog, early, "--groups", file)["groups"][0]["number"]
+    run(hearthlog, early, "--groups", file, "--name", f"{number}=bell")
+    before = read_marks(early)
+    assert before
+    assert not read_marks(late)
+    run(hearthlog, home, "--name", f"{number}=bell")
+    assert [mark[:4] for mark in read_marks(early)] == [mark[:4] for mark in before]
+    assert read_marks(late)
+
+
+def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_days):
+    folder, _ = two_days
+    counts = {}
+    for choice in ("all", "unsure", "unknown"):
+        with read_sounds(find_home_logs([folder]), choice) as sounds:
+            counts[choice] = len(sounds.descriptors)
+            if choice == "unknown":
+                assert set(sounds.spans.labels) <= {"unknown"}
+    assert counts["all"] > counts["unsure"] >= counts["unknown"]
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "says"),
+    [
+        (["--name", "door"], 2, "say the number of a group and a class, as 3=doorbell"),
+        (["--name", "1=silence"], 2, "say the number of a group and a class"),
+        (["--name", "99=door"], 1, "there is no group 99"),
+        (["--of", "loud"], 2, "it is one of all, unsure, unknown"),
+        (["--end", "2026-03-01T08:00:20"], 1, "sounds are too few to group: it takes 16"),
+        (["--end", "2026-01-01"], 1, "no log has features and labels"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(home, hearthlog, options, status, says):
+    done = hearthlog("discover", home, *options)
+    assert done.returncode == status
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (home / GROUPS).exists()
+
+
+def test_several_logs_want_a_place_for_their_groups(home, hearthlog):
+    done = hearthlog("discover", *logs_of(home))
+    assert done.returncode == 2
+    assert "--groups: say where the groups are kept" in done.stderr
+
+
+def test_groups_of_other_features_are_refused(two_days):
+    groups, _, _ = grouped([two_days[0]])
+    other = replace(groups, features=("a",))
+    with pytest.raises(DataError, match="of 1 features, the logs have 33 others"):
+        grouped([two_days[0]], other)
+
+
+@pytest.fixture(scope="module")
+def groups_file(two_days, tmp_path_factory):
+    path = tmp_path_factory.mktemp("groups") / GROUPS
+    save_groups(grouped([two_days[0]])[0], path)
+    return path
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.data())
+def test_a_damaged_file_of_groups_is_one_line_or_a_file_of_groups(groups_file, data):
+    content = bytearray(groups_file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = groups_file.with_name("damaged")
+    path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
+    said = f"{path}: is well"
+    try:
+        assert np.isfinite(load_groups(path).examples).all()
+    except DataError as error:
+        said = str(error)
+    assert said.startswith(f"{path}: is ")
+    assert "\n" not in said
+
+
+@settings(deadline=None)
+@given(st.integers(0, 1 << 30), st.integers(4, 60), st.floats(0.01, 100.0))
+def test_a_description_does_not_depend_on_the_level_nor_on_what_is_around(seed, count, level):
+    rng = np.random.default_rng(seed)
+    names = ("energy", "centroid", "rolloff")
+    values = rng.normal(size=(count + 40, 3)).astype(np.float32)
+    values[:, 0] = rng.uniform(0.1, 1.0, len(values))
+    first, last = np.array([2, 20 + count // 2]), np.array([2 + count // 2, 20 + count])
+    both = describe(values, names, first, last)
+    assert both.shape == (2, descriptor_width(names))
+    for row in range(2):
+        alone = values[first[row] : last[row]] * np.float32([level, 1.0, 1.0])
+        again = describe(alone, names, np.array([0]), np.array([len(alone)]))
+        np.testing.assert_allclose(both[row], again[0], rtol=1e-4, atol=1e-5)
+
+
+def test_a_description_is_what_it_says():
+    values = np.float32([[1.0, 0.0], [1.0, 2.0], [1.0, 4.0], [1.0, 2.0]])
+    (described,) = describe(values, ("energy", "a"), np.array([0]), np.array([4]))
+    np.testing.assert_allclose(described, [2.0, np.sqrt(2.0), 2.0, 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("hours", "text"),
+    [
+        ({7: 9, 8: 1}, "07 to 08"),
+        ({23: 5, 0: 5}, "23 to 01"),
+        (dict.fromkeys(range(24), 3), ""),
+    ],
+)
+def test_the_usual_hours_are_the_shortest_span_with_four_fifths(hours, text):
+    assert usual_hours([hours.get(hour, 0) for hour in range(24)]) == text
