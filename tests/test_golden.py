@@ -381,7 +381,7 @@ def test_logs_of_two_versions_are_one_series_of_the_later(later, tmp_path):
 
 def test_logs_of_two_versions_are_one_series_of_the_earlier(later):
     first, second = (path for path in find_logs(Path("logs")) if not is_layer(path))
-    with pytest.warns(HearthlogWarning, match="is of schema version '3'"):
+    with pytest.warns(HearthlogWarning, match=f"is of schema version '{NEXT}'"):
         metadata = select([first, later / second]).metadata
     assert [record.get("schema_version") for record in metadata] == [None, str(NEXT)]
     both, own = read_columns([first, later / second]), read_columns([first, second])
