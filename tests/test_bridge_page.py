@@ -19,12 +19,15 @@ from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.analyzer.bridge.home_state import Health, HomeState
+from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.outputs import open_outputs
 from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.board import Board
 from hearthlog.analyzer.bridge.page.day_picture import day_picture
+from hearthlog.analyzer.bridge.page.health_list import health_list
 from hearthlog.analyzer.bridge.page.home_page import HomePage
+from hearthlog.analyzer.bridge.page.now_heard import NowHeard
 from hearthlog.analyzer.bridge.page.said import REVIEWER, Said, class_of
 from hearthlog.analyzer.bridge.page.words import length, when
 from hearthlog.analyzer.bridge.run import Bridge
@@ -447,6 +450,20 @@ def test_what_was_not_heard_is_marked_as_such():
     now = today(begin + 20 * hour, UTC)
     gaps = day_picture([microphone], now, UTC)["rooms"][0]["gaps"]
     assert gaps == [(0, 0.25), (0.5, 0.5833), (0.75, 0.8333)]
+
+
+@pytest.mark.parametrize(
+    ("said", "why"), [("listening", ""), ("reading", ""), ("paused by Anna", "paused by Anna")]
+)
+def test_a_microphone_that_is_away_is_not_said_to_listen(said, why):
+    state, now = HomeState(), time.time_ns()
+    state.push([segments("mic", (now - 60 * NANOSECONDS, now - 30 * NANOSECONDS, "silence"))])
+    state.health["mic"] = Health(0, said)
+    news = News(state, [], [], today(now, UTC), UTC)
+    (heard,) = NowHeard().describe(news)["rooms"]
+    assert (heard["words"], heard["why"]) == ("Not listening", why)
+    health = health_list(news, "home", now)[0]
+    assert health["text"] == (f"not listening: {why}" if why else "not listening")
 
 
 def test_times_and_lengths_are_said_in_words():

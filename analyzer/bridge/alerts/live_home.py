@@ -107,8 +107,12 @@ class LiveHome:
 
     def heard(self) -> HomeHeard:
         """Return what was heard, with what goes on."""
+        return self._gathered.heard(self.open_segments())
+
+    def open_segments(self) -> list[tuple[str, int, int, str, float]]:
+        """Return what goes on and has no segment yet, as `Gathered.heard` takes it."""
         runs = ((name, each.run()) for name, each in self._runs.items())
-        return self._gathered.heard([(name, *run) for name, run in runs if run is not None])
+        return [(name, *run) for name, run in runs if run is not None]
 
     def forget_before(self, time: int) -> None:
         """Forget what was over before a time, in nanoseconds of UTC."""

@@ -204,13 +204,17 @@ class AlertsOutput:
         return now
 
     def _weeks(self, start: int, end: int) -> HomeHeard:
-        """Read weeks from the logs, once a day; what cannot be read was not heard."""
+        """Read weeks from the logs, once a day; what cannot be read was not heard.
+
+        A night that is still quiet in the morning has no segment yet.
+        """
         home = self._followed
         try:
             logs = find_home_logs([home.folder])
         except LogError:  # there is none yet
             return Gathered().heard()
-        return read_heard(logs, home.node, start, end, lambda _: None)
+        open_segments = self._heard.open_segments()
+        return read_heard(logs, home.node, start, end, lambda _: None, others=open_segments)
 
     def _damaged(self, error: LogError) -> None:
         self._say(f"alerts: {error}")

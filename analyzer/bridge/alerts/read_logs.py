@@ -28,6 +28,7 @@ def read_heard(  # noqa: PLR0913, PLR0917
     end: int,
     lose: Callable[[str], None],
     progress: Progress = ignore_progress,
+    others: Sequence[tuple[str, int, int, str, float]] = (),
 ) -> HomeHeard:
     """Read what was heard in a span of time.
 
@@ -42,6 +43,8 @@ def read_heard(  # noqa: PLR0913, PLR0917
         Told what cannot be read, a log in a line.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
+    others : sequence of (str, int, int, str, float), optional
+        Segments that go on and are in no log yet, as `Gathered.heard` takes them.
     """
     gathered = Gathered()
     entries = [entry.path for entry in logs.between(start, end + _LATE) if entry.node == node]
@@ -51,7 +54,7 @@ def read_heard(  # noqa: PLR0913, PLR0917
         except LogError as error:
             lose(str(error))
         progress(number / len(entries))
-    return gathered.heard()
+    return gathered.heard(others)
 
 
 def _add_log(

@@ -16,6 +16,7 @@ LONGEST_PAUSE = 10 * MINUTE  # within an event
 _MARGIN = 5 * MINUTE
 _PAUSE = 10 * SECOND  # between the segments of one event, as in the report
 _NIGHT_ENDS = 7 * 60
+_TWO_DAYS = 50 * 3600 * SECOND  # with what a change of the clock adds
 
 
 def _within(least: int, most: int, words: str) -> BeforeValidator:
@@ -211,4 +212,19 @@ def history(rule: AlertRule) -> int:
         return rule.silent_for + _MARGIN
     if isinstance(rule, UnlikeUsual):
         return 31 * DAY
-    return 50 * 3600 * SECOND if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN
+    return _TWO_DAYS if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN
+
+
+def live_history(rule: AlertRule) -> int:
+    """Return how long before a time a rule needs what is followed, and not read from the logs.
+
+    Parameters
+    ----------
+    rule : AlertRule
+
+    Returns
+    -------
+    int
+        Nanoseconds. Of weeks, the day that is judged: a silence may have gone on since it began.
+    """
+    return _TWO_DAYS if isinstance(rule, UnlikeUsual) else history(rule)

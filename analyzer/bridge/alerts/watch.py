@@ -11,7 +11,7 @@ from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.memory import Memory, Progress
 from hearthlog.analyzer.bridge.alerts.outbox import Outbox
 from hearthlog.analyzer.bridge.alerts.ring import Ring, RuleState
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule, UnlikeUsual, history
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule, UnlikeUsual, history, live_history
 
 _OLDEST = DAY  # what rang longer ago is not told any more
 _EVERY = SECOND  # of the log
@@ -82,8 +82,10 @@ class RuleWatch:
         now : int
             In nanoseconds of UTC.
         """
-        live = [rule for rule in self._rules if not isinstance(rule, UnlikeUsual)]
-        return min((self._progress[r.name].until - history(r) for r in live), default=now)
+        return min(
+            (self._progress[rule.name].until - live_history(rule) for rule in self._rules),
+            default=now,
+        )
 
     def evaluate(
         self,

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.words import room, told, when
+from hearthlog.analyzer.bridge.page.words import reason, room, told, when
 
 _WELL, _WARNING, _WRONG = 0, 1, 2  # as in diagnostics
 _THINGS = {"disk": "Disk", "machine": "Clock and computer"}
@@ -57,7 +57,8 @@ def _of_microphone(microphone: MicrophoneState, state: HomeState) -> HealthLine:
     is_alone = len(state.microphones) == 1
     what = "Microphone" if is_alone else f"Microphone, {room(microphone.name)}"
     if not microphone.is_listening():
-        return HealthLine(what, _WRONG, f"not listening: {text}" if text else "not listening")
+        why = reason(text)
+        return HealthLine(what, _WRONG, f"not listening: {why}" if why else "not listening")
     return HealthLine(what, min(level, _WRONG), f"listening: {text}" if level else "listening")
 
 

@@ -8,7 +8,7 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HOLD_SECONDS
 from hearthlog.analyzer.bridge.home_state import MicrophoneState
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.words import class_words, room, told, when
+from hearthlog.analyzer.bridge.page.words import class_words, reason, room, told, when
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.messages.labels import is_sound
 from hearthlog.schemas.text import listed
@@ -53,7 +53,7 @@ class NowHeard:
             "room": "" if is_alone else room(microphone.name),
             "words": words,
             "since": shown,
-            "why": told(health.text) if health is not None and not is_listening else "",
+            "why": reason(told(health.text)) if health is not None and not is_listening else "",
             "level": _level(microphone) if is_listening else None,
         }
 

@@ -9,6 +9,7 @@ from hearthlog.schemas.text import printable, shortened
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60
 _SURE, _FAIRLY_SURE = 0.9, 0.7
+_HEARD = {"listening", "reading"}  # what a recorder says of a microphone that it hears
 
 
 def clock(time: int, zone: tzinfo) -> str:
@@ -82,6 +83,17 @@ def room(microphone: str) -> str:
 def told(text: str) -> str:
     """Return a text of a log on one line, and not too long."""
     return shortened(" ".join(printable(text).split()), _LONGEST)
+
+
+def reason(text: str) -> str:
+    """Return why a microphone is not heard; empty if what was said of it last is no reason.
+
+    Parameters
+    ----------
+    text : str
+        What the recorder said; before it ended, or was killed, that it listens.
+    """
+    return "" if text in _HEARD else text
 
 
 def _counted(count: int, what: str) -> str:
