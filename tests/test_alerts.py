@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 from homelife import HOUR, midnight, write_day
+from livehome import LiveHome as WrittenHome
 from livehome import following
 from pydantic import TypeAdapter
 
@@ -512,6 +513,32 @@ def test_a_replay_as_json_is_of_the_span_that_is_asked_for(two_days, hearthlog):
     assert result["start"] == "2026-03-02T13:00:00.000+01:00"
     assert result["rules"]["coughs"] == []
     assert [ring["known"] for ring in result["rules"]["no speech"]] == [False]
+
+
+def test_a_replay_says_that_no_model_knows_the_class_of_a_rule(two_days, hearthlog, tmp_path):
+    (tmp_path / "home.toml").write_text(CONFIG.replace("coughing", "couhging"))
+    options = ["--config", tmp_path / "home.toml"]
+    done = hearthlog("alerts", "replay", two_days / "logs", *options)
+    assert done.stderr == (
+        "hearthlog: coughs: no model here knows the class 'couhging', so that it cannot be heard\n"
+    )
+
+
+def test_a_bridge_says_that_no_model_knows_the_class_of_a_rule(tmp_path, monkeypatch):
+    monkeypatch.setattr("hearthlog.analyzer.bridge.alerts.output._WAIT_SECONDS", 0.1)
+    said, recorder = [], WrittenHome(tmp_path / "logs")
+    wrong = rule("more_than", "wrong", count=1, window="1h", **{"class": "couhging"})
+    try:
+        with bridge(tmp_path, [COUGHS, wrong], [], said):
+            until = time.monotonic() + 30
+            while not said and time.monotonic() < until:
+                recorder.hears("silence")
+                time.sleep(0.1)
+    finally:
+        recorder.close()
+    assert {*said} == {
+        "alerts: wrong: no model here knows the class 'couhging', so that it cannot be heard"
+    }
 
 
 def test_a_replay_goes_by_the_time_zone_of_the_configuration_before_that_of_the_logs(

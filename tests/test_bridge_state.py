@@ -1,5 +1,6 @@
 """What a bridge says follows from the log alone, however it came to be read."""
 
+import math
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo
 
@@ -20,6 +21,8 @@ from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.totals import Total, Totals
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
@@ -40,6 +43,43 @@ def heard(labels, cuts=()):
 @given(st.lists(st.sampled_from(CLASSES), max_size=300), st.lists(st.integers(0, 300), max_size=9))
 def test_what_is_heard_does_not_depend_on_how_the_labels_came(labels, cuts):
     assert heard(labels, sorted(min(cut, len(labels)) for cut in cuts)) == heard(labels)
+
+
+def ends_of(spans, seconds):
+    """When a microphone that heard coughs in some spans was told of which event's end, in s."""
+    microphone, ends = MicrophoneState("mic"), []
+    microphone.classes, microphone.heard = CLASSES, HeardNow(CLASSES)
+    microphone.seen = math.inf
+    for now in range(seconds):
+        times = now * NANOSECONDS + FRAME * np.arange(20)
+        sounds = any(start <= now < end for start, end in spans)
+        microphone.heard.push(20 * ["coughing" if sounds else "silence"], times)
+        for start, end in (span for span in spans if span[1] + 3 == now):
+            span = np.array([start]) * NANOSECONDS, np.array([end]) * NANOSECONDS
+            fields = {
+                "header.stamp": span[0],
+                "duration": span[1] - span[0],
+                "label": np.array(["coughing"], object),
+                "confidence": np.ones(1, np.float32),
+            }
+            microphone.push_segments(
+                Columns("/mic/segment", message_types.SEGMENT, {}, *(3 * [span[1]]), fields)
+            )
+        ended = microphone.ended_events()
+        ends += [(now, each.start // NANOSECONDS, each.end // NANOSECONDS) for each in ended]
+    return ends
+
+
+@pytest.mark.parametrize(
+    ("spans", "ends"),
+    [
+        ([(10, 14)], [(29, 10, 14)]),
+        ([(10, 14), (26, 27)], [(30, 10, 14), (42, 26, 27)]),  # another event before it is over
+        ([(10, 15), (16, 43)], [(58, 10, 43)]),  # of the second segment nothing is known for long
+    ],
+)
+def test_each_event_is_over_once_when_it_is(spans, ends):
+    assert ends_of(spans, 80) == ends
 
 
 @pytest.mark.parametrize(("frames", "is_heard"), [(7, False), (8, True)])

@@ -45,13 +45,20 @@ class EventRecord:
     Parameters
     ----------
     microphone, label : str
+
+    Attributes
+    ----------
+    events : list of Event
+        By their starts.
+    current : Event or None
+        With which a segment may go on: the one that the last segment is of.
     """
 
     def __init__(self, microphone: str, label: str) -> None:
         self._microphone = microphone
         self._label = label
-        self.events: list[Event] = []  # by their starts
-        self._current: Event | None = None  # with which a segment may go on
+        self.events: list[Event] = []
+        self.current: Event | None = None
         self._segments: deque[tuple[int, int]] = deque(maxlen=_MOST_AGAIN)  # the last ones
 
     def push(self, start: int, end: int, confidence: float) -> bool:
@@ -68,19 +75,19 @@ class EventRecord:
             return False
         self._segments.append((start, end))
         seconds = (end - start) / NANOSECONDS
-        current = self._current
+        current = self.current
         if current is None or not _goes_on(current, start):
             new = Event(self._microphone, self._label, start, end, confidence, seconds)
             insort(self.events, new, key=_start)  # not the last one if the clock was set back
-            self._current = new
+            self.current = new
             return True
-        self._current = current._replace(
+        self.current = current._replace(
             end=max(current.end, end),
             confidence=max(current.confidence, confidence),
             seconds=current.seconds + seconds,
         )
         place = bisect_left(self.events, current.start, key=_start)
-        self.events[self.events.index(current, place)] = self._current
+        self.events[self.events.index(current, place)] = self.current
         return False
 
     def since(self, time: int) -> list[Event]:
@@ -100,8 +107,8 @@ class EventRecord:
         kept = self.events[min(first, max(end - 1, 0)) : end]
         if len(kept) < len(self.events):
             self.events = kept
-            if self._current not in kept:
-                self._current = None
+            if self.current not in kept:
+                self.current = None
 
 
 def _start(event: Event) -> int:

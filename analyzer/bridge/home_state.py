@@ -67,6 +67,7 @@ class MicrophoneState:
         self.seen = -math.inf  # when a label came, by CLOCK_MONOTONIC
         self._records: dict[str, EventRecord] = {}
         self._unended: set[str] = set()  # classes with an event that may go on
+        self._replaced: list[Event] = []  # that are over, for another one of the class began
 
     def is_listening(self) -> bool:
         """Tell whether labels have come in the last fifteen seconds."""
@@ -109,9 +110,13 @@ class MicrophoneState:
             if label == SILENCE or (label not in self._records and self._is_full()):
                 continue
             record = self._records.setdefault(label, EventRecord(self.name, label))
-            self._unended.add(label)
-            if record.push(start, start + max(duration, 0), confidence):
-                begun.append(record.events[-1])
+            before = record.current
+            if record.push(start, start + max(duration, 0), confidence) and record.current:
+                begun.append(record.current)
+                if before is not None and label in self._unended:
+                    self._replaced.append(before)
+            if record.current is not before:
+                self._unended.add(label)
         return begun
 
     def push_gaps(self, columns: Columns) -> None:
@@ -122,14 +127,14 @@ class MicrophoneState:
 
     def ended_events(self) -> list[Event]:
         """Return the events that are over, each once."""
-        ended = []
+        ended, self._replaced = self._replaced, []
         for label in sorted(self._unended):
-            event = self._records[label].events[-1]
-            # Before it, if the clock was set back.
-            is_over = abs(self.heard.time - event.end) > _DECIDED
-            if is_over or not self.is_listening():
-                ended.append(event)
-        self._unended.difference_update(event.label for event in ended)
+            event = self._records[label].current
+            # Before it, if the clock was set back. What goes on has no segment yet.
+            is_quiet = event is None or abs(self.heard.time - event.end) > _DECIDED
+            if not self.is_listening() or (is_quiet and not self.heard.is_heard(label)):
+                self._unended.remove(label)
+                ended += [] if event is None else [event]
         return ended
 
     def forget(self, before: int, after: int) -> None:
@@ -144,7 +149,6 @@ class MicrophoneState:
         """
         for record in self._records.values():
             record.forget(before, after)
-        self._unended = {label for label in self._unended if self._records[label].events}
         if self.gaps and self.gaps[0][1] < before:
             self.gaps = [gap for gap in self.gaps if gap[1] >= before]
 

@@ -15,6 +15,7 @@ from hearthlog.tools.cli.text import (
     number,
     print_json,
     print_lines,
+    tell,
     wrong_use,
 )
 
@@ -51,7 +52,7 @@ def replay(
     """
     from hearthlog.analyzer.bridge.alerts.evaluate import rings
     from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-    from hearthlog.analyzer.bridge.alerts.rules import history
+    from hearthlog.analyzer.bridge.alerts.rules import history, unknown_class
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
@@ -71,6 +72,8 @@ def replay(
     with share_done("reading what was heard") as progress:
         heard = read_heard(home, settings.node, first - longest, last, losses.append, progress)
     found = {rule.name: rings(rule, heard, first, last, zone)[0] for rule in own.alert}
+    for text in filter(None, (unknown_class(rule, heard.classes) for rule in own.alert)):
+        tell(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))
     else:
@@ -120,15 +123,23 @@ def _print(
         print()
     weeks = (span[1] - span[0]) / _WEEK
     rows = [
-        (rule.name, rule.rule, str(len(own)), f"{len(own) / weeks:.1f}", str(_unknown(own)))
+        (
+            rule.name,
+            rule.rule,
+            str(len(own)),
+            f"{len(own) / weeks:.1f}" if weeks >= 1 / 7 else "",  # of minutes it would say nothing
+            str(_unknown(own)),
+        )
         for rule in rules
         for own in [found[rule.name]]
     ]
     print_table(("name", "rule", "rings", "a week", "not known"), rows, words=2)
-    print(
-        f"{number(round(7 * weeks), 'day')}, {_local(span[0], zone)} to {_local(span[1], zone)}, "
-        f"{zone}"
-    )
+    print(f"{_days(weeks)}, {_local(span[0], zone)} to {_local(span[1], zone)}, {zone}")
+
+
+def _days(weeks: float) -> str:
+    hours = 7 * 24 * weeks
+    return number(round(hours / 24), "day") if hours >= 24 else f"{hours:.1f} hours"
 
 
 def _line(ring: "Ring", zone: tzinfo) -> str:

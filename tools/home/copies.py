@@ -180,8 +180,9 @@ def _frames(logs: Sequence[Path], microphone: str, period: int) -> int:
     """Return what each period adds to the frame numbers of a microphone."""
     topic = f"/{microphone}/features"
     fields = ["frame", "header.stamp"]
-    ends = [read_columns([log], [topic], fields=fields)[topic] for log in (logs[0], logs[-1])]
-    if not all(map(len, ends)):
+    found = (read_columns([log], [topic], fields=fields) for log in (logs[0], logs[-1]))
+    ends = [columns[topic] for columns in found if len(columns.get(topic, ()))]
+    if len(ends) < 2:  # the logs were thinned
         return 0
     first, last = (int(ends[i]["frame"][-i]) for i in (0, 1))
     start, end = (int(ends[i]["header.stamp"][-i]) for i in (0, 1))

@@ -1,6 +1,6 @@
 """What was heard up to now, from the log while it is written."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
@@ -108,6 +108,11 @@ class LiveHome:
     def heard(self) -> HomeHeard:
         """Return what was heard, with what goes on."""
         return self._gathered.heard(self.open_segments())
+
+    @property
+    def classes(self) -> Mapping[str, Collection[str]]:
+        """By microphone, the classes that its model knows."""
+        return self._gathered.classes
 
     def open_segments(self) -> list[tuple[str, int, int, str, float]]:
         """Return what goes on and has no segment yet, as `Gathered.heard` takes it."""

@@ -16,7 +16,7 @@ from hearthlog.analyzer.bridge.alerts.open_run import Label
 from hearthlog.analyzer.bridge.alerts.outbox import Outbox
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
 from hearthlog.analyzer.bridge.alerts.ring import Ring
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule, unknown_class
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.alerts.targets import read_targets
 from hearthlog.analyzer.bridge.alerts.watch import AHEAD, RuleWatch
@@ -83,6 +83,7 @@ class AlertsOutput:
                 "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a "
                 "broker in [bridge.mqtt]"
             )
+        self._rules = rules
         self._followed = home
         self._say = say
         self._on_ring = on_ring
@@ -197,6 +198,13 @@ class AlertsOutput:
             if label.time < now + _TO_COME:
                 self._heard.add_label(name, label, classes)
         self._watch.evaluate(self._heard.heard, self._weeks, self._heard.known_until(now), now)
+        if time.monotonic() - self._began >= _WAIT_SECONDS:
+            self._say_unknown_classes()
+
+    def _say_unknown_classes(self) -> None:
+        for rule in self._rules:
+            if text := unknown_class(rule, self._heard.classes):
+                self._say(f"alerts: {text}")
 
     def _now(self) -> int:
         now = time.time_ns()

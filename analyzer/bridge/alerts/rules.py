@@ -1,6 +1,7 @@
 """The rules of alerts: each a table `[[bridge.alert]]` of the configuration."""
 
 import hashlib
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -213,6 +214,23 @@ def history(rule: AlertRule) -> int:
     if isinstance(rule, UnlikeUsual):
         return 31 * DAY
     return _TWO_DAYS if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN
+
+
+def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> str:
+    """Say that no model knows the class of a rule; empty if one does, or if nothing is known.
+
+    Parameters
+    ----------
+    rule : AlertRule
+    classes : mapping of str to collection of str
+        By microphone, those that its model knows.
+    """
+    if not isinstance(rule, _SoundRule) or rule.label == ANY_SOUND:
+        return ""
+    own = [names for name, names in classes.items() if rule.microphone in {"", name}]
+    if not own or any(rule.label in names for names in own):
+        return ""
+    return f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard"
 
 
 def live_history(rule: AlertRule) -> int:
