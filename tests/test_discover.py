@@ -23,6 +23,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 from hearthlog.schemas.times import NANOSECONDS, read_time
+from hearthlog.tools.bench.recurring_scene import OTHER
 
 START = 1_772_352_000 * NANOSECONDS
 DAY = 86_400 * NANOSECONDS
@@ -67,7 +68,7 @@ def test_each_sound_that_recurs_is_a_group_of_its_own(two_days):
     folder, (first, second) = two_days
     _, of, spans = grouped([folder])
     names = names_of(spans, [*first, *second])
-    recurs = names != "other"
+    recurs = names != OTHER
     assert adjusted_rand_score(names[recurs], of[recurs]) > 0.7
     rows = set()
     for name in RECURRING:
