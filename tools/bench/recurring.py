@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
@@ -25,7 +25,7 @@ from hearthlog.analyzer.discover.sound_spans import ALL
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.bench.recurring_scene import OTHER, Sounded, names_of, record_scene
@@ -50,16 +50,36 @@ def recurring(
     kinds, others = _drawn(manifest, seed)
     print(", ".join(kinds), flush=True)
     with tempfile.TemporaryDirectory(prefix="hearthlog-recurring-") as folder:
-        logs = Path(folder) / "logs"
-        truth = [
-            record_scene(
-                kinds, others, 60 * minutes, noise, logs, _START + day * _DAY, 100 * seed + day
-            )
-            for day in range(days)
-        ]
-        groups, _, _ = _grouped(logs, _START + _DAY)
-        _, of, names = _grouped(logs, None, groups, [each for day in truth for each in day])
-    print(_table(kinds, groups, of, *names, [each for day in truth for each in day], days))
+        logs, truth = Path(folder) / "logs", list[Sounded]()
+        for day in range(days):
+            start = _START + day * _DAY
+            truth += record_scene(kinds, others, 60 * minutes, noise, logs, start, 100 * seed + day)
+        groups, _ = _grouped(logs, truth, None, _START + _DAY)
+        _, sounds = _grouped(logs, truth, groups)
+    known = len(groups.numbers)
+    sounds = sounds._replace(of=np.where(sounds.of < known, sounds.of, NO_GROUP))
+    print(Table(f"recurring: ten sounds on {days} days", _rows(list(kinds), sounds, truth, known)))
+
+
+class _Grouped(NamedTuple):
+    """Sounds in the order in which they were read.
+
+    Attributes
+    ----------
+    of : np.ndarray [shape=(n,)], int64
+        The row of the group of each, or `NO_GROUP`.
+    kinds : np.ndarray [shape=(n,)], str
+        What each was.
+    events : np.ndarray [shape=(n,)], int64
+        Where it is in the truth; -1 for nothing.
+    is_early : np.ndarray [shape=(n,)], bool
+        Whether it is of the first day.
+    """
+
+    of: Int64
+    kinds: NDArray[np.str_]
+    events: Int64
+    is_early: Bool
 
 
 def _drawn(manifest: Path, seed: int) -> tuple[dict[str, Float32], list[Float32]]:
@@ -83,55 +103,63 @@ def _samples(manifest: Path, path: str) -> Float32:
 
 
 def _grouped(
-    logs: Path, end: int | None, groups: Groups | None = None, truth: Sequence[Sounded] = ()
-) -> tuple[Groups, Int64, tuple[NDArray[np.str_], Int64]]:
+    logs: Path, truth: Sequence[Sounded], groups: Groups | None, end: int | None = None
+) -> tuple[Groups, _Grouped]:
     with read_sounds(find_home_logs([logs]), ALL, None, end) as sounds:
         found, of, _ = discover(sounds, groups)
-        names, rows = names_of(sounds.spans, truth) if truth else ([], [])
-    return found, of, (np.array(names, np.str_), np.array(rows, np.int64))
+        names, events = names_of(sounds.spans, truth)
+        is_early = sounds.spans.starts < _START + _DAY
+    return found, _Grouped(of, np.array(names), np.array(events), is_early)
 
 
-def _table(  # noqa: PLR0913, PLR0917
-    kinds: dict[str, Float32],
-    groups: Groups,
-    of: Int64,
-    names: NDArray[np.str_],
-    rows: Int64,
-    truth: Sequence[Sounded],
-    days: int,
-) -> Table:
-    recurs = names != OTHER
-    known = len(groups.numbers)
-    of = np.where(of < known, of, NO_GROUP)  # the later groups have no name yet
-    share_of_kind, precision_of_kind = {}, {}
-    for kind in kinds:
-        own = of[(names == kind) & (of != NO_GROUP)]
-        group = int(np.bincount(own).argmax()) if len(own) else NO_GROUP
-        events = [row for row, each in enumerate(truth) if each.name == kind]
-        labelled = set(rows[(of == group) & (names == kind)].tolist()) if len(own) else set()
-        share_of_kind[kind] = len(labelled & set(events)) / max(len(events), 1)
-        precision_of_kind[kind] = float((names[of == group] == kind).mean()) if len(own) else 0.0
-    found = sum(
-        share > 0.5 and precision_of_kind[kind] > 0.5 for kind, share in share_of_kind.items()
-    )
-    shares = [
-        Row(f"  {kind}", share, "", note=f"{precision_of_kind[kind]:.0%} of its group is this")
-        for kind, share in share_of_kind.items()
+def _rows(
+    kinds: Sequence[str], sounds: _Grouped, truth: Sequence[Sounded], groups: int
+) -> list[Row]:
+    names = np.array([*(_name(sounds, group) for group in range(groups)), OTHER])
+    named = names[sounds.of]  # the last one for those of no group
+    recurs = sounds.kinds != OTHER
+    shares = [_share(kind, named, sounds, truth) for kind in kinds]
+    single = sum(_is_one_group(kind, sounds) for kind in kinds)
+    index = float(adjusted_rand_score(sounds.kinds[recurs], sounds.of[recurs]))
+    given = float(np.mean([share for share, _ in shares]))
+    return [
+        Row("one group each", single, "of 10", target=Target(8)),
+        Row("adjusted Rand index", index, target=Target(0.7)),
+        Row("events of the later days that names give", given, target=Target(0.7)),
+        *(
+            Row(f"  {kind}", share, note=f"{right:.0%} of what gets the name")
+            for kind, (share, right) in zip(kinds, shares, strict=True)
+        ),
     ]
-    return Table(
-        f"recurring: ten sounds on {days} days, groups of the first day",
-        [
-            Row("one group each", found, "of 10", target=Target(8)),
-            Row(
-                "adjusted Rand index",
-                float(adjusted_rand_score(names[recurs], of[recurs])),
-                target=Target(0.7),
-            ),
-            Row("events that names give", float(np.mean([*share_of_kind.values()])), "",
-                target=Target(0.7)),
-            *shares,
-        ],
-    )  # fmt: skip
+
+
+def _name(sounds: _Grouped, group: int) -> str:
+    """Name a group as a person does on the first evening: by what most of it is."""
+    names, counts = np.unique(
+        sounds.kinds[(sounds.of == group) & sounds.is_early], return_counts=True
+    )
+    return str(names[counts.argmax()]) if len(names) else OTHER
+
+
+def _share(
+    kind: str, named: NDArray[np.str_], sounds: _Grouped, truth: Sequence[Sounded]
+) -> tuple[float, float]:
+    """Return what share of the later events of a kind get its name, and how many of all do so."""
+    late = (named == kind) & ~sounds.is_early
+    right = late & (sounds.kinds == kind)
+    events = [each for each in truth if each.name == kind and each.start >= _START + _DAY]
+    return len(set(sounds.events[right].tolist())) / max(len(events), 1), float(
+        right.sum() / max(late.sum(), 1)
+    )
+
+
+def _is_one_group(kind: str, sounds: _Grouped) -> bool:
+    """Tell whether most of the sounds of a kind are one group, and most of that group is this."""
+    own = sounds.of[sounds.kinds == kind]
+    counts = np.bincount(own[own != NO_GROUP], minlength=1)
+    group = int(counts.argmax())
+    is_whole = 2 * counts[group] > len(own)
+    return bool(is_whole and (sounds.kinds[sounds.of == group] == kind).mean() > 0.5)
 
 
 if __name__ == "__main__":
