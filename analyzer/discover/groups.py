@@ -12,6 +12,7 @@ _DIMENSIONS = 16
 _CLOSE = 3  # neighbours by which a density is judged
 _EXAMPLES = 200  # that are kept of a group
 _RADIUS = 95  # percentile of the distances of its examples to the next one
+_LEAST_RADIUS = 1e-6  # of sounds that are all the same
 NO_GROUP = -1
 
 
@@ -135,7 +136,7 @@ def _add(groups: Groups, points: Float64) -> Groups:
 
     examples = points[np.linspace(0, len(points) - 1, min(len(points), _EXAMPLES)).astype(int)]
     steps = cKDTree(examples).query(examples, 2)[0][:, 1]
-    radius = max(float(np.percentile(steps, _RADIUS)), np.finfo(np.float64).tiny)
+    radius = max(float(np.percentile(steps, _RADIUS)), _LEAST_RADIUS)
     number = groups.numbers.max(initial=0) + 1
     return replace(
         groups,
