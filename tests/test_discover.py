@@ -14,6 +14,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
 from hearthlog.analyzer.discover.discover import discover
+from hearthlog.analyzer.discover.group_spans import group_spans
 from hearthlog.analyzer.discover.groups import NO_GROUP
 from hearthlog.analyzer.discover.groups_file import GROUPS, load_groups, save_groups
 from hearthlog.analyzer.discover.read_sounds import read_sounds
@@ -21,6 +22,9 @@ from hearthlog.analyzer.discover.summary import usual_hours
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
+from hearthlog.analyzer.review.timeline.model import LabelledSpans
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.bench.recurring_scene import OTHER
@@ -140,6 +144,27 @@ def test_naming_again_marks_what_is_new(home, hearthlog):
     run(hearthlog, home, "--name", f"{number}=bell")
     assert [mark[:4] for mark in read_marks(early)] == [mark[:4] for mark in before]
     assert read_marks(late)
+
+
+def test_a_review_shows_what_recurs_as_a_lane(home, hearthlog):
+    run(hearthlog, home)
+    groups = load_groups(home / GROUPS)
+    groups.names[1] = "rooster"
+    spans, _ = group_spans(find_home_logs([home]), groups)
+    assert {"rooster", "group 1"} <= set(spans["mic"].texts)
+    assert (spans["mic"].starts[1:] >= spans["mic"].ends[:-1]).all()
+    timeline = read_timeline([home])
+    assert "Recurs" not in [lane.name for lane in timeline_lanes(timeline)]
+    timeline.microphones["mic"].recurring = LabelledSpans(*spans["mic"])
+    (lane,) = [lane for lane in timeline_lanes(timeline) if lane.name == "Recurs"]
+    assert {"Rooster", "Group 1"} <= set(lane.spans.texts)
+
+
+def test_a_review_of_groups_that_are_not_there_is_one_line(home, hearthlog, tmp_path):
+    options = ["--groups", tmp_path / "none", "--save", tmp_path / "day.rrd"]
+    done = hearthlog("review", home, *options)
+    assert done.returncode == 1
+    assert "no such file of groups; `hearthlog discover` makes one" in done.stderr
 
 
 def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_days):

@@ -77,6 +77,10 @@ def review(
     reviewer: Annotated[
         str | None, typer.Option(help="Who makes the marks.", show_default="the login name")
     ] = None,
+    groups: Annotated[
+        Path | None,
+        typer.Option(help="Groups of `hearthlog discover`, a file; their sounds are a lane."),
+    ] = None,
     timezone: Timezone = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the viewer.")] = None,
 ) -> None:
@@ -98,7 +102,10 @@ def review(
 
     def read() -> "Timeline":
         with share_done("reading logs") as progress:
-            return read_timeline(logs, *limits, zone=timezone, progress=progress)
+            timeline = read_timeline(logs, *limits, zone=timezone, progress=progress)
+        if groups is not None:
+            _add_groups(timeline, logs, groups)
+        return timeline
 
     chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
     if save is not None and queue is not None:
@@ -116,6 +123,26 @@ def review(
             timeline = read()
             _show(viewer, timeline, logs, chosen)
     end_with_warnings(timeline.losses)
+
+
+def _add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
+    """Add the sounds of groups to a timeline."""
+    from hearthlog.analyzer.discover.group_spans import group_spans
+    from hearthlog.analyzer.discover.groups_file import load_groups
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.review.timeline.model import LabelledSpans
+
+    groups = load_groups(file)
+    if groups is None:
+        raise DataError(f"{file}: no such file of groups; `hearthlog discover` makes one")
+    span = timeline.grid.start, timeline.grid.end
+    with share_done("finding what recurs") as progress:
+        found, losses = group_spans(find_home_logs(logs), groups, *span, progress)
+    for name, spans in found.items():
+        if name in timeline.microphones:
+            timeline.microphones[name].recurring = LabelledSpans(*spans)
+    timeline.losses += [text for text in losses if text not in timeline.losses]
 
 
 class ReviewCommand(TyperCommand):

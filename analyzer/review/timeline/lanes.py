@@ -21,6 +21,7 @@ from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW
 REVIEWED = "Reviewed"  # the name of the lane, and of its spans without a mark
 NOT_HEARD = "Not heard"
 _TROUBLE = "Trouble"
+_RECURRING = "Recurs"
 _LOOKED_AT: Colour = (58, 70, 92)
 _TROUBLED: Colour = (240, 140, 40)
 _MOST_LANES = 12  # of classes, where some were not heard at all
@@ -141,6 +142,8 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
         texts = np.array([in_words(text) for text in spans.texts], object)
         name = f"{labelling_in_words(other.name)} differs"
         yield Lane(microphone.name, "", name, LabelledSpans(*spans[:2], texts), shades)
+    if len(microphone.recurring):
+        yield _recurring_lane(microphone)
     marks = next((one.spans for one in microphone.labellings if one.name == REVIEW), no_spans())
     yield reviewed_lane(microphone.name, marks, microphone.reviewed)
     kinds = (NOT_HEARD, microphone.gaps, GAP), (_TROUBLE, microphone.troubles, _TROUBLED)
@@ -149,3 +152,11 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
             texts = np.full(len(spans), name, object)
             named = LabelledSpans(*spans[:2], texts)
             yield Lane(microphone.name, "", name, named, {name: shade})
+
+
+def _recurring_lane(microphone: MicrophoneTimeline) -> Lane:
+    names = {text: in_words(text) for text in dict.fromkeys(microphone.recurring.texts)}
+    shades = {name: colour(text) for text, name in names.items()}
+    texts = np.array([names[text] for text in microphone.recurring.texts], object)
+    spans = LabelledSpans(*microphone.recurring[:2], texts)
+    return Lane(microphone.name, "", _RECURRING, spans, shades)

@@ -33,6 +33,11 @@ class LabelledSpans(NamedTuple):
         return len(self.starts)
 
 
+def no_spans() -> LabelledSpans:
+    """Return an empty `LabelledSpans`."""
+    return LabelledSpans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+
+
 class GridSeries(NamedTuple):
     """Means on the grid of a timeline.
 
@@ -150,6 +155,8 @@ class MicrophoneTimeline:
     troubles : LabelledSpans
         Warnings and errors of the diagnostics.
     clips : list of SoundClip
+    recurring : LabelledSpans
+        Sounds that recur, with what they are called.
     """
 
     name: str
@@ -162,6 +169,7 @@ class MicrophoneTimeline:
     gaps: LabelledSpans
     troubles: LabelledSpans
     clips: list[SoundClip]
+    recurring: LabelledSpans = field(default_factory=no_spans)
 
     @property
     def classes(self) -> list[str]:
@@ -211,8 +219,3 @@ class Timeline:
             If there is no such time zone.
         """
         return home_clock(home_zone(self.zone), self.grid.start, self.grid.end)
-
-
-def no_spans() -> LabelledSpans:
-    """Return an empty `LabelledSpans`."""
-    return LabelledSpans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
