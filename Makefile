@@ -14,8 +14,9 @@ demo: $(VENV)/.analyzer
 	$(BIN)/hearthlog demo --output demo
 
 # SEED=7 tries other examples of what tests draw at random; without it they are the same every time.
+# Three at once, for many tests wait for sound.
 test: $(VENV)/.dev
-	$(BIN)/pytest -n 2 $(if $(SEED),--hypothesis-seed=$(SEED))
+	$(BIN)/pytest -n 3 $(if $(SEED),--hypothesis-seed=$(SEED))
 
 # A little of every room, in two minutes.
 test-fast: $(VENV)/.dev

@@ -88,7 +88,8 @@ def key_lines(text: str) -> dict[Key, int]:
 
 def _variable(name: str) -> str | None:
     wanted = f"{ENVIRONMENT}{name}".upper()
-    return next((each for each in os.environ if each.upper() == wanted), None) if name else None
+    is_a_key = name and name == name.lower()  # NODE in a file is none
+    return next((each for each in os.environ if each.upper() == wanted), None) if is_a_key else None
 
 
 def _upwards(key: Key) -> list[Key]:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from recurring import RECURRING, names_of, record_recurring
 from sklearn.metrics import adjusted_rand_score
 
+from hearthlog.analyzer.discover import read_sounds as read_sounds_module
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
 from hearthlog.analyzer.discover.discover import discover
 from hearthlog.analyzer.discover.group_spans import group_spans
@@ -21,7 +23,7 @@ from hearthlog.analyzer.discover.read_sounds import read_sounds
 from hearthlog.analyzer.discover.summary import usual_hours
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write_marks
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
@@ -116,12 +118,13 @@ def test_a_group_gets_a_name_and_each_of_its_sounds_a_mark_which_undo_takes_back
     done = run(hearthlog, home, "--name", name, "--reviewer", "Anna")
     count = largest["times"] - 1
     assert (
-        f"group {largest['number']}: {count} marks of front_door; 1 have a mark of" in done.stderr
+        f"group {largest['number']}: {count} marks of front_door; 1 are marked or looked at"
+        in done.stderr
     )
     marks = [mark for log in logs_of(home) for mark in read_marks(log)]
     assert own in marks
     said = [mark for mark in marks if mark != own]
-    reason = f"group {largest['number']}"
+    reason = f"group {largest['number']} of {load_groups(home / GROUPS).id}"
     assert {mark[3:5] + mark[6:] for mark in said} == {("front_door", "Anna", "live", reason)}
     assert len(said) == count
     assert as_json(hearthlog, home)["groups"][0]["name"] == "front_door"
@@ -144,6 +147,79 @@ def test_naming_again_marks_what_is_new(home, hearthlog):
     run(hearthlog, home, "--name", f"{number}=bell")
     assert [mark[:4] for mark in read_marks(early)] == [mark[:4] for mark in before]
     assert read_marks(late)
+
+
+def test_another_name_renames_all_marks_of_a_group_whatever_is_looked_at_now(home, hearthlog):
+    number = as_json(hearthlog, home)["groups"][0]["number"]
+    run(hearthlog, home, "--name", f"{number}=dish")
+    before = [mark for log in logs_of(home) for mark in read_marks(log)]
+    run(hearthlog, home, "--name", f"{number}=glass", "--start", "2026-03-02")
+    after = [mark for log in logs_of(home) for mark in read_marks(log)]
+    assert [mark[:3] for mark in after] == [mark[:3] for mark in before]
+    assert {mark.label for mark in after} == {"glass"}
+
+
+def test_what_somebody_has_looked_at_is_not_marked(home, hearthlog):
+    largest = as_json(hearthlog, home)["groups"][0]
+    example = largest["examples"][0]
+    span = ReviewedSpan("mic", read_time(example["start"]), read_time(example["end"]), "Berta")
+    write_marks(Path(example["log"]), [], reviewed=[span])
+    done = run(hearthlog, home, "--name", f"{largest['number']}=dish")
+    assert "; 1 are marked or looked at by somebody already" in done.stderr
+
+
+def test_groups_of_another_file_are_other_groups(home, hearthlog, tmp_path):
+    first = as_json(hearthlog, home)["groups"][0]["number"]
+    run(hearthlog, home, "--name", f"{first}=dish")
+    count = sum(len(read_marks(log)) for log in logs_of(home))
+    other = ["--groups", tmp_path / "other.safetensors", "--least", 10]
+    run(hearthlog, home, *other)
+    done = run(hearthlog, home, *other, "--undo", first)
+    assert f"group {first}: 0 marks taken back" in done.stderr
+    assert sum(len(read_marks(log)) for log in logs_of(home)) == count
+
+
+def test_nothing_is_marked_by_groups_that_cannot_be_kept(home, hearthlog, tmp_path):
+    options = ["--groups", tmp_path / "none" / "x", "--name", "1=dish"]
+    done = hearthlog("discover", home, *options)
+    assert done.returncode == 1
+    assert "cannot be written (No such file or directory)" in done.stderr
+    assert not any(review_path(log).exists() for log in logs_of(home))
+
+
+def test_two_who_name_groups_at_once_wait_for_each_other(home, hearthlog):
+    run(hearthlog, home)
+    with ThreadPoolExecutor() as pool:
+        names = ("1=one", "2=two")
+        done = list(pool.map(lambda name: hearthlog("discover", home, "--name", name), names))
+    assert [each.returncode for each in done] == [0, 0]
+    assert load_groups(home / GROUPS).names[:2] == ["one", "two"]
+
+
+def test_logs_that_were_joined_have_their_sounds_where_they_were(home, hearthlog, tmp_path):
+    joined = tmp_path / "joined"
+    joined.mkdir()
+    done = hearthlog("merge", *logs_of(home), "-o", joined / "both.mcap")
+    assert done.returncode == 0, done.stderr
+    spans = []
+    for folder in (home, joined):
+        with read_sounds(find_home_logs([folder]), "all") as sounds:
+            spans.append(sorted(zip(sounds.spans.starts, sounds.spans.ends, strict=True)))
+    assert spans[0] == spans[1]
+
+
+def test_features_that_are_no_numbers_are_left_out_and_said(home, monkeypatch):
+    real = read_sounds_module.read_columns
+
+    def with_nan(*arguments, **options):
+        found = real(*arguments, **options)
+        found["/mic/features"].fields["values"][2000:2400] = np.nan
+        return found
+
+    monkeypatch.setattr(read_sounds_module, "read_columns", with_nan)
+    with read_sounds(find_home_logs([home]), "all") as sounds:
+        assert np.isfinite(sounds.descriptors).all()
+    assert "with features that are no numbers; left out" in sounds.losses[0]
 
 
 def test_a_review_shows_what_recurs_as_a_lane(home, hearthlog):
@@ -183,6 +259,9 @@ def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_d
     [
         (["--name", "door"], 2, "say the number of a group and a class, as 3=doorbell"),
         (["--name", "1=silence"], 2, "say the number of a group and a class"),
+        (["--name", f"{'9' * 5000}=door"], 2, "say the number of a group and a class"),
+        (["--name", "1=door", "--name", "1=bell"], 2, "group 1 has another name already"),
+        (["--undo", "1"], 1, "there is no group 1"),
         (["--name", "99=door"], 1, "there is no group 99"),
         (["--of", "loud"], 2, "it is one of all, unsure, unknown"),
         (["--end", "2026-03-01T08:00:20"], 1, "sounds are too few to group: it takes 16"),
@@ -200,7 +279,7 @@ def test_what_makes_no_sense_is_one_line(home, hearthlog, options, status, says)
 def test_several_logs_want_a_place_for_their_groups(home, hearthlog):
     done = hearthlog("discover", *logs_of(home))
     assert done.returncode == 2
-    assert "--groups: say where the groups are kept" in done.stderr
+    assert "--groups: say in which file the groups are kept" in done.stderr
 
 
 def test_groups_of_other_features_are_refused(two_days):
@@ -232,6 +311,26 @@ def test_a_damaged_file_of_groups_is_one_line_or_a_file_of_groups(groups_file, d
         said = str(error)
     assert said.startswith(f"{path}: is ")
     assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("scale", 1e-300),
+        ("mean", 1e308),
+        ("examples", np.nan),
+        ("radii", 5e-324),
+        ("numbers", -1),
+        ("numbers", 1 << 62),
+    ],
+)
+def test_a_file_of_groups_with_hostile_numbers_is_refused(two_days, tmp_path, name, value):
+    groups, _, _ = grouped([two_days[0]])
+    array = getattr(groups, name).copy()
+    array[0] = value
+    save_groups(replace(groups, **{name: array}), tmp_path / GROUPS)
+    with pytest.raises(DataError, match="is damaged"):
+        load_groups(tmp_path / GROUPS)
 
 
 @settings(deadline=None)

@@ -27,6 +27,10 @@ def commands(command, name=()):
         yield from commands(verb, (*name, word))
 
 
+def test_help_before_a_verb_lists_all_of_them(hearthlog):
+    assert hearthlog("--help", "discover").stdout == hearthlog("--help").stdout
+
+
 VERBS = dict(commands(typer.main.get_command(make_app())))
 
 

@@ -270,6 +270,11 @@ def test_home_assistant_has_switches_and_buttons_only_where_commands_are_taken(h
             listener.wait_for(COMMANDS, "")
 
 
+def test_there_are_buttons_where_no_class_is_known_yet(home, broker):
+    with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
+        assert {*json.loads(listener.wait_for(COMMANDS))["components"]} == {"pause", "resume"}
+
+
 def test_a_bridge_that_is_started_again_tells_of_no_event_twice(home, broker):
     home.hears("silence")
     with Listener(broker.port) as listener:

@@ -1,5 +1,6 @@
 """Groups of sounds that are alike: found among descriptors, and known again."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -8,6 +9,7 @@ import numpy as np
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 
 LEAST = 8  # sounds of a group, by default
+MOST_GROUPS = 1_000  # in a file
 _DIMENSIONS = 16
 _CLOSE = 3  # neighbours by which a density is judged
 _EXAMPLES = 200  # that are kept of a group
@@ -38,6 +40,8 @@ class Groups:
         A sound within this distance of an example is of the group.
     names : list of str
         Classes that a person named groups; empty where nobody did.
+    id : str
+        What no other groups have: of which file a mark has its group.
     """
 
     features: tuple[str, ...]
@@ -49,6 +53,7 @@ class Groups:
     numbers: Int64
     radii: Float64
     names: list[str] = field(default_factory=list)
+    id: str = ""
 
     def points(self, descriptors: Float32) -> Float64:
         """Return where described sounds lie, shape (n, d)."""
@@ -119,16 +124,21 @@ def add_groups(groups: Groups, points: Float64, of: Int64, least: int = LEAST) -
     from sklearn.cluster import HDBSCAN  # noqa: PLC0415
 
     if len(points) < max(2 * least, _CLOSE + 1):
-        return groups
+        return groups if groups.id else replace(groups, id=_digest(groups))
     clusters = HDBSCAN(min_cluster_size=least, min_samples=_CLOSE, copy=True)
     labels = clusters.fit_predict(points)
     sizes = np.bincount(labels[labels >= 0])
     for label in np.argsort(-sizes, kind="stable"):
         own = labels == label
         new = own & (of == NO_GROUP)
-        if 2 * new.sum() > own.sum() and new.sum() >= least:
+        if 2 * new.sum() > own.sum() and new.sum() >= least and len(groups.numbers) < MOST_GROUPS:
             groups = _add(groups, points[new])
-    return groups
+    return groups if groups.id else replace(groups, id=_digest(groups))
+
+
+def _digest(groups: Groups) -> str:
+    arrays = groups.mean, groups.scale, groups.axes, groups.examples, groups.of
+    return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()[:8]
 
 
 def _add(groups: Groups, points: Float64) -> Groups:

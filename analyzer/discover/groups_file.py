@@ -1,6 +1,9 @@
 """The file of the groups of a home: arrays and names, checked when read."""
 
+import fcntl
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -11,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from safetensors.numpy import load, save
 
 from hearthlog.analyzer.discover.descriptors import descriptor_width
-from hearthlog.analyzer.discover.groups import Groups
+from hearthlog.analyzer.discover.groups import MOST_GROUPS, Groups
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.storage.new_files import replaced_file
@@ -22,7 +25,8 @@ _KEY = "hearthlog_groups"
 _FORMAT: Final = 1
 _LARGEST = 64 << 20  # bytes
 _LARGEST_HEADER = 1 << 20
-_MOST_GROUPS = 10_000
+_LEAST_NUMBER, _MOST_NUMBER = 1, (1 << 31) - 1
+_SMALL, _LARGE = 1e-6, 1e6  # of radii and scales; all other numbers are at most as large
 _ARRAYS = {"mean": 1, "scale": 1, "axes": 2, "examples": 2, "of": 1, "numbers": 1, "radii": 1}
 _WHOLE = {"of", "numbers"}
 
@@ -34,8 +38,27 @@ class _Head(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
     format: Annotated[int, Field(ge=1, le=_FORMAT)]
+    id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{8}$")]
     features: Annotated[list[_Name], Field(min_length=1, max_length=256)]
-    names: Annotated[list[_Class], Field(max_length=_MOST_GROUPS)]
+    names: Annotated[list[_Class], Field(max_length=MOST_GROUPS)]
+
+
+@contextmanager
+def locked_groups(path: Path) -> Iterator[None]:
+    """Keep others from the file of groups, who wait.
+
+    Raises
+    ------
+    DataError
+        If its folder cannot be written.
+    """
+    try:
+        lock = path.with_name(f".{path.name}.lock").open("ab")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def save_groups(groups: Groups, path: Path) -> None:
@@ -46,7 +69,7 @@ def save_groups(groups: Groups, path: Path) -> None:
     LogError
         If it cannot be written.
     """
-    head = _Head(format=_FORMAT, features=list(groups.features), names=groups.names)
+    head = _Head(format=_FORMAT, id=groups.id, features=list(groups.features), names=groups.names)
     arrays = {name: np.ascontiguousarray(getattr(groups, name)) for name in _ARRAYS}
     data = save(arrays, {_KEY: head.model_dump_json()})
     with replaced_file(path) as temporary:
@@ -75,7 +98,7 @@ def load_groups(path: Path) -> Groups | None:
         raise DataError(f"{path}: is no file of groups of this version of hearthlog") from error
     if problem := _problem(head, arrays):
         raise DataError(f"{path}: is damaged: {problem}; move it away to begin anew")
-    return Groups(tuple(head.features), **arrays, names=head.names)
+    return Groups(tuple(head.features), **arrays, names=head.names, id=head.id)
 
 
 def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
@@ -84,8 +107,10 @@ def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
         return "it has other arrays"
     for name, dimensions in _ARRAYS.items():
         array, kind = arrays[name], np.int64 if name in _WHOLE else np.float64
-        if array.ndim != dimensions or array.dtype != kind or not np.isfinite(array).all():
+        if array.ndim != dimensions or array.dtype != kind:
             return f"{name} is not as it has to be"
+        if name not in _WHOLE and not (np.abs(array) <= _LARGE).all():
+            return f"{name} has numbers that are too large, or none"
     width, count = descriptor_width(head.features), len(head.names)
     axes, examples, of = arrays["axes"], arrays["examples"], arrays["of"]
     fits = (
@@ -95,7 +120,10 @@ def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
         and of.shape == examples.shape[:1]
         and np.array_equal(np.unique(of), np.arange(count))
         and len(np.unique(arrays["numbers"])) == count
-        and (arrays["radii"] > 0).all()
-        and (arrays["scale"] > 0).all()
+        and (arrays["radii"] >= _SMALL).all()
+        and (arrays["scale"] >= _SMALL).all()
+        and (arrays["numbers"] >= _LEAST_NUMBER).all()
+        and (arrays["numbers"] <= _MOST_NUMBER).all()
+        and len(axes)
     )
     return "" if fits else "its arrays do not fit each other"

@@ -4,26 +4,34 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
+from hearthlog.analyzer.discover.groups import Groups
 from hearthlog.analyzer.discover.read_sounds import HomeSounds
-from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import (
+    Mark,
+    MarkedSpan,
+    ReviewedSpan,
+    read_marks,
+    read_reviewed,
+    write_marks,
+)
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.messages.topics import LIVE
 
 
-def mark_group(
-    sounds: HomeSounds, rows: Int64, number: int, label: str, reviewer: str
+def mark_group(  # noqa: PLR0913
+    logs: Iterable[Path], sounds: HomeSounds, rows: Int64, *, reason: str, label: str, reviewer: str
 ) -> tuple[int, int]:
-    """Mark the sounds of a group; what somebody has marked already stays as it is.
+    """Mark the sounds of a group; marks that it has get the label, if it had another name.
 
     Parameters
     ----------
+    logs : iterable of Path
+        Of the home.
     sounds : HomeSounds
     rows : np.ndarray [shape=(n,)], int64
         Those of the group.
-    number : int
-        Of the group, which is the reason of each mark.
+    reason : str
+        `reason_of` the group.
     label : str
         The class that they are.
     reviewer : str
@@ -32,7 +40,8 @@ def mark_group(
     Returns
     -------
     made, left : int
-        How many were marked, and how many were left because there is a mark of another reason.
+        How many marks were made or got another label, and how many sounds were left as they are
+        because somebody has marked them, or looked at them.
 
     Raises
     ------
@@ -40,31 +49,44 @@ def mark_group(
         If a review layer cannot be read or written.
     """
     made = left = 0
-    now, spans = time.time_ns(), sounds.spans
-    for place in np.unique(sounds.log[rows]).tolist():
-        own = rows[sounds.log[rows] == place]
-        names = [sounds.microphones[i] for i in sounds.microphone[own].tolist()]
-        wanted = [
-            Mark(name, start, end, label, reviewer, now, LIVE, reason_of(number))
-            for name, start, end in zip(
-                names, spans.starts[own].tolist(), spans.ends[own].tolist(), strict=True
-            )
+    now, wanted = time.time_ns(), _wanted(sounds, rows)
+    for log in dict.fromkeys([*logs, *sounds.logs]):
+        old, reviewed = read_marks(log), read_reviewed(log)
+        own = [mark for mark in old if mark.reason == reason]
+        others: list[Mark | ReviewedSpan] = [mark for mark in old if mark.reason != reason]
+        others += reviewed
+        spans = [span for span in wanted.get(log, ()) if not _any_overlap(span, own)]
+        free = [span for span in spans if not _any_overlap(span, others)]
+        new = [Mark(*span, label, reviewer, now, LIVE, reason) for span in free]
+        new += [
+            mark._replace(label=label, reviewer=reviewer, made=now)
+            for mark in own
+            if mark.label != label
         ]
-        log = sounds.logs[place]
-        old = [mark for mark in read_marks(log) if mark.reason != reason_of(number)]
-        new = [mark for mark in wanted if not any(_overlap(mark, each) for each in old)]
-        write_marks(log, new)
-        made, left = made + len(new), left + len(wanted) - len(new)
+        if new:
+            write_marks(log, new)
+        made, left = made + len(new), left + len(spans) - len(free)
     return made, left
 
 
-def unmark_group(logs: Iterable[Path], number: int) -> int:
+def _wanted(sounds: HomeSounds, rows: Int64) -> dict[Path, list[MarkedSpan]]:
+    wanted: dict[Path, list[MarkedSpan]] = {}
+    starts, ends = sounds.spans.starts.tolist(), sounds.spans.ends.tolist()
+    for row in rows.tolist():
+        name = sounds.microphones[sounds.microphone[row]]
+        span = MarkedSpan(name, starts[row], ends[row])
+        wanted.setdefault(sounds.logs[sounds.log[row]], []).append(span)
+    return wanted
+
+
+def unmark_group(logs: Iterable[Path], reason: str) -> int:
     """Take back the marks of a group; return how many there were.
 
     Parameters
     ----------
     logs : iterable of Path
-    number : int
+    reason : str
+        `reason_of` the group.
 
     Raises
     ------
@@ -73,17 +95,20 @@ def unmark_group(logs: Iterable[Path], number: int) -> int:
     """
     count = 0
     for log in logs:
-        own = [mark for mark in read_marks(log) if mark.reason == reason_of(number)]
+        own = [mark for mark in read_marks(log) if mark.reason == reason]
         if own:
             write_marks(log, [], [MarkedSpan(*mark[:3]) for mark in own])
         count += len(own)
     return count
 
 
-def reason_of(number: int) -> str:
-    """Return the reason that the marks of a group have."""
-    return f"group {number}"
+def reason_of(groups: Groups, number: int) -> str:
+    """Return the reason that the marks of a group have, which those of other files have not."""
+    return f"group {number} of {groups.id}"
 
 
-def _overlap(one: Mark, other: Mark) -> bool:
-    return one.microphone == other.microphone and one.start < other.end and other.start < one.end
+def _any_overlap(span: MarkedSpan, others: Iterable[Mark | ReviewedSpan]) -> bool:
+    return any(
+        other.microphone == span.microphone and other.start < span.end and span.start < other.end
+        for other in others
+    )

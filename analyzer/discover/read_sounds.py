@@ -5,28 +5,23 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
-from hearthlog.analyzer.discover.sound_spans import (
-    FEATURE_FIELDS,
-    LABEL_FIELDS,
-    SoundSpans,
-    find_sounds,
-)
+from hearthlog.analyzer.discover.sound_spans import FrameLabels, SoundSpans, find_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 
-_FIELDS = {*FEATURE_FIELDS, *LABEL_FIELDS}
+_FIELDS = {"header.stamp", "values", "label", "confidence"}
 _NEVER = 1 << 62
 
 
@@ -48,6 +43,8 @@ class HomeSounds:
         On the disk.
     losses : list of str
         What cannot be read, a log in a line.
+    without : int
+        Logs that have no features, or no labels: they were thinned.
     """
 
     features: tuple[str, ...]
@@ -58,6 +55,7 @@ class HomeSounds:
     spans: SoundSpans
     descriptors: Float32
     losses: list[str]
+    without: int = 0
 
 
 @contextmanager
@@ -105,6 +103,7 @@ def read_sounds(
 class _Reader:
     def __init__(self, choice: str, start: int | None, end: int | None) -> None:
         self.losses: list[str] = []
+        self.without = 0
         self._choice = choice
         self._span = start, end
         self._features: tuple[str, ...] = ()
@@ -123,9 +122,22 @@ class _Reader:
             self._features = self._features or names
             if names != self._features:
                 raise LogError(f"{log}: has other features than the later logs; left out")
-            spans = find_sounds(features, labels).chosen(self._choice)
-            store.write(describe(features["values"], names, spans.first, spans.last).tobytes())
-            self._add(log, name, spans)
+            stamps, values = _by_time(features, "values")
+            spans = find_sounds(stamps, FrameLabels(*_by_time(labels, "label", "confidence")))
+            self._describe(log, name, spans.chosen(self._choice), values, store)
+        if not any(log == each for each in self._logs):
+            self.without += 1
+
+    def _describe(
+        self, log: Path, microphone: str, spans: SoundSpans, values: Float32, store: IO[bytes]
+    ) -> None:
+        described = describe(values, self._features, spans.first, spans.last)
+        is_finite: Bool = np.isfinite(described).min(axis=1, initial=True)
+        if not is_finite.all():
+            count = int((~is_finite).sum())
+            self.losses.append(f"{log}: {count} sounds with features that are no numbers; left out")
+        store.write(described[is_finite].tobytes())
+        self._add(log, microphone, spans.rows(is_finite))
 
     def _add(self, log: Path, microphone: str, spans: SoundSpans) -> None:
         if microphone not in self._microphones:
@@ -154,4 +166,18 @@ class _Reader:
             SoundSpans(*(np.concatenate(each) for each in zip(*spans, strict=True))),
             descriptors,
             [*losses, *self.losses],
+            self.without,
         )
+
+
+def _by_time(columns: Columns, *fields: str) -> tuple[Any, ...]:
+    """Return the stamps of messages and some of their fields, in the order of the stamps.
+
+    In logs that were joined, frames begin anew, and where a clock was set back, times do.
+    """
+    stamps = columns["header.stamp"]
+    values = [stamps, *(columns[name] for name in fields)]
+    if (np.diff(stamps) >= 0).all():
+        return tuple(values)
+    order = np.argsort(stamps, kind="stable")
+    return tuple(each[order] for each in values)

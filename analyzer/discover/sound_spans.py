@@ -7,17 +7,35 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.spans import ranges
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.schemas.arrays import Bool, Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns
 
 ALL, UNSURE, NOT_KNOWN = CHOICES = ("all", "unsure", "unknown")
-LABEL_FIELDS = ("frame", "label", "confidence")
-FEATURE_FIELDS = ("header.stamp", "frame", "values")
-_PAUSE_FRAMES = 2  # that a sound may have within it
-_LEAST_FRAMES = 4
-_BEFORE = np.int64(-1 << 62)  # any frame
+# A sound may have two frames of silence within it, and has four frames; stamps follow a clock.
+_PAUSE = 3 * FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2
+_LEAST = 3 * FRAME_NANOSECONDS - FRAME_NANOSECONDS // 2
+_BEFORE = np.int64(-1 << 62)  # any time
 _UNSURE_CONFIDENCE = 0.5  # as of the clips of what a model is unsure of
+
+
+class FrameLabels(NamedTuple):
+    """Labels of frames.
+
+    Attributes
+    ----------
+    stamps : np.ndarray [shape=(n,)], int64
+        Ascending, in nanoseconds of UTC.
+    labels : np.ndarray [shape=(n,)] of str
+    confidence : np.ndarray [shape=(n,)], float32
+    """
+
+    stamps: Int64
+    labels: NDArray[np.object_]
+    confidence: Float32
+
+    def rows(self, rows: Bool) -> "FrameLabels":
+        """Return some of the labels."""
+        return FrameLabels(self.stamps[rows], self.labels[rows], self.confidence[rows])
 
 
 class SoundSpans(NamedTuple):
@@ -49,53 +67,49 @@ class SoundSpans(NamedTuple):
         keep = self.labels == UNKNOWN
         if choice == UNSURE:
             keep |= self.confidence < _UNSURE_CONFIDENCE
+        return self.rows(keep)
+
+    def rows(self, rows: Bool) -> "SoundSpans":
+        """Return some of the sounds."""
         return SoundSpans(
-            self.starts[keep],
-            self.ends[keep],
-            self.first[keep],
-            self.last[keep],
-            self.labels[keep],
-            self.confidence[keep],
+            self.starts[rows],
+            self.ends[rows],
+            self.first[rows],
+            self.last[rows],
+            self.labels[rows],
+            self.confidence[rows],
         )
 
 
-def find_sounds(features: Columns, labels: Columns) -> SoundSpans:
+def find_sounds(stamps: Int64, labels: FrameLabels) -> SoundSpans:
     """Find the sounds of a log: runs of labels other than silence.
 
     Parameters
     ----------
-    features : Columns
-        Of a microphone, with `FEATURE_FIELDS`, in the order of their frames.
-    labels : Columns
-        Of the same, with `LABEL_FIELDS`. Frames without features are left out.
+    stamps : np.ndarray [shape=(m,)], int64
+        Of the frames that have features, ascending.
+    labels : FrameLabels
+        Those of frames without features are left out.
     """
-    heard = labels["label"] != SILENCE
-    frames, rows = labels["frame"][heard].astype(np.int64), _rows(features, labels, heard)
-    there = rows >= 0
-    frames, rows = frames[there], rows[there]
-    first = np.flatnonzero(np.diff(frames, prepend=_BEFORE) > _PAUSE_FRAMES + 1)
-    counts = np.diff(np.append(first, len(frames)))
-    enough = frames[first + counts - 1] - frames[first] + 1 >= _LEAST_FRAMES
+    heard = labels.rows(labels.labels != SILENCE)
+    rows = np.minimum(np.searchsorted(stamps, heard.stamps), max(len(stamps) - 1, 0))
+    there = stamps[rows] == heard.stamps if len(stamps) else np.zeros(len(rows), np.bool_)
+    heard, rows = heard.rows(there), rows[there]
+    first = np.flatnonzero(np.diff(heard.stamps, prepend=_BEFORE) > _PAUSE)
+    counts = np.diff(np.append(first, len(rows)))
+    enough = heard.stamps[first + counts - 1] - heard.stamps[first] >= _LEAST
     first, counts = first[enough], counts[enough]
-    begin, end = rows[first], rows[first + counts - 1]
     sound, inside = ranges(first, counts)
-    stamps = features["header.stamp"]
-    sums = np.bincount(sound, labels["confidence"][heard][there][inside], len(first))
+    begin, end = rows[first], rows[first + counts - 1]
+    sums = np.bincount(sound, heard.confidence[inside], len(first))
     return SoundSpans(
         stamps[begin],
         stamps[end] + FRAME_NANOSECONDS,
-        begin,
-        end + 1,
-        _most_frequent(labels["label"][heard][there][inside], sound, len(first)),
+        begin.astype(np.int64),
+        end.astype(np.int64) + 1,
+        _most_frequent(heard.labels[inside], sound, len(first)),
         sums / counts,
     )
-
-
-def _rows(features: Columns, labels: Columns, heard: Bool) -> Int64:
-    """Return the row of the features of each frame that is heard; -1 where there are none."""
-    known, frames = features["frame"], labels["frame"][heard]
-    rows = np.minimum(np.searchsorted(known, frames), len(known) - 1)
-    return np.where(known[rows] == frames, rows, -1).astype(np.int64)
 
 
 def _most_frequent(labels: NDArray[Any], sound: Int64, count: int) -> NDArray[np.str_]:

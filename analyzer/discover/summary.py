@@ -132,6 +132,8 @@ def _example(sounds: HomeSounds, row: int) -> Example:
 
 
 def _typical_distance(points: Float64) -> float:
+    if not len(points):
+        return 0.0
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 

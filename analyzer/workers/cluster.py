@@ -242,6 +242,7 @@ class Cluster:
     async def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
         """Run a task, again if Dask drops it, or if all workers that may run it have left."""
         from distributed import KilledWorker  # noqa: PLC0415  part of the extra `cluster`
+        from distributed.comm.core import CommClosedError  # noqa: PLC0415
 
         with suppress(KilledWorker):
             for _ in range(_LOSSES):
@@ -249,7 +250,7 @@ class Cluster:
                 allowed = list(self._members.threads)
                 try:
                     return await self._attempt(function, args, allowed)
-                except CancelledError:
+                except (CancelledError, CommClosedError):
                     self._sent.clear()
                     await asyncio.sleep(_LOOK_SECONDS)  # for a look, if the scheduler is gone
         raise WorkerError(f"the task lost its worker {_LOSSES} times: killed, or out of memory")

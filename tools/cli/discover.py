@@ -1,6 +1,7 @@
 """`hearthlog discover`: the sounds that recur in a home, and what they are called."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from shlex import quote
@@ -58,7 +59,7 @@ def discover(
     Exit status 3: a log is damaged, unfinished or of other features; the others were used.
     """
     from hearthlog.analyzer.discover.discover import discover as find_groups
-    from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
+    from hearthlog.analyzer.discover.groups_file import load_groups, locked_groups, save_groups
     from hearthlog.analyzer.discover.read_sounds import read_sounds
     from hearthlog.analyzer.discover.sound_spans import CHOICES
     from hearthlog.analyzer.discover.summary import summarise
@@ -69,25 +70,26 @@ def discover(
         wrong_use(f"--of {of}: it is one of {', '.join(CHOICES)}")
     first, last = parse_span(start, end)
     names, who = _names(name or []), reviewer_name(reviewer)
-    file = groups or _default_file(logs)
-    known = load_groups(file)
     home = find_home_logs(logs)
+    every = [entry.path for entry in home.between(0, 1 << 62)]
     zone = home_zone(timezone, home.records())
-    with (
-        share_done("reading what was heard") as progress,
-        read_sounds(home, of, first, last, progress) as sounds,
-    ):
-        found, rows, points = find_groups(sounds, known, least)
-        _check_numbers(found, [*names, *(undo or [])])
-        found = _undo(found, [entry.path for entry in home.between(0, 1 << 62)], undo or [])
-        found = _name(found, sounds, rows, names, who)
-        save_groups(found, file)
-        summaries = summarise(sounds, found, rows, points, zone)
-        total = len(rows)
+    file = groups or _default_file(logs)
+    with locked_groups(file):
+        known = _undo(load_groups(file), file, every, undo or [])
+        with (
+            share_done("reading what was heard") as progress,
+            read_sounds(home, of, first, last, progress) as sounds,
+        ):
+            found, rows, points = find_groups(sounds, known, least)
+            _check_numbers(found, names)
+            save_groups(found, file)  # before there are marks of it
+            found = _name(found, every, sounds, rows, names, who)
+            save_groups(found, file)
+            summaries = summarise(sounds, found, rows, points, zone)
     if as_json:
-        print_json(_as_json(summaries, total, file, zone))
+        print_json(_as_json(summaries, len(rows), file, zone))
     else:
-        _print(summaries, total, zone)
+        _print(summaries, len(rows), sounds.without, zone)
         _tell_next(summaries, logs)
     end_with_warnings(sounds.losses)
 
@@ -96,7 +98,7 @@ def _default_file(logs: Sequence[Path]) -> Path:
     from hearthlog.analyzer.discover.groups_file import GROUPS
 
     if len(logs) > 1 or not logs[0].is_dir():
-        wrong_use("--groups: say where the groups are kept, for these are several logs")
+        wrong_use("--groups: say in which file the groups are kept, where LOGS is no single folder")
     return logs[0] / GROUPS
 
 
@@ -109,38 +111,56 @@ def _names(given: Sequence[str]) -> dict[int, str]:
     for text in given:
         group, _, label = text.partition("=")
         label = spelt(label)
-        if not group.strip().isdecimal() or not CLASS_NAME.fullmatch(label) or label == SILENCE:
+        is_number = re.fullmatch(r" *[0-9]{1,9} *", group)
+        if not is_number or not CLASS_NAME.fullmatch(label) or label == SILENCE:
             wrong_use(f"--name {text[:64]!r}: say the number of a group and a class, as 3=doorbell")
+        if int(group) in names:
+            wrong_use(f"--name {text[:64]!r}: group {int(group)} has another name already")
         names[int(group)] = label
     return names
 
 
-def _check_numbers(groups: "Groups", numbers: Sequence[int]) -> None:
+def _check_numbers(groups: "Groups | None", numbers: Iterable[int]) -> None:
     from hearthlog.analyzer.errors import DataError
 
     for each in numbers:
-        if each not in groups.numbers:
+        if groups is None or each not in groups.numbers:
             raise DataError(f"there is no group {each}; `hearthlog discover LOGS` lists them")
 
 
-def _undo(groups: "Groups", logs: Sequence[Path], numbers: Sequence[int]) -> "Groups":
-    from hearthlog.analyzer.discover.naming import unmark_group
+def _undo(
+    groups: "Groups | None", file: Path, logs: Sequence[Path], numbers: Sequence[int]
+) -> "Groups | None":
+    from hearthlog.analyzer.discover.groups_file import save_groups
+    from hearthlog.analyzer.discover.naming import reason_of, unmark_group
 
+    _check_numbers(groups, numbers)
+    if groups is None:
+        return None
     for each in numbers:
-        tell(f"group {each}: {number(unmark_group(logs, each), 'mark')} taken back")
+        count = unmark_group(logs, reason_of(groups, each))
+        tell(f"group {each}: {number(count, 'mark')} taken back")
         groups = _named(groups, each, "")
+        save_groups(groups, file)
     return groups
 
 
 def _name(
-    groups: "Groups", sounds: "HomeSounds", of: "Int64", names: dict[int, str], reviewer: str
+    groups: "Groups",
+    logs: Sequence[Path],
+    sounds: "HomeSounds",
+    of: "Int64",
+    names: dict[int, str],
+    reviewer: str,
 ) -> "Groups":
-    from hearthlog.analyzer.discover.naming import mark_group
+    from hearthlog.analyzer.discover.naming import mark_group, reason_of
 
     for each, label in names.items():
         rows = (of == groups.numbers.tolist().index(each)).nonzero()[0]
-        made, left = mark_group(sounds, rows, each, label, reviewer)
-        more = f"; {left} have a mark of somebody already" if left else ""
+        made, left = mark_group(
+            logs, sounds, rows, reason=reason_of(groups, each), label=label, reviewer=reviewer
+        )
+        more = f"; {left} are marked or looked at by somebody already" if left else ""
         tell(f"group {each}: {number(made, 'mark')} of {label}{more}")
         groups = _named(groups, each, label)
     return groups
@@ -151,7 +171,7 @@ def _named(groups: "Groups", group: int, label: str) -> "Groups":
     return replace(groups, names=[*groups.names[:row], label, *groups.names[row + 1 :]])
 
 
-def _print(summaries: "Sequence[GroupSummary]", total: int, zone: "tzinfo") -> None:
+def _print(summaries: "Sequence[GroupSummary]", total: int, without: int, zone: "tzinfo") -> None:
     from hearthlog.analyzer.discover.summary import usual_hours
 
     head = ("group", "name", "heard as", "listen to", "times", "days", "hours", "seconds", "alike")
@@ -172,6 +192,8 @@ def _print(summaries: "Sequence[GroupSummary]", total: int, zone: "tzinfo") -> N
     print_table(head, rows, words=4)
     grouped = sum(each.times for each in summaries)
     print(f"{number(total, 'sound')}, of which {grouped} recur in {number(len(rows), 'group')}")
+    if without:
+        print(f"{number(without, 'log')} without features and labels")
 
 
 def _place(summary: "GroupSummary", zone: "tzinfo") -> str:

@@ -85,8 +85,12 @@ def main() -> None:
 
 def _wanted_verbs() -> Iterable[str]:
     """Return the verb of the command line; all where it has none, as for help and completion."""
-    words = [word.replace("-", "_") for word in sys.argv[1:] if not word.startswith("-")]
-    return words[:1] if words and words[0] in VERBS else VERBS
+    for word in sys.argv[1:]:
+        if word.replace("-", "_") in VERBS:
+            return [word.replace("-", "_")]
+        if word not in {"--debug", "--version"}:
+            break
+    return VERBS
 
 
 def _status_of(step: Callable[[], Any]) -> str | int | None:

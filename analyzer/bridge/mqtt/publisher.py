@@ -59,7 +59,8 @@ class MqttPublisher:
         self._home = home
         self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
-        self._switches: tuple[list[str], list[str]] = [], []  # and of which no more are told
+        # Those that there are switches of, and those of which no more.
+        self._switches: tuple[list[str], list[str]] | None = None
         self._held = HeldValues(topics)
         # Events that were not told of yet.
         self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)
