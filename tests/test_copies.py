@@ -73,6 +73,17 @@ def segments(folder):
     return read["header.stamp"], read["header.stamp"] + read["duration"]
 
 
+def test_logs_that_were_thinned_to_their_labels_are_copied(recording, tmp_path):
+    thinned = tmp_path / "thinned"
+    for log in logs_in(recording):
+        copy = thinned / log.relative_to(recording)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        thin_log(log, copy, 3)
+    copy_logs(thinned, tmp_path / "month", 2, 3 * MINUTE)
+    before, after = (segments(folder)[0] for folder in (thinned, tmp_path / "month"))
+    assert after.tolist() == [*before, *(before + 3 * MINUTE * NANOSECONDS)]
+
+
 def is_sound(capfd, folder):
     done = run(capfd, "doctor", folder)
     assert done.returncode == 0, done.stderr + done.stdout
