@@ -6,8 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
+
+pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+
+import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recurring import RECURRING, names_of, record_recurring
