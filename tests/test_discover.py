@@ -20,7 +20,7 @@ from hearthlog.analyzer.discover import read_sounds as read_sounds_module
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
 from hearthlog.analyzer.discover.discover import discover
 from hearthlog.analyzer.discover.group_spans import group_spans
-from hearthlog.analyzer.discover.groups import NO_GROUP
+from hearthlog.analyzer.discover.groups import NO_GROUP, add_groups, make_space
 from hearthlog.analyzer.discover.groups_file import GROUPS, load_groups, save_groups
 from hearthlog.analyzer.discover.read_sounds import read_sounds
 from hearthlog.analyzer.discover.summary import usual_hours
@@ -30,7 +30,9 @@ from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.bench.recurring_scene import OTHER
 
@@ -209,6 +211,27 @@ def test_logs_that_were_joined_have_their_sounds_where_they_were(home, hearthlog
         with read_sounds(find_home_logs([folder]), "all") as sounds:
             spans.append(sorted(zip(sounds.spans.starts, sounds.spans.ends, strict=True)))
     assert spans[0] == spans[1]
+
+
+def test_sounds_are_read_in_the_order_of_time_where_a_clock_was_set_back():
+    stamps = np.array([50, 60, 10, 20])
+    fields = {"header.stamp": stamps, "label": np.array(list("cdab"), object)}
+    columns = Columns("/mic/label", message_types.LABEL, {}, stamps, stamps, stamps, fields)
+    times, labels = read_sounds_module._by_time(columns, "label")
+    assert times.tolist() == [10, 20, 50, 60]
+    assert labels.tolist() == list("abcd")
+
+
+def test_what_lies_about_a_known_group_is_no_new_one():
+    rng = np.random.default_rng(0)
+    near, far = rng.normal(0, 1, (120, 3)), rng.normal(40, 1, (60, 3))
+    points = np.concatenate([near, far])
+    space = make_space(("a",), points.astype(np.float32))
+    of = np.zeros(len(points), np.int64)
+    of[100:120] = NO_GROUP  # the others of the first cluster are known
+    assert len(add_groups(space, points, of).numbers) == 0
+    of[:120] = NO_GROUP
+    assert len(add_groups(space, points, of).numbers) == 1
 
 
 def test_features_that_are_no_numbers_are_left_out_and_said(home, monkeypatch):

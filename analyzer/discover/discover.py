@@ -3,7 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.discover.groups import LEAST, NO_GROUP, Groups, add_groups, make_space
+from hearthlog.analyzer.discover.groups import (
+    LEAST,
+    NO_GROUP,
+    Groups,
+    add_groups,
+    identified,
+    make_space,
+)
 from hearthlog.analyzer.discover.read_sounds import HomeSounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.arrays import Float64, Int64
@@ -46,6 +53,7 @@ def discover(
             f"the groups are of {len(groups.features)} features, the logs have "
             f"{len(sounds.features)} others; name another file with --groups"
         )
+    is_new = groups is None
     if groups is None:
         if count < 2 * least:
             raise DataError(f"{count} sounds are too few to group: it takes {2 * least}")
@@ -61,6 +69,7 @@ def discover(
     of = groups.find(points)
     drawn = _drawn(sounds, np.arange(count), _MOST)
     groups = add_groups(groups, points[drawn], of[drawn], least)
+    groups = identified(groups) if is_new else groups
     rest = of == NO_GROUP
     of[rest] = groups.find(points[rest])
     return groups, of, points

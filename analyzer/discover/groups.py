@@ -124,7 +124,7 @@ def add_groups(groups: Groups, points: Float64, of: Int64, least: int = LEAST) -
     from sklearn.cluster import HDBSCAN  # noqa: PLC0415
 
     if len(points) < max(2 * least, _CLOSE + 1):
-        return groups if groups.id else replace(groups, id=_digest(groups))
+        return groups
     clusters = HDBSCAN(min_cluster_size=least, min_samples=_CLOSE, copy=True)
     labels = clusters.fit_predict(points)
     sizes = np.bincount(labels[labels >= 0])
@@ -133,12 +133,14 @@ def add_groups(groups: Groups, points: Float64, of: Int64, least: int = LEAST) -
         new = own & (of == NO_GROUP)
         if 2 * new.sum() > own.sum() and new.sum() >= least and len(groups.numbers) < MOST_GROUPS:
             groups = _add(groups, points[new])
-    return groups if groups.id else replace(groups, id=_digest(groups))
+    return groups
 
 
-def _digest(groups: Groups) -> str:
+def identified(groups: Groups) -> Groups:
+    """Give groups that were made now an id, which others have only if they are the same."""
     arrays = groups.mean, groups.scale, groups.axes, groups.examples, groups.of
-    return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()[:8]
+    digest = hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
+    return replace(groups, id=digest[:8])
 
 
 def _add(groups: Groups, points: Float64) -> Groups:

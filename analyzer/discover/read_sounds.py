@@ -27,13 +27,14 @@ _NEVER = 1 << 62
 
 @dataclass(frozen=True)
 class HomeSounds:
-    """Sounds of a home, in the order of their logs and of time.
+    """Sounds of a home, in the order of `logs`, and in each of time.
 
     Attributes
     ----------
     features : tuple of str
         Names of the features that they are described by.
     logs : list of Path
+        The last one first; once for each of its microphones.
     microphones : list of str
     log, microphone : np.ndarray [shape=(n,)], int64
         Of each sound: where it is in these lists.
@@ -125,7 +126,7 @@ class _Reader:
             stamps, values = _by_time(features, "values")
             spans = find_sounds(stamps, FrameLabels(*_by_time(labels, "label", "confidence")))
             self._describe(log, name, spans.chosen(self._choice), values, store)
-        if not any(log == each for each in self._logs):
+        if log not in self._logs:
             self.without += 1
 
     def _describe(

@@ -50,8 +50,6 @@ _FIELDS = {
     message_types.MARK: (*_SPAN, *_ORIGIN, "reason"),
     message_types.REVIEWED: ("header.stamp", "duration", *_ORIGIN, "chosen"),
 }
-
-
 _OWN_TEXTS = {
     message_types.SEGMENT: ("label",),
     message_types.MARK: ("label", "reason"),
@@ -75,7 +73,7 @@ class Mark(NamedTuple):
     corrects : str
         The labelling that it corrects: `live`, or the name of a model; empty if unknown.
     reason : str
-        Why, of a mark that was made with others, such as `group 3`; else empty.
+        Of a mark that was made with others, such as `group 3 of 5b4e0d1c`; else empty.
     """
 
     microphone: str
