@@ -13,7 +13,7 @@ from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.rooms import empty_room, in_room, reverberated, steady_noise
 from hearthlog.analyzer.training.scenario import LABELS, Scenario, load_scenario
-from hearthlog.analyzer.training.svm_method import ROOM, _spread_over_classes
+from hearthlog.analyzer.training.svm_method import ROOM, spread_over_classes
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import FloorTracker
@@ -241,4 +241,4 @@ def test_of_more_windows_than_can_be_learned_from_small_classes_are_kept_whole(t
 
 def chosen_classes(examples, most):
     _, target, weight = examples.windows(slice(None))
-    return target[_spread_over_classes(target, weight, most)]
+    return target[spread_over_classes(target, weight, most)]

@@ -17,6 +17,7 @@ from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.rbf_distances import in_steps
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
+from hearthlog.models.features.network import INPUTS
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 
 _SEED = 20_261_122
@@ -90,7 +91,7 @@ class SvmMethod(Method):
         inputs, target, weight = examples.windows(seen)
         remembered = np.arange(-len(inputs), 0) + len(examples.more_target)
         if len(inputs) > self.most_windows:
-            kept = _spread_over_classes(target, weight, self.most_windows)
+            kept = spread_over_classes(target, weight, self.most_windows)
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
             remembered = remembered[kept]
         inputs = rounded(inputs)
@@ -255,8 +256,22 @@ class SvmMethod(Method):
         )
 
 
-def _spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
-    """Choose windows at random, those of most weight first, but fewer of the large classes."""
+def spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
+    """Choose windows at random, those of most weight first, but fewer of the large classes.
+
+    Parameters
+    ----------
+    target : np.ndarray [shape=(n,)], intp
+        Their classes.
+    weight : np.ndarray [shape=(n,)], float64
+    most : int
+        How many.
+
+    Returns
+    -------
+    np.ndarray [shape=(most,)], intp
+        Their places.
+    """
     shuffled = np.random.default_rng(_SEED).permutation(len(target))
     shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
     order = np.argsort(target[shuffled], kind="stable")
@@ -383,3 +398,14 @@ ROOM = SvmMethod(
     gamma=0.5,
 )
 ROOM21 = replace(ROOM, name="room21", feature_set="auros21")
+
+
+def network_method(name: str) -> SvmMethod:
+    """Return the method that learns from the embeddings of a network.
+
+    Parameters
+    ----------
+    name : str
+        Of the network, and of the method.
+    """
+    return SvmMethod(name, name, INPUTS, SVM_RBF.name, copies=0, rooms=1, cost=4.0, gamma=0.5)

@@ -1,1 +1,1 @@
-"""Classifiers: what a model says of itself, kinds of models, and the one that is ours."""
+"""Classifiers: what a model says of itself, and kinds of models."""

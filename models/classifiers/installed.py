@@ -1,14 +1,18 @@
 """The kinds of classifiers that are installed."""
 
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.layers import LAYERS
+from hearthlog.models.classifiers.neighbours import NEIGHBOURS
+from hearthlog.models.classifiers.one_class import ONE_CLASS
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.trees import TREES
 from hearthlog.models.extensions import Extensions
 
 CLASSIFIERS = Extensions(
     "hearthlog.classifiers",
     ClassifierKind,  # type: ignore[type-abstract]
     "classifier kind",
-    [SVM_RBF],
+    [SVM_RBF, LAYERS, NEIGHBOURS, ONE_CLASS, TREES],
 )
 
 

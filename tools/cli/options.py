@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 _LAST = (1 << 63) - 1  # log time
 
 METHOD = "room"  # the default one; what has it takes long to import
-METHODS = "How to learn: room, room21 (the 21 features of auros21), bands, or paper."
+METHODS = (
+    "How to learn: room, room21 (the 21 features of auros21), bands, or paper; or the inputs of "
+    "room with logistic, perceptron, neighbours, forest, extra-trees, boosting, or one-class."
+)
 
 
 def log_location(text: str) -> Path:
@@ -149,6 +152,19 @@ def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | No
     if first is not None and last is not None and first >= last:
         wrong_use(f"--end {end} is not after --start {start}")
     return first, last
+
+
+def scenario_files(given: list[str] | None) -> dict[str, Path]:
+    """Read values of the option `--scenario`: the model files by the names of the scenarios."""
+    files: dict[str, Path] = {}
+    for text in given or ():
+        name, equals, file = text.partition("=")
+        if not (name and equals and file):
+            wrong_use(f"--scenario {text[:80]!r}: say NAME=FILE, the name and its model file")
+        if name in files:
+            wrong_use(f"--scenario {name}: is given twice; each scenario has one model")
+        files[name] = Path(file)
+    return files
 
 
 def chosen_method(name: str, **parameters: float | None) -> "Method":

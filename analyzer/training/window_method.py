@@ -1,0 +1,212 @@
+"""Methods that learn a classifier of scikit-learn from windows, and keep them in the model."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.training.method import Examples, Learned, Method
+from hearthlog.analyzer.training.svm_method import ROOM, rounded, spread_over_classes
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Float32, Float64, Indices
+
+_ROWS_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class WindowMethod(Method):
+    """A classifier of scikit-learn, whose classes are weighted against their number.
+
+    Attributes
+    ----------
+    most_windows : int
+        That are learned from, those that method `room` would learn from.
+    seed : int
+        Of what is drawn at random.
+    """
+
+    most_windows: int = 12_000
+    seed: int = 20_261_122
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose versions influence the result."""
+        return ("scikit-learn",)
+
+    def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> "LearnedMachine":
+        """Learn from some segments.
+
+        Parameters
+        ----------
+        examples : Examples
+        seen : np.ndarray [shape=(m,)], intp, or slice
+            Indices of the segments to learn from; all by default.
+        """
+        inputs, target, weight = examples.windows(seen)
+        if len(inputs) > self.most_windows:
+            kept = spread_over_classes(target, weight, self.most_windows)
+            inputs, target, weight = inputs[kept], target[kept], weight[kept]
+        classes, number = np.unique(target, return_inverse=True)
+        machine, arrays, parameters = self.learn(rounded(inputs), number, weight)
+        return LearnedMachine(machine, classes, arrays, parameters)
+
+    @abstractmethod
+    def learn(
+        self, inputs: Float32, target: Indices, weight: Float64
+    ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
+        """Learn from windows.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+        target : np.ndarray [shape=(n,)], intp
+            Numbers of their classes, of which none is without a window.
+        weight : np.ndarray [shape=(n,)], float64
+
+        Returns
+        -------
+        machine : Machine
+        arrays, parameters : dict
+            Those of a model.
+        """
+
+    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
+        """Return the windows that a model was learned from, before it was ever adapted.
+
+        Parameters
+        ----------
+        base : Model
+
+        Returns
+        -------
+        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
+        """
+        return base.arrays["learned_inputs"], base.arrays["learned_target"]
+
+    def memory(
+        self, remembered: tuple[Float32, Indices], learned: Learned
+    ) -> dict[str, NDArray[Any]]:
+        """Return arrays by which a model that was learned from `remembered` gives it again.
+
+        Parameters
+        ----------
+        remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
+        learned : Learned
+
+        Returns
+        -------
+        dict of str to np.ndarray
+            By name of the array.
+        """
+        del learned
+        return kept_windows(*remembered)
+
+
+def kept_windows(inputs: Float32, target: Indices) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `hearthlog.models.classifiers.learned_windows`.
+
+    Parameters
+    ----------
+    inputs : np.ndarray [shape=(n, width)], float32
+    target : np.ndarray [shape=(n,)], intp
+        Numbers of their classes.
+    """
+    return {"learned_inputs": inputs, "learned_target": target.astype(np.int64)}
+
+
+def balanced(target: Indices, weight: Float64) -> Float64:
+    """Weigh windows against the number of their class, as scikit-learn's `balanced`.
+
+    Parameters
+    ----------
+    target : np.ndarray [shape=(n,)], intp
+        Numbers of their classes.
+    weight : np.ndarray [shape=(n,)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+    """
+    counts = np.bincount(target)
+    share = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
+    weighted: Float64 = weight * share[target]
+    return weighted
+
+
+def as_room(kind: ClassifierKind) -> dict[str, Any]:
+    """Return the fields of a method with the inputs of method `room`.
+
+    Parameters
+    ----------
+    kind : ClassifierKind
+        That it learns.
+    """
+    return {
+        "feature_set": ROOM.feature_set,
+        "inputs": ROOM.inputs,
+        "kind": kind.name,
+        "copies": ROOM.copies,
+        "rooms": ROOM.rooms,
+        "gate": ROOM.gate,
+        "observation_weight": ROOM.observation_weight,
+    }
+
+
+class LearnedMachine:
+    """A classifier that decides with the code that will decide in the recorder.
+
+    Parameters
+    ----------
+    machine : Machine
+        Of the classes that were learned.
+    classes : np.ndarray [shape=(c,)], intp
+        Their numbers.
+    arrays : mapping of str to np.ndarray
+        Of a model.
+    parameters : mapping of str to value
+        The field `parameters` of its description.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        classes: Indices,
+        arrays: Mapping[str, NDArray[Any]],
+        parameters: Mapping[str, Any],
+    ) -> None:
+        self._machine = machine
+        self._classes = classes
+        self._arrays = arrays
+        self._parameters = parameters
+
+    def decide(self, inputs: Float32, classes: int) -> Float64:
+        """Return decision values.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+        classes : int
+            C, the number of all classes.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, C)], float64
+            -inf for a class that was not learned.
+        """
+        decision = np.full((len(inputs), classes), -np.inf)
+        for start in range(0, len(inputs), _ROWS_AT_ONCE):
+            rows = slice(start, start + _ROWS_AT_ONCE)
+            decision[rows, self._classes] = self._machine.decide(inputs[rows])[0]
+        return decision
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a model file; all classes were learned."""
+        return dict(self._arrays)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the values of the field `parameters` in the description of a model."""
+        return dict(self._parameters)

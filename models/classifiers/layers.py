@@ -1,0 +1,165 @@
+"""Logistic regression, and networks with one hidden layer: layers of weights."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from hearthlog.models.batch_invariant import aligned, rowwise_matmul
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
+from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.models.classifiers.scaler import Scaler, scaler_problem
+from hearthlog.schemas.arrays import Float32, Float64
+
+MOST_UNITS = 1024
+_WEIGHTS_AT_ONCE = 4096  # a product this small no BLAS divides among threads
+
+
+class LayersParameters(BaseModel):
+    """Parameters of layers: none, all is in their arrays."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+class LayersKind(ClassifierKind):
+    """Layers of weights; the arrays for C classes and h hidden units.
+
+    scaler_mean, scaler_scale : [shape=(width,)], float64
+        Mean and standard deviation of the inputs.
+    hidden_weights : [shape=(width, h)], float64, optional
+        Of scaled inputs; hidden units are rectified: what is negative is 0.
+    hidden_bias : [shape=(h,)], float64, optional
+    output_weights : [shape=(h, C)], float64
+        Of hidden units; of scaled inputs, with shape (width, C), where there are none.
+    output_bias : [shape=(C,)], float64
+    learned_inputs, learned_target : optional
+        As of `hearthlog.models.classifiers.learned_windows`.
+    """
+
+    name = "layers"
+    parameters = LayersParameters
+    arrays: Mapping[str, np.dtype[Any]] = {
+        "scaler_mean": np.dtype(np.float64),
+        "scaler_scale": np.dtype(np.float64),
+        "output_weights": np.dtype(np.float64),
+        "output_bias": np.dtype(np.float64),
+    }
+    optional: Mapping[str, np.dtype[Any]] = {
+        "hidden_weights": np.dtype(np.float64),
+        "hidden_bias": np.dtype(np.float64),
+        **LEARNED,
+    }
+
+    def shapes(
+        self, classes: int, width: int, arrays: Mapping[str, Array]
+    ) -> dict[str, tuple[int, ...]]:
+        """Return the shapes that the arrays of a model must have.
+
+        Parameters
+        ----------
+        classes, width : int
+            Number of classes, and of inputs.
+        arrays : mapping of str to np.ndarray
+            Those of the model, by name; they may be of any type and shape.
+
+        Returns
+        -------
+        dict of str to tuple of int
+            By name of the array; hidden units and learned windows only if there are any.
+        """
+        shapes: dict[str, tuple[int, ...]] = {
+            "scaler_mean": (width,),
+            "scaler_scale": (width,),
+            "output_weights": (width, classes),
+            "output_bias": (classes,),
+        }
+        if "hidden_bias" in arrays or "hidden_weights" in arrays:
+            units = arrays.get("hidden_bias", np.empty(0)).size
+            shapes["hidden_weights"], shapes["hidden_bias"] = (width, units), (units,)
+            shapes["output_weights"] = (units, classes)
+        return shapes | learned_shapes(width, arrays)
+
+    def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
+        """Return what is wrong with the arrays of a model; None if nothing is.
+
+        Parameters
+        ----------
+        classes : int
+            Number of classes.
+        arrays : mapping of str to np.ndarray
+            By name; of the right types and shapes, and finite.
+
+        Returns
+        -------
+        str or None
+            The rest of a sentence that begins with the file.
+        """
+        if not 1 <= len(arrays.get("hidden_bias", arrays["output_bias"])) <= MOST_UNITS:
+            return f"hidden_bias has no unit, or more than {MOST_UNITS}"
+        return scaler_problem(arrays) or target_problem("learned_target", classes, arrays)
+
+    def machine(self, model: Model) -> "LayersMachine":
+        """Prepare a model for inference."""
+        return LayersMachine(model.arrays)
+
+    def summary(self, model: Model) -> str:
+        """Return the number of weights, and of hidden units, in words."""
+        weights = [array.size for name, array in model.arrays.items() if name.endswith("_weights")]
+        hidden = len(model.arrays.get("hidden_bias", ()))
+        return f"{sum(weights)} weights" + (f", {hidden} hidden units" if hidden else "")
+
+
+LAYERS = LayersKind()
+
+
+class LayersMachine:
+    """Inference of one model, as scikit-learn's within 1e-5.
+
+    Parameters
+    ----------
+    arrays : mapping of str to np.ndarray
+        As of `LayersKind`.
+    """
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        self._scaled = Scaler(arrays)
+        self._output = _Layer(arrays["output_weights"], arrays["output_bias"])
+        self._hidden = None
+        if "hidden_bias" in arrays:
+            self._hidden = _Layer(arrays["hidden_weights"], arrays["hidden_bias"])
+
+    def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
+        """Compute decision values of windows.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+
+        Returns
+        -------
+        decisions : np.ndarray [shape=(n, C)], float64
+        novelty : np.ndarray [shape=(n,)], float64
+            NaN.
+        """
+        values = self._scaled(inputs)
+        if self._hidden is not None:
+            values = np.maximum(self._hidden(values), 0.0)
+        return self._output(values), np.full(len(inputs), np.nan)
+
+
+class _Layer:
+    """Rows times weights, plus a bias, so that a row does not depend on the others."""
+
+    def __init__(self, weights: NDArray[Any], bias: NDArray[Any]) -> None:
+        columns = max(_WEIGHTS_AT_ONCE // len(weights), 1)
+        cuts = range(columns, weights.shape[1], columns)
+        self._blocks = [aligned(block) for block in np.split(weights, cuts, axis=1)]
+        self._bias = bias
+
+    def __call__(self, rows: Float64) -> Float64:
+        products = [rowwise_matmul(rows, block) for block in self._blocks]
+        return np.concatenate(products, axis=1) + self._bias

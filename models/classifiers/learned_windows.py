@@ -1,0 +1,51 @@
+"""The windows that a model was learned from, which it keeps to be learned again in a home."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hearthlog.models.classifiers.model import Array
+
+LEARNED: Mapping[str, np.dtype[Any]] = {
+    "learned_inputs": np.dtype(np.float32),
+    "learned_target": np.dtype(np.int64),
+}
+
+
+def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays `LEARNED`; empty if a model keeps no windows.
+
+    Parameters
+    ----------
+    width : int
+        Number of inputs.
+    arrays : mapping of str to np.ndarray
+        Those of the model, by name; they may be of any type and shape.
+    """
+    inputs = arrays.get("learned_inputs", np.empty(0))
+    if not inputs.ndim or not len(inputs):
+        return {}
+    return {"learned_inputs": (len(inputs), width), "learned_target": (len(inputs),)}
+
+
+def target_problem(name: str, classes: int, arrays: Mapping[str, Array]) -> str | None:
+    """Return what is wrong with an array of classes; None if nothing is, or it is absent.
+
+    Parameters
+    ----------
+    name : str
+    classes : int
+        Number of classes.
+    arrays : mapping of str to np.ndarray
+        By name; of the right types and shapes, and finite.
+
+    Returns
+    -------
+    str or None
+        The rest of a sentence that begins with the file.
+    """
+    target = arrays.get(name, np.empty(0, np.int64))
+    if ((target < 0) | (target >= classes)).any():
+        return f"{name} has classes that the model has not"
+    return None

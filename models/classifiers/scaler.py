@@ -1,0 +1,44 @@
+"""Inputs in standard deviations from the mean, for the kinds of classifiers that need it."""
+
+from collections.abc import Mapping
+
+from hearthlog.models.classifiers.model import Array
+from hearthlog.schemas.arrays import Float32, Float64
+
+_SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
+
+
+class Scaler:
+    """Scales inputs as a model has it.
+
+    Parameters
+    ----------
+    arrays : mapping of str to np.ndarray
+        Among them scaler_mean and scaler_scale, both [shape=(width,)], float64.
+    """
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        self._mean = arrays["scaler_mean"]
+        self._scale = arrays["scaler_scale"]
+
+    def __call__(self, inputs: Float32) -> Float64:
+        """Scale inputs, of shape (n, width)."""
+        return (inputs - self._mean) / self._scale
+
+
+def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
+    """Return what is wrong with the scaler of a model; None if nothing is.
+
+    Parameters
+    ----------
+    arrays : mapping of str to np.ndarray
+        As of `Scaler`; of the right types and shapes, and finite.
+
+    Returns
+    -------
+    str or None
+        The rest of a sentence that begins with the file.
+    """
+    if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
+        return None
+    return "scaler_scale has values that are not positive"
