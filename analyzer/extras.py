@@ -5,6 +5,8 @@ _EXTRAS = {
     "rerun": "viewer",
     "rerun_cli": "viewer",
     "foxglove": "foxglove",
+    "onnx": "onnx",
+    "onnxruntime": "onnx",
     "paho": "bridge",
     "apprise": "bridge",
 } | dict.fromkeys(_CLUSTER, "cluster")

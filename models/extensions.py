@@ -7,6 +7,11 @@ from typing import Generic, Protocol, TypeVar
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.errors import HearthlogError
 
+_OF_EXAMPLES = {  # in `examples` of a clone of hearthlog, by distribution
+    "hearthlog-example": ("octaves", "nearest-mean", "nearest-octaves"),
+    "hearthlog-feature-sets": ("logmel", "plp", "rasta", "sai"),
+}
+
 
 class Named(Protocol):
     """Anything with a name."""
@@ -59,6 +64,27 @@ class Extensions(Generic[T]):
         theirs = {point.name for point in entry_points(group=self._group)}
         return [*self._ours, *sorted(theirs - self._ours.keys())]
 
+    def has(self, name: str) -> bool:
+        """Tell whether there is one of this name, without importing it.
+
+        Parameters
+        ----------
+        name : str
+        """
+        return name in self._loaded or bool(entry_points(group=self._group, name=name))
+
+    def distribution(self, name: str) -> str:
+        """Return the distribution that brings one of others, and its version; empty for ours.
+
+        Parameters
+        ----------
+        name : str
+            Of one that there is.
+        """
+        points = () if name in self._ours else entry_points(group=self._group, name=name)
+        names = [f"{p.dist.name} {p.dist.version}" for p in points if p.dist is not None]
+        return names[0] if names else ""
+
     def get(self, name: str) -> T:
         """Return an object by its name.
 
@@ -87,6 +113,15 @@ class Extensions(Generic[T]):
         if name not in self._loaded:
             installed = ", ".join(self.names())
             raise self._missing(
-                f"{self._word} {name[:64]!r} is not installed; there is {installed}"
+                f"{self._word} {name[:64]!r} is not installed; {_brought_by(name)}there is "
+                f"{installed}"
             )
         return self._loaded[name]
+
+
+def _brought_by(name: str) -> str:
+    """Say which distribution of ours brings a name, if one does."""
+    for distribution, names in _OF_EXAMPLES.items():
+        if name in names:
+            return f"distribution {distribution}, in examples of a clone of hearthlog, brings it; "
+    return ""

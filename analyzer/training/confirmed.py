@@ -43,7 +43,7 @@ class Candidates(NamedTuple):
     Attributes
     ----------
     recordings : list of Recording
-        A second each, labelled with the name of the class.
+        Of one length, labelled with the name of the class.
     target : np.ndarray [shape=(n,)], intp
         Their classes.
     """
@@ -52,7 +52,9 @@ class Candidates(NamedTuple):
     target: Indices
 
 
-def confirmed_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
+def confirmed_segments(
+    sound: HomeSound, classes: Sequence[str], segment_frames: int = SEGMENT_FRAMES
+) -> Candidates:
     """Cut out what was looked at, and not marked.
 
     Parameters
@@ -60,6 +62,8 @@ def confirmed_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
     sound : HomeSound
     classes : sequence of str
         Of the model; what was labelled otherwise is left out.
+    segment_frames : int
+        Length of the window of the feature set.
 
     Raises
     ------
@@ -73,12 +77,16 @@ def confirmed_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
         if labelling is not None and sound.values.shape[1]:
             spans = [(span.start, span.end) for span in reviewed if (span.corrects or LIVE) == name]
             target = _classes_of(sound, labelling, classes)
-            confirmed.append(_cut(sound, np.where(sound.inside(spans), target, -1), classes))
+            target = np.where(sound.inside(spans), target, -1)
+            confirmed.append(_cut(sound, target, classes, segment_frames))
     return _joined(confirmed)
 
 
 def labelled_segments(
-    sound: HomeSound, classes: Sequence[str], names: Collection[str]
+    sound: HomeSound,
+    classes: Sequence[str],
+    names: Collection[str],
+    segment_frames: int = SEGMENT_FRAMES,
 ) -> Candidates:
     """Cut out what was labelled as some classes, whether anyone has looked at it or not.
 
@@ -89,6 +97,8 @@ def labelled_segments(
         Of the model.
     names : collection of str
         Of the classes; of sound without labels all may be silence.
+    segment_frames : int
+        Length of the window of the feature set.
 
     Raises
     ------
@@ -103,7 +113,7 @@ def labelled_segments(
     else:  # the model will tell
         target = np.full(len(sound.stamps), classes.index(SILENCE) if SILENCE in classes else -1)
     own = [number for number, name in enumerate(classes) if name in names]
-    return _cut(sound, np.where(np.isin(target, own), target, -1), classes)
+    return _cut(sound, np.where(np.isin(target, own), target, -1), classes, segment_frames)
 
 
 def chosen(
@@ -174,7 +184,9 @@ def _classes_of(sound: HomeSound, labelling: Labelling, classes: Sequence[str]) 
     return np.where(inside, own[row], -1)
 
 
-def _cut(sound: HomeSound, target: Indices, classes: Sequence[str]) -> Candidates:
+def _cut(
+    sound: HomeSound, target: Indices, classes: Sequence[str], segment_frames: int
+) -> Candidates:
     """Cut segments by the class in their middle, silence by all of it; away from marks.
 
     -1 is no class, and in no segment.
@@ -182,12 +194,12 @@ def _cut(sound: HomeSound, target: Indices, classes: Sequence[str]) -> Candidate
     marks = [(mark.start, mark.end) for mark in sound.marks]
     away = ~sound.inside(marks, _ASIDE) & ~sound.inside(sound.drawn)
     silence = classes.index(SILENCE) if SILENCE in classes else -2
-    starts = np.arange(0, max(len(target) - SEGMENT_FRAMES + 1, 0), HOP_FRAMES)
-    frames = starts[:, np.newaxis] + np.arange(SEGMENT_FRAMES)
-    own = target[frames[:, SEGMENT_FRAMES // 2]]
+    starts = np.arange(0, max(len(target) - segment_frames + 1, 0), HOP_FRAMES)
+    frames = starts[:, np.newaxis] + np.arange(segment_frames)
+    own = target[frames[:, segment_frames // 2]]
     fit = (away[frames] & (target[frames] >= 0)).all(axis=1)
     fit &= (own != silence) | (target[frames] == silence).all(axis=1)
-    fit &= sound.frames[frames[:, -1]] - sound.frames[frames[:, 0]] == SEGMENT_FRAMES - 1
+    fit &= sound.frames[frames[:, -1]] - sound.frames[frames[:, 0]] == segment_frames - 1
     frames, own = frames[fit], own[fit]
     tried = [
         spread(np.flatnonzero(own == number), _MOST_SILENT if number == silence else _MOST_TRIED)
@@ -221,7 +233,7 @@ def _probabilities(
     features, inputs = classifier.feature_set, classifier.inputs
     segments = np.stack([recording.features for recording in recordings])
     floors = np.zeros((len(segments), features.bands))
-    places = window_places(SEGMENT_FRAMES, inputs.window_frames)
+    places = window_places(segments.shape[1], inputs.window_frames)
     quiet = np.zeros((len(segments), len(places)), bool)
     for row, recording in enumerate(recordings):
         if recording.floor is not None:

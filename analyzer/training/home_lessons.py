@@ -78,11 +78,11 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
     features = feature_set(model.description.feature_set)
     marked: list[Recording] = []
     candidates: list[Candidates] = []
-    counts = _Counts()
+    counts, window = _Counts(), features.window_frames
     for folder in folders:
         sounds = list(_counted(read_reviewed_sound(folder, features), counts))
         marked += marked_recordings(sounds, folder, features, model.description.gate)
-        candidates += [confirmed_segments(sound, model.classes) for sound in sounds]
+        candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
     scenario, notes, unlearned = _with_new_classes(marked, model, features)
     marked = [one for one in marked if one.label not in unlearned]
     notes += counts.notes()

@@ -99,7 +99,7 @@ def _labelled(log: Path, model: Model, names: Collection[str], length: int) -> I
                 begin = info.first_frame[1]
                 part = begin, begin + length
                 for sound in read_sound_of(log, features, {info.microphone}, part):
-                    yield labelled_segments(sound, model.classes, names)
+                    yield labelled_segments(sound, model.classes, names, features.window_frames)
 
 
 def _labelled_time(log: Path, names: Collection[str]) -> int:

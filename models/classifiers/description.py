@@ -14,6 +14,7 @@ from hearthlog.schemas.text import printable
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
 MOST_SPANS = 1000  # forty kilobytes
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
+MOST_FEATURES = 5000  # those of a network have 4097 at most
 FORMAT: Final = 5
 MOST_WEIGHT: Final = 10.0
 SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
@@ -171,6 +172,8 @@ class Description(_Record):
         Parameters of that kind.
     feature_set, feature_set_version, inputs : str, int, str
         Feature set of the classifier, and which of its inputs.
+    feature_set_sha256 : str
+        SHA-256 of the network whose values the features are; empty for other feature sets.
     method : str
         Method by which it was learned, and is adapted.
     label_frame : int
@@ -201,7 +204,8 @@ class Description(_Record):
     classes: Annotated[list[_ClassName], Field(min_length=2, max_length=MOST_CLASSES)]
     feature_set: _Text
     feature_set_version: Annotated[int, Field(ge=1, lt=1 << 31)]
-    feature_names: Annotated[list[_Text], Field(min_length=1, max_length=1000)]
+    feature_set_sha256: _Digest | Literal[""] = ""
+    feature_names: Annotated[list[_Text], Field(min_length=1, max_length=MOST_FEATURES)]
     inputs: _Text
     window_seconds: _Positive
     label_frame: Annotated[int, Field(ge=0, lt=1000)]

@@ -64,6 +64,8 @@ class FeatureSet:
     augmented : callable or None
         Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to what
         another microphone in another room would give. None if features cannot be changed so.
+    digest : str
+        SHA-256 of the file that computes the values, in hexadecimal; empty where it is code.
     """
 
     name: str
@@ -76,6 +78,7 @@ class FeatureSet:
     power: Callable[[NDArray[Any]], NDArray[Any]]
     band_powers: Callable[[Float32], Float64] | None = None
     augmented: Callable[[Float32, np.random.Generator], Float32] | None = None
+    digest: str = ""
 
     @property
     def width(self) -> int:

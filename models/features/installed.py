@@ -1,9 +1,17 @@
 """The feature sets that are installed."""
 
+from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
+from hearthlog.models.features.network import (
+    card_names,
+    has_card,
+    network_features,
+    network_folders,
+)
+from hearthlog.schemas.logs.feature_record import feature_entries
 
 DEFAULT = HOME33
 FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [HOME33, AUROS21])
@@ -15,11 +23,41 @@ def feature_set(name: str = DEFAULT.name) -> FeatureSet:
     Parameters
     ----------
     name : str
-        Such as "home33".
+        Such as "home33"; of ours, of another distribution, or of a network that has a card.
 
     Raises
     ------
     ModelError
-        If there is none of this name, or it cannot be imported.
+        If there is none of this name, or it cannot be imported, or its card says what cannot be.
     """
-    return FEATURE_SETS.get(name)
+    if is_network(name):
+        return network_features(name)
+    try:
+        return FEATURE_SETS.get(name)
+    except ModelError as error:
+        if FEATURE_SETS.has(name):
+            raise
+        networks = ", ".join(card_names()) or "none"
+        folder = network_folders()[0]
+        raise ModelError(f"{error}; networks with a card in {folder}: {networks}") from error
+
+
+def is_network(name: str) -> bool:
+    """Tell whether a name is that of a network, and not of a feature set that is installed.
+
+    Parameters
+    ----------
+    name : str
+    """
+    return not FEATURE_SETS.has(name) and has_card(name)
+
+
+def entries_of(features: FeatureSet) -> dict[str, str]:
+    """Return what the metadata record of a log says of its feature set.
+
+    Parameters
+    ----------
+    features : FeatureSet
+    """
+    source = "" if features.digest else FEATURE_SETS.distribution(features.name)
+    return feature_entries(features.name, features.version, features.digest, source)

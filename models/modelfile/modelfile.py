@@ -239,6 +239,12 @@ def _problem(description: Description) -> str | None:
             f"is for version {description.feature_set_version} of feature set {features.name}; "
             f"here is version {features.version}: train it anew"
         )
+    if description.feature_set_sha256 != features.digest:
+        digest = description.feature_set_sha256[:12]
+        return (
+            f"is for the network {features.name} with sha256 {digest}; here is "
+            f"{features.digest[:12]}: train it anew, or bring that network back"
+        )
     if len(description.feature_names) != features.width:
         count = len(description.feature_names)
         return f"names {count} features, which {description.feature_set} has not"

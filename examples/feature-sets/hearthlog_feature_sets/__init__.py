@@ -1,0 +1,1 @@
+"""Feature sets of other systems, added to hearthlog."""
