@@ -22,11 +22,15 @@ class Frames:
         Samples in full scale, -1 to 1.
     stamps : np.ndarray [shape=(n,)], int64
         Time of each frame's first sample in nanoseconds of UTC.
+    channels : np.ndarray [shape=(n, 800, c)], float32, or None
+        The same of all microphones of an array, of which `samples` is the first one; None of a
+        single microphone.
     """
 
     first: int
     samples: Float32
     stamps: Int64
+    channels: Float32 | None = None
 
 
 @dataclass(frozen=True)

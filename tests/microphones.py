@@ -50,13 +50,17 @@ class LabMicrophone:
         self.configure()
 
     def configure(self, rate: int = _RATE, ppm: float = 0.0, data: np.ndarray | None = None):
-        """Set what the next process to open the microphone finds; `data` is int16, mono."""
+        """Set what the next process to open the microphone finds.
+
+        `data` is int16, mono, or has an axis of channels.
+        """
         self._rate = rate * (1 + Fraction(str(ppm)) / 1_000_000)
         fields = f'type labmic rate {rate} ppm {float(ppm):.6f} ctl "{self._control}"'
         if data is not None:
             samples = self._folder / f"{self.device}.s16"
             _write_samples(samples, data)
             fields += f' data "{samples}"'
+            fields += f" channels {data.shape[1]}" if data.ndim == 2 else ""
         (self._folder / f"{self.device}.pcm").write_text(f"pcm.{self.device} {{ {fields} }}\n")
         self._write_configuration()
 
@@ -245,6 +249,5 @@ def _wait_for_server(daemon: subprocess.Popen, env: dict[str, str]):
 
 def _write_samples(path: Path, samples: np.ndarray):
     assert samples.dtype == np.int16
-    assert samples.ndim == 1
     assert samples.size
     path.write_bytes(samples.astype("<i2").tobytes())

@@ -8,8 +8,9 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import OK, Event, Frames, SourceHealth
-from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
+from hearthlog.recorder.events import OK, Event, SourceHealth
+from hearthlog.recorder.sources.decoding import audio_seconds, check_channels, read_audio
+from hearthlog.recorder.sources.framing import frames_of
 from hearthlog.recorder.sources.wall_clock import check_times
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
@@ -32,6 +33,8 @@ class FileSource:
         Time of the first sample in nanoseconds of UTC.
     realtime : bool
         Whether to yield each frame only once as much time has passed since the first one.
+    channels : int or None
+        Of an array, which the files must have; None: their channels are averaged.
     progress : callable
         Told the share of the sound that was read, 0 to 1.
 
@@ -42,8 +45,8 @@ class FileSource:
     Raises
     ------
     SourceError
-        If one of the files is missing, is not audio, holds none, or has a sample rate that cannot
-        be recorded; if a log cannot have their times.
+        If one of the files is missing, is not audio, holds none, has a sample rate that cannot be
+        recorded, or other channels than the array; if a log cannot have their times.
     """
 
     def __init__(
@@ -52,14 +55,18 @@ class FileSource:
         start: int,
         *,
         realtime: bool = False,
+        channels: int | None = None,
         progress: Progress = ignore_progress,
     ) -> None:
+        for path in paths:
+            check_channels(path, channels)
         self._seconds = sum(audio_seconds(path) for path in paths)
         check_times(start, start + int(self._seconds * NANOSECONDS))
         self.device = _name(paths)
         self._paths = paths
         self._start = start
         self.realtime = realtime
+        self._channels = channels
         self._progress = progress
 
     def events(self, stop: Flag) -> Iterator[Event]:
@@ -83,7 +90,7 @@ class FileSource:
         began = time.monotonic()
         first = 0
         for samples in self._frames():
-            frames = Frames(first, samples, self._stamps(first, len(samples)))
+            frames = frames_of(first, samples, self._stamps(first, len(samples)))
             if self.realtime:
                 due = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
                 stop.wait(max(due - time.monotonic(), 0.0))
@@ -104,17 +111,18 @@ class FileSource:
     def _frames(self) -> Iterator[Float32]:
         """Yield blocks of frames whose number divides the interval of the health reports."""
         size = (_REALTIME_FRAMES if self.realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
-        held = np.empty(0, np.float32)
+        shape = () if self._channels is None else (self._channels,)
+        held = np.empty((0, *shape), np.float32)
         for path in self._paths:
-            for block in read_audio(path):
+            for block in read_audio(path, channels=self._channels):
                 held = np.concatenate([held, block])
                 whole = len(held) - len(held) % size
                 for start in range(0, whole, size):
-                    yield held[start : start + size].reshape(-1, FRAME_SAMPLES)
+                    yield held[start : start + size].reshape(-1, FRAME_SAMPLES, *shape)
                 held = held[whole:]
         rest = len(held) - len(held) % FRAME_SAMPLES
         if rest:
-            yield held[:rest].reshape(-1, FRAME_SAMPLES)
+            yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
 
 
 def _name(paths: Sequence[Path]) -> str:

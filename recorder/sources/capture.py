@@ -4,7 +4,7 @@ PortAudio hangs inside the process when a device vanishes, so this process can b
 moment. It imports no more than PortAudio needs and computes nothing.
 
 It writes one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and
-the samples that it announces (int16, one channel).
+the samples that it announces (int16, interleaved if it is an array of microphones).
 """
 
 import json
@@ -14,6 +14,7 @@ import signal
 import struct
 import sys
 import time
+from array import array
 from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any
@@ -21,8 +22,8 @@ from typing import Any
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.sources.devices import Device, find_device, list_devices, load_portaudio
 
-# index of the first sample, samples, flags of PortAudio, time of the first sample by the ADC
-# (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC (s)
+# index of the first sample, samples of each channel, flags of PortAudio, time of the first sample
+# by the ADC (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC (s)
 BLOCK = struct.Struct("<QIIdd")
 
 _PREFERRED_RATE = 16_000
@@ -40,13 +41,14 @@ class CaptureFormat:
     rate: int
     stale_seconds: float = 3.0  # without a block, after which none will come
     lost_reason: str = ""  # why samples are in no block; empty: the recorder was too slow
+    channels: int | None = None  # of an array; None: of a single microphone
 
 
 def main() -> None:
     """Capture from the device named by the first argument, until killed or without a parent.
 
-    Without an argument, list the devices. A second argument: take no other device whose name
-    contains this one.
+    Without an argument, list the devices. The second one is the number of channels of an array, or
+    0. A third one: take no other device whose name contains this one.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
@@ -58,8 +60,8 @@ def main() -> None:
         if len(sys.argv) == 1:
             output.write(json.dumps([asdict(device) for device in devices]).encode())
         else:
-            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 2)
-            _capture(sounddevice, device, output)
+            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 3)
+            _capture(sounddevice, device, int(sys.argv[2]) or None, output)
     except SourceError as error:
         answer = {"error": str(error), "device": isinstance(error, DeviceError)}
         output.write(json.dumps(answer).encode() + b"\n")
@@ -69,7 +71,7 @@ def main() -> None:
     os._exit(0)
 
 
-def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
+def _capture(sounddevice: ModuleType, device: Device, places: int | None, output: Any) -> None:
     blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(_QUEUE_BLOCKS)
     index = 0
 
@@ -86,10 +88,9 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
         if not blocks.full():  # what is dropped here shows in the next index
             blocks.put_nowait((head, bytes(samples)))
 
-    stream, rate, channels = _open(sounddevice, device, enqueue)
-    output.write(
-        json.dumps(asdict(CaptureFormat(device.name, device.identity, rate))).encode() + b"\n"
-    )
+    stream, rate, channels = _open(sounddevice, device, places or 1, enqueue)
+    answer = CaptureFormat(device.name, device.identity, rate, channels=places)
+    output.write(json.dumps(asdict(answer)).encode() + b"\n")
     stream.start()
     parent = os.getppid()
     while os.getppid() == parent:
@@ -98,14 +99,21 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
         except queue.Empty:
             continue
         output.write(head)
-        output.write(_first_channel(samples, channels))
+        output.write(_first_channels(samples, channels, places or 1))
 
 
-def _open(sounddevice: ModuleType, device: Device, callback: Any) -> tuple[Any, int, int]:
-    """Open the device at 16 kHz and one channel if possible, else at its own rate and channels."""
+def _open(
+    sounddevice: ModuleType, device: Device, wanted: int, callback: Any
+) -> tuple[Any, int, int]:
+    """Open the device at 16 kHz and so many channels, or at its own rate, or all channels."""
+    if device.channels < wanted:
+        raise SourceError(
+            f"microphone {device.name!r} has {device.channels} channels, and `array` names places "
+            f"for {wanted}: name one for each channel that it has"
+        )
     reason = ""
     for rate in (_PREFERRED_RATE, int(device.default_rate)):
-        for channels in (1, device.channels):
+        for channels in (wanted, device.channels):
             try:
                 stream = sounddevice.RawInputStream(
                     samplerate=rate,
@@ -123,10 +131,14 @@ def _open(sounddevice: ModuleType, device: Device, callback: Any) -> tuple[Any, 
     raise DeviceError(f"microphone {device.name!r} cannot be opened ({reason})")
 
 
-def _first_channel(samples: bytes, channels: int) -> bytes:
-    if channels == 1:
+def _first_channels(samples: bytes, channels: int, wanted: int) -> bytes:
+    if channels == wanted:
         return samples
-    return memoryview(samples).cast("h")[::channels].tobytes()
+    every = array("h", samples)
+    chosen = array("h", bytes(2 * wanted * (len(every) // channels)))
+    for channel in range(wanted):
+        chosen[channel::wanted] = every[channel::channels]
+    return chosen.tobytes()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Audio files as one stream of samples at 16 kHz, mono."""
+"""Audio files as one stream of samples at 16 kHz: mono, or those of an array of microphones."""
 
 import math
 from collections.abc import Iterator
@@ -19,7 +19,9 @@ _BLOCK_SECONDS = 10.0
 _RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
 
 
-def read_audio(path: Path, start: float = 0.0, end: float = math.inf) -> Iterator[Float32]:
+def read_audio(
+    path: Path, start: float = 0.0, end: float = math.inf, *, channels: int | None = None
+) -> Iterator[Float32]:
     """Read an audio file of any rate and channel count, block by block.
 
     Channels are averaged, other rates resampled; samples that are not finite become 0.
@@ -29,10 +31,12 @@ def read_audio(path: Path, start: float = 0.0, end: float = math.inf) -> Iterato
     path : Path
     start, end : float
         The part to read, in seconds, as far as the file goes.
+    channels : int or None
+        Those of an array, as `check_channels` takes them, which are kept apart.
 
     Yields
     ------
-    np.ndarray [shape=(n,)], float32
+    np.ndarray [shape=(n,) or (n, channels)], float32
         Samples in full scale, -1 to 1, at 16 kHz.
 
     Raises
@@ -41,11 +45,13 @@ def read_audio(path: Path, start: float = 0.0, end: float = math.inf) -> Iterato
         If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
         768 kHz.
     """
+    mix = _mono if channels is None else _finite
     with _opened(path) as audio:
         first, last = (round(min(time * audio.samplerate, audio.frames)) for time in (start, end))
         if first:
             audio.seek(first)
-        yield from _resampled(_mono_blocks(audio, last - first), audio.samplerate)
+        blocks = (mix(block) for block in _blocks(audio, last - first))
+        yield from _resampled(blocks, audio.samplerate, channels)
 
 
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
@@ -94,6 +100,28 @@ def audio_seconds(path: Path) -> float:
         return float(audio.frames / audio.samplerate)
 
 
+def check_channels(path: Path, channels: int | None) -> None:
+    """Check that an audio file has the channels of an array.
+
+    Parameters
+    ----------
+    path : Path
+    channels : int or None
+        None allows any.
+
+    Raises
+    ------
+    SourceError
+        If it has more or fewer; as `audio_seconds`.
+    """
+    with _opened(path) as audio:
+        if channels not in {None, audio.channels}:
+            raise SourceError(
+                f"{path}: has {audio.channels} channels, and `array` names places for {channels}: "
+                "name one for each channel of the file, or leave `array` out"
+            )
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
     if not path.exists():
@@ -113,24 +141,32 @@ def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
         raise SourceError(f"{path}: cannot be read as audio ({reason})") from error
 
 
-def _mono_blocks(audio: soundfile.SoundFile, frames: int) -> Iterator[Float32]:
+def _blocks(audio: soundfile.SoundFile, frames: int) -> Iterator[Float32]:
     size = int(audio.samplerate * _BLOCK_SECONDS)
     while len(block := audio.read(min(size, frames), dtype="float32", always_2d=True)):
         frames -= len(block)
-        yield _mono(block)
+        yield block
 
 
 def _mono(block: Float32) -> Float32:
-    if not np.isfinite(block).all():
-        np.nan_to_num(block, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    block = _finite(block)
     return block[:, 0] if block.shape[1] == 1 else block.mean(axis=1)
 
 
-def _resampled(blocks: Iterator[Float32], rate: int) -> Iterator[Float32]:
+def _finite(block: Float32) -> Float32:
+    if not np.isfinite(block).all():
+        np.nan_to_num(block, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    return block
+
+
+def _resampled(
+    blocks: Iterator[Float32], rate: int, channels: int | None = None
+) -> Iterator[Float32]:
     if rate == SAMPLE_RATE:
         yield from blocks
         return
-    resampler = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32")
+    resampler = soxr.ResampleStream(rate, SAMPLE_RATE, channels or 1, dtype="float32")
     for block in blocks:
         yield resampler.resample_chunk(np.ascontiguousarray(block))
-    yield resampler.resample_chunk(np.empty(0, np.float32), last=True)
+    shape = () if channels is None else (channels,)
+    yield resampler.resample_chunk(np.empty((0, *shape), np.float32), last=True)

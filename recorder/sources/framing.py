@@ -27,7 +27,8 @@ class SampleBlock:
     ----------
     index : int
         Number of the first sample since that process started.
-    samples : np.ndarray [shape=(n,)], int16
+    samples : np.ndarray [shape=(n,) or (n, c)], int16
+        With an axis of channels, if it is an array of microphones.
     overflowed : bool
         The sound card lost samples before the last one of this block, or a little earlier.
     adc_time : float
@@ -77,6 +78,7 @@ class Framer:
         self._end_offset = 0  # CLOCK_REALTIME less CLOCK_MONOTONIC at that end, in nanoseconds
         self._reason = ""
         self._rate = float(SAMPLE_RATE)
+        self._channels: int | None = None
         self._clock = SampleClock(SAMPLE_RATE)
         self._wall_offset = 0  # CLOCK_REALTIME less CLOCK_MONOTONIC, in nanoseconds
         self._expected = 0  # index of the next block, if nothing is lost
@@ -98,7 +100,14 @@ class Framer:
         """Stamp of the last frame in nanoseconds of UTC; 0 before the first one."""
         return self._last_stamp
 
-    def begin(self, rate: int, wall_offset: int, reason: str, lost_reason: str = "") -> None:
+    def begin(
+        self,
+        rate: int,
+        wall_offset: int,
+        reason: str,
+        lost_reason: str = "",
+        channels: int | None = None,
+    ) -> None:
         """Start anew with another capture process.
 
         Parameters
@@ -111,8 +120,11 @@ class Framer:
             Why there was no sound in between.
         lost_reason : str
             Why blocks may not follow each other; by default the recorder was too slow.
+        channels : int or None
+            Of an array; None of a single microphone.
         """
         self._rate = float(rate)
+        self._channels = channels
         self._lost_reason = lost_reason or "the recorder was too slow"
         self._clock = SampleClock(rate)
         self._expected = self._lost = self._steady = 0
@@ -172,7 +184,7 @@ class Framer:
         self._reason = reason
         self._origin = origin
         self._framed = 0
-        self._cutter = FrameCutter(self._rate)
+        self._cutter = FrameCutter(self._rate, self._channels)
 
     def _cut(self, samples: Float32) -> list[Frames | Gap]:
         frames = self._cutter.push(samples)
@@ -188,7 +200,7 @@ class Framer:
                 return []
         gap = self._gap_before(int(times[0]))
         stamps = times + self._wall_offset
-        complete = Frames(self._next_frame, frames, stamps)
+        complete = frames_of(self._next_frame, frames, stamps)
         self._next_frame += count
         self._end = int(times[-1]) + FRAME_NANOSECONDS
         self._end_offset = self._wall_offset
@@ -208,3 +220,19 @@ class Framer:
         lost = max(round((time - self._end) / FRAME_NANOSECONDS), 1)
         self._next_frame += lost
         return Gap(self._end + self._end_offset, time + self._wall_offset, reason, lost)
+
+
+def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:
+    """Make the event of frames of one microphone, or of an array.
+
+    Parameters
+    ----------
+    first : int
+        Number of the first frame.
+    frames : np.ndarray [shape=(n, 800) or (n, 800, c)], float32
+    stamps : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds of UTC.
+    """
+    if frames.ndim == 2:
+        return Frames(first, frames, stamps)
+    return Frames(first, np.ascontiguousarray(frames[:, :, 0]), stamps, frames)

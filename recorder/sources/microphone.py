@@ -61,11 +61,14 @@ class MicrophoneSource:
     device : str
         As `hearthlog devices` lists it, empty for the default one, or an address in the network.
     fallback : str, optional
-        Another device, which is heard as long as this one is not there; by default none.
+        Another device, which is heard as long as this one is not there; by default none. It is
+        no array.
     waits : bool, optional
         Whether a device that is not there at the start is waited for, as it is later.
     rest : Rest or None
         When the device is to be closed; by default never.
+    channels : int or None
+        Of an array; None of a single microphone.
 
     Attributes
     ----------
@@ -81,9 +84,15 @@ class MicrophoneSource:
     """
 
     def __init__(
-        self, device: str, *, fallback: str = "", waits: bool = True, rest: Rest | None = None
+        self,
+        device: str,
+        *,
+        fallback: str = "",
+        waits: bool = True,
+        rest: Rest | None = None,
+        channels: int | None = None,
     ) -> None:
-        self._own = _Device(device)
+        self._own = _Device(device, channels)
         self._fallback = _Device(fallback) if fallback else None
         self._return: ReturnWatch | None = None  # as long as the fallback is heard
         self._lost_at = -math.inf  # when the device was lost
@@ -159,7 +168,7 @@ class MicrophoneSource:
     ) -> Generator[Event, None, str]:
         """Yield the events of one run of the capture process; return why it ended."""
         form = capture.format
-        self._framer.begin(form.rate, self._wall_offset, reason, form.lost_reason)
+        self._framer.begin(form.rate, self._wall_offset, reason, form.lost_reason, form.channels)
         stale = form.stale_seconds
         last_block = time.monotonic() + max(_FIRST_BLOCK_SECONDS - stale, 0.0)
         while not stop.is_set():
@@ -197,7 +206,7 @@ class MicrophoneSource:
     def _open(self, device: "_Device", stop: Flag) -> Capture:
         if is_address(device.wanted):
             return NetworkProcess(device.wanted, stop)
-        return CaptureProcess(device.wanted, exact=device.was_heard)
+        return CaptureProcess(device.wanted, exact=device.was_heard, channels=device.channels)
 
     def _hear(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
@@ -319,10 +328,11 @@ class _Level:
 class _Device:
     """A device that is to be heard: by its name, and once it was heard, by what it is."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, channels: int | None = None) -> None:
         check_device(device)
         self.name = public_name(device)
         self.wanted = device
+        self.channels = channels
         self.was_heard = False
 
     def is_heard(self, capture: Capture) -> None:

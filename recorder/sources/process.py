@@ -120,10 +120,10 @@ class _Process:
         blocks = []
         while len(self._held) >= BLOCK.size:
             head = BLOCK.unpack_from(self._held)
-            end = BLOCK.size + 2 * head[1]
+            end = BLOCK.size + 2 * head[1] * (self.format.channels or 1)
             if len(self._held) < end:
                 break
-            blocks.append(_block(head, self._held[BLOCK.size : end]))
+            blocks.append(_block(head, self._held[BLOCK.size : end], self.format.channels))
             self._held = self._held[end:]
         return blocks
 
@@ -174,6 +174,8 @@ class CaptureProcess(_Process):
         As `hearthlog devices` lists it, or empty for the default one.
     exact : bool, optional
         Whether no other device will do whose name contains this one.
+    channels : int or None
+        Of an array; None of a single microphone.
 
     Attributes
     ----------
@@ -182,17 +184,17 @@ class CaptureProcess(_Process):
     Raises
     ------
     DeviceError
-        If the device is not there or cannot be opened, in the words of the capture process; or if
-        PortAudio hangs.
+        If the device is not there, cannot be opened or has too few channels, in the words of the
+        capture process; or if PortAudio hangs.
     SourceError
         If PortAudio is missing, cannot start, or crashes.
     """
 
     _hangs, _crashes = _HANGS, _CRASHES
 
-    def __init__(self, device: str, *, exact: bool = False) -> None:
+    def __init__(self, device: str, *, exact: bool = False, channels: int | None = None) -> None:
         process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, device, *(["exact"] if exact else [])],
+            [*_CAPTURE, device, str(channels or 0), *(["exact"] if exact else [])],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
             bufsize=0,
@@ -246,7 +248,12 @@ class NetworkProcess(_Process):
 Capture = CaptureProcess | NetworkProcess
 
 
-def _block(head: tuple[int, int, int, float, float], data: bytes) -> SampleBlock:
+def _block(
+    head: tuple[int, int, int, float, float], data: bytes, channels: int | None
+) -> SampleBlock:
     index, _, flags, adc_time, arrival = head
     overflowed = bool(flags & _INPUT_OVERFLOW)
-    return SampleBlock(index, np.frombuffer(data, "<i2"), overflowed, adc_time, arrival)
+    samples = np.frombuffer(data, "<i2")
+    if channels is not None:
+        samples = samples.reshape(-1, channels)
+    return SampleBlock(index, samples, overflowed, adc_time, arrival)

@@ -1,14 +1,16 @@
 /* labmic: a capture device for ALSA in user space, for tests that must count samples.
  *
  * Sample n is taken at CLOCK_MONOTONIC = n / (rate * (1 + ppm * 1e-6)). Its value is n itself,
- * (n mod 65536) - 32768, or data[n mod length] of a raw s16 file. Loss, duplication, drift and
- * outages can therefore be read off the samples exactly. The ring overruns as a real one does:
+ * (n mod 65536) - 32768, or data[n mod length] of a raw s16 file, in which the samples of several
+ * channels are interleaved. Loss, duplication, drift and outages can therefore be read off the
+ * samples exactly. Without data, and beyond the channels of the data, all channels are the first. The ring overruns as a real one does:
  * a reader that is too slow gets -EPIPE.
  *
  *   gcc -O2 -fPIC -shared -DPIC -o libasound_module_pcm_labmic.so labmic.c -lasound
  *
  *   pcm_type.labmic { lib "/path/to/libasound_module_pcm_labmic.so" }
- *   pcm.labmic { type labmic  rate 16000  ctl "/path/to/control"  data "/path/to/samples.s16" }
+ *   pcm.labmic { type labmic  rate 16000  ctl "/path/to/control"  data "/path/to/samples.s16"
+ *                channels 4 }
  *
  * The control file says "unplug" (the device is gone: -ENODEV) or "freeze" (it is there and
  * delivers nothing); absent or empty means normal. The environment variable LABMIC_PPM goes before
@@ -34,6 +36,7 @@ enum condition { NORMAL, UNPLUGGED, FROZEN };
 
 struct settings {
     long rate;
+    long channels; /* of the data */
     double ppm;
     const char *control;
     const char *data;
@@ -44,7 +47,8 @@ typedef struct {
     double ppm;
     char *control;
     int16_t *data;
-    long data_length;
+    long data_length; /* samples of a channel */
+    long channels;    /* of the data */
     uint64_t first; /* index of the sample at position 0 of this start */
     int running;
 } labmic_t;
@@ -75,10 +79,11 @@ static uint64_t index_now(const labmic_t *mic)
     return (uint64_t)(seconds * mic->io.rate * (1.0L + mic->ppm * 1e-6L));
 }
 
-static int16_t sample_at(const labmic_t *mic, uint64_t index)
+static int16_t sample_at(const labmic_t *mic, uint64_t index, unsigned channel)
 {
     if (mic->data)
-        return mic->data[index % mic->data_length];
+        return mic->data[index % mic->data_length * mic->channels
+                         + (channel < mic->channels ? channel : 0)];
     return (int16_t)((int)(index % 65536) - 32768);
 }
 
@@ -144,8 +149,8 @@ static snd_pcm_sframes_t mic_transfer(snd_pcm_ioplug_t *io, const snd_pcm_channe
 {
     const labmic_t *mic = io->private_data;
     for (snd_pcm_uframes_t i = 0; i < size; i++) {
-        int16_t value = sample_at(mic, mic->first + io->appl_ptr + i);
         for (unsigned channel = 0; channel < io->channels; channel++) {
+            int16_t value = sample_at(mic, mic->first + io->appl_ptr + i, channel);
             const snd_pcm_channel_area_t *area = &areas[channel];
             char *place = (char *)area->addr + (area->first + area->step * (offset + i)) / 8;
             memcpy(place, &value, sizeof value);
@@ -225,6 +230,8 @@ static int read_settings(snd_config_t *configuration, struct settings *settings)
         int error = 0;
         if (!strcmp(id, "rate"))
             error = snd_config_get_integer(node, &settings->rate);
+        else if (!strcmp(id, "channels"))
+            error = snd_config_get_integer(node, &settings->channels);
         else if (!strcmp(id, "ppm"))
             error = snd_config_get_ireal(node, &settings->ppm);
         else if (!strcmp(id, "ctl"))
@@ -238,6 +245,8 @@ static int read_settings(snd_config_t *configuration, struct settings *settings)
             return error;
         }
     }
+    if (settings->channels < 1)
+        return -EINVAL;
     if (getenv("LABMIC_PPM"))
         settings->ppm = atof(getenv("LABMIC_PPM"));
     return 0;
@@ -249,12 +258,13 @@ static int load_data(labmic_t *mic, const char *path)
     if (!file)
         return -errno;
     fseek(file, 0, SEEK_END);
-    mic->data_length = ftell(file) / (long)sizeof *mic->data;
+    long samples = ftell(file) / (long)sizeof *mic->data;
     rewind(file);
-    mic->data = calloc(mic->data_length + 1, sizeof *mic->data);
-    size_t length = mic->data ? fread(mic->data, sizeof *mic->data, mic->data_length, file) : 0;
+    mic->data = calloc(samples + 1, sizeof *mic->data);
+    size_t length = mic->data ? fread(mic->data, sizeof *mic->data, samples, file) : 0;
     fclose(file);
-    return length > 0 && (long)length == mic->data_length ? 0 : -EINVAL;
+    mic->data_length = samples / mic->channels;
+    return mic->data_length > 0 && (long)length == samples ? 0 : -EINVAL;
 }
 
 static int limit(labmic_t *mic, long rate)
@@ -262,8 +272,8 @@ static int limit(labmic_t *mic, long rate)
     static const unsigned access[] = {SND_PCM_ACCESS_RW_INTERLEAVED,
                                       SND_PCM_ACCESS_MMAP_INTERLEAVED};
     static const unsigned format[] = {SND_PCM_FORMAT_S16_LE};
-    static const struct { int parameter; unsigned minimum, maximum; } ranges[] = {
-        {SND_PCM_IOPLUG_HW_CHANNELS, 1, 2},
+    const struct { int parameter; unsigned minimum, maximum; } ranges[] = {
+        {SND_PCM_IOPLUG_HW_CHANNELS, 1, mic->channels > 2 ? mic->channels : 2},
         {SND_PCM_IOPLUG_HW_PERIOD_BYTES, 64, 1 << 20},
         {SND_PCM_IOPLUG_HW_BUFFER_BYTES, 256, 4 << 20},
         {SND_PCM_IOPLUG_HW_PERIODS, 2, 1024},
@@ -286,6 +296,7 @@ static labmic_t *new_mic(const struct settings *settings)
     if (!mic)
         return NULL;
     mic->ppm = settings->ppm;
+    mic->channels = settings->channels;
     mic->control = settings->control ? strdup(settings->control) : NULL;
     mic->io.version = SND_PCM_IOPLUG_VERSION;
     mic->io.name = "labmic";
@@ -300,7 +311,7 @@ static labmic_t *new_mic(const struct settings *settings)
 SND_PCM_PLUGIN_DEFINE_FUNC(labmic)
 {
     (void)root;
-    struct settings settings = {.rate = 16000};
+    struct settings settings = {.rate = 16000, .channels = 1};
     int error = read_settings(conf, &settings);
     if (error < 0)
         return error;

@@ -1,0 +1,1 @@
+"""Where sound comes from: an array of microphones, and directions in their channels."""
