@@ -13,6 +13,7 @@ FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
 OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
 OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no scenario that is built in
 OTHER, UNKNOWN = "other", labels.UNKNOWN  # for models and people; never learned
+OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # what it has no name for
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 

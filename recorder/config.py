@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_origin
+from typing import Annotated, Any, Literal, Self, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -13,10 +13,12 @@ from pydantic import (
     ValidationError,
     field_serializer,
     field_validator,
+    model_validator,
 )
 
-from hearthlog.recorder.addresses import public_name
+from hearthlog.recorder.addresses import is_address, public_name
 from hearthlog.recorder.config_origins import DEFAULT, ENVIRONMENT, Key, Origins, key_lines
+from hearthlog.recorder.direction.geometry import ArrayGeometry, array_geometry
 from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
 from hearthlog.recorder.disk.sizes import Size
 from hearthlog.recorder.errors import ConfigurationError
@@ -25,7 +27,7 @@ from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.recorder.timezone import check_time_zone, machine_zone, time_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import check_node_name
-from hearthlog.schemas.messages.topics import check_microphone_name
+from hearthlog.schemas.messages.topics import check_microphone_name, check_scenario_name
 from hearthlog.schemas.storage.small_file import read_toml
 
 ReadableBy = Literal["owner", "group", "all"]
@@ -45,6 +47,20 @@ def _checked(check: Any) -> AfterValidator:
     return AfterValidator(validate)
 
 
+def _checked_places(places: list[list[float]]) -> list[list[float]]:
+    try:
+        if places:
+            array_geometry(places)
+    except ConfigurationError as error:
+        raise ValueError(str(error)) from error
+    return places
+
+
+Scenarios = Annotated[
+    dict[Annotated[str, _checked(check_scenario_name)], Path], Field(max_length=8)
+]
+
+
 class MicrophoneSettings(BaseModel):
     """One microphone, or the audio files that replace it."""
 
@@ -61,9 +77,33 @@ class MicrophoneSettings(BaseModel):
     fallback: str = Field(
         default="", description="A device that is heard while that one is not there; empty: none."
     )
+    array: Annotated[list[list[float]], AfterValidator(_checked_places)] = Field(
+        default=[],
+        description="Places of the microphones of an array, [x, y] in metres for each channel; "
+        "empty: one channel is heard.",
+    )
     model: Path | None = Field(
         default=None, description="Instead of the recorder's; none: no labels."
     )
+    scenarios: Scenarios | None = Field(
+        default=None, description="Instead of the recorder's; {}: none."
+    )
+
+    @property
+    def geometry(self) -> ArrayGeometry | None:
+        """Where the microphones of the array are; None without one."""
+        return array_geometry(self.array) if self.array else None
+
+    @property
+    def channels(self) -> int | None:
+        """How many channels the array has; None without one."""
+        return len(self.array) or None
+
+    @model_validator(mode="after")
+    def _check_array(self) -> Self:
+        if self.array and is_address(self.device):
+            raise ValueError("an address in the network gives one channel, and has no array")
+        return self
 
     @field_serializer("device", "fallback", when_used="json")
     def _name_device(self, device: str) -> str:
@@ -83,6 +123,11 @@ class Settings(BaseModel):
         default=None,
         description="Model file, or a link to one; general or bathroom, which come with hearthlog; "
         "none: no labels. By default models/champion.safetensors if there is one, else general.",
+    )
+    scenarios: Scenarios = Field(
+        default={},
+        description="Models that label beside it, by the name of what for: as "
+        '{speakers = "models/speakers.safetensors"}.',
     )
     feature_set: str = Field(
         default="", description="Empty: that of the model, or the default one."
@@ -171,6 +216,20 @@ class Settings(BaseModel):
         )
         return KeepingRules(str(self.output), self.node, limits, thinning)
 
+    def settings_of(self, microphone: str) -> MicrophoneSettings:
+        """Return what is configured of a microphone.
+
+        Parameters
+        ----------
+        microphone : str
+            Its name.
+        """
+        return next(each for each in self.microphone if each.name == microphone)
+
+    def scenarios_of(self, microphone: MicrophoneSettings) -> dict[str, Path]:
+        """Return the model files of the scenarios of a microphone, by their names."""
+        return self.scenarios if microphone.scenarios is None else microphone.scenarios
+
     def rest(self) -> Rest:
         """Return when the microphones are closed."""
         hours = [quiet_hours(text) for text in self.quiet_hours]
@@ -254,7 +313,7 @@ def _environment() -> dict[str, Any]:
         if field is None:
             raise ConfigurationError(f"environment: unknown variable {variable[:64]!r}")
         values[name] = os.environ[variable]
-        if get_origin(field.annotation) is list:
+        if get_origin(field.annotation) in {list, dict}:
             values[name] = _from_json(variable)
     return values
 
@@ -280,7 +339,7 @@ def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> Config
     """
     errors = error.errors()
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
-    whole = (*table, *first["loc"])
+    whole = (*table, *(part for part in first["loc"] if part != "[key]"))
     where = _place(whole, origins)
     key = ".".join(str(part) for part in whole)
     if first["type"] == "extra_forbidden":

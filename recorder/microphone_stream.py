@@ -33,7 +33,7 @@ class MicrophoneStream:
     ModelError
         If the configured feature set is not installed.
     ConfigurationError
-        If the model is for another feature set than the configured one, or does not know what is
+        If a model is for another feature set than the configured one, or does not know what is
         private.
     """
 
@@ -52,8 +52,9 @@ class MicrophoneStream:
             _configured_features(settings, models),
             models.classifier,
             settings.statistics_every,
-            models.candidate_classifier,
+            {name: loaded.classifier for name, loaded in models.beside().items()},
             settings.privacy,
+            settings.settings_of(microphone).geometry,
         )
         if unknown := self.pipeline.unknown_private():
             classes = self.pipeline.classes
@@ -132,11 +133,24 @@ class MicrophoneStream:
         """Describe the logs of this microphone."""
         features, models = self.pipeline.feature_set, self.models
         info = stream_info(self.pipeline.microphone, self._device, features, models.model)
-        return describe_log(self._settings, info, features, models.model, models.candidate)
+        beside = {name: loaded.model for name, loaded in models.beside().items()}
+        return describe_log(self._settings, info, features, models.model, beside)
 
 
 def _configured_features(settings: Settings, models: LabellingModels) -> FeatureSet:
-    """Return the configured feature set, which must be that of the model, if there is one."""
+    """Return the configured feature set, which must be that of all models."""
+    features = _features_of_model(settings, models)
+    for labelling, (model, classifier) in models.beside().items():
+        if classifier.feature_set != features:
+            raise ConfigurationError(
+                f"{labelling.replace('/', ' ')}: model {model.name} is for feature set "
+                f"{classifier.feature_set.name}, and what is recorded is {features.name}; all "
+                f"models must be for the same one: train this one for {features.name}"
+            )
+    return features
+
+
+def _features_of_model(settings: Settings, models: LabellingModels) -> FeatureSet:
     if models.classifier is None:
         return feature_set(settings.feature_set or DEFAULT.name)
     name = models.classifier.feature_set.name

@@ -130,7 +130,11 @@ def record_microphones(
         # They capture, and their pipes hold, while older logs are completed.
         sources = {
             each.name: stack.enter_context(
-                closing(MicrophoneSource(each.device, fallback=each.fallback, rest=rest))
+                closing(
+                    MicrophoneSource(
+                        each.device, fallback=each.fallback, rest=rest, channels=each.channels
+                    )
+                )
             )
             for each in settings.microphone
         }
@@ -262,20 +266,36 @@ def _open_models(
     reload_requests: ReloadRequests | None,
     stack: ExitStack,
 ) -> dict[str, LabellingModels]:
-    """Load the models of microphones, and watch their files; each file once."""
+    """Load the models of microphones, and watch their files; once for those that have the same."""
     reload_requests = reload_requests or ReloadRequests()
-    own = {each.name: each.model for each in settings.microphone}
-    paths = {name: own.get(name) or settings.model or NO_MODEL for name in microphones}
-    models = {NO_MODEL: LabellingModels()}
-    for path in paths.values():
-        if path not in models:
-            watch = stack.enter_context(closing(ModelWatch(path, reload_requests.queue())))
-            is_file = path.suffix == SUFFIX  # else the name of a starter
-            folder = path.parent if is_file else DEFAULT_FOLDER
-            candidates = CandidateWatch(folder, watch.first.classifier.feature_set)
-            stack.enter_context(closing(candidates))
-            models[path] = LabellingModels(watch, candidates)
-    return {name: models[path] for name, path in paths.items()}
+    chosen = {
+        each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
+        for each in settings.microphone
+    }
+    models: dict[str, LabellingModels] = {}
+    for name in microphones:
+        same = next((other for other in models if chosen[other] == chosen[name]), None)
+        models[name] = (
+            _watched_models(*chosen[name], reload_requests, stack) if same is None else models[same]
+        )
+    return models
+
+
+def _watched_models(
+    path: Path, scenarios: Mapping[str, Path], reload_requests: ReloadRequests, stack: ExitStack
+) -> LabellingModels:
+    watches = {
+        name: stack.enter_context(closing(ModelWatch(file, reload_requests.queue(), name)))
+        for name, file in scenarios.items()
+    }
+    if path == NO_MODEL:
+        return LabellingModels(scenarios=watches)
+    watch = stack.enter_context(closing(ModelWatch(path, reload_requests.queue())))
+    is_file = path.suffix == SUFFIX  # else the name of a starter
+    folder = path.parent if is_file else DEFAULT_FOLDER
+    candidates = CandidateWatch(folder, watch.first.classifier.feature_set)
+    stack.enter_context(closing(candidates))
+    return LabellingModels(watch, candidates, watches)
 
 
 class RecordingSession:

@@ -89,7 +89,14 @@ def _values(about: dict[str, Any]) -> str:
         return _values(kinds[0]) if len(kinds) == 1 else "size"
     if about["type"] in {"number", "integer"}:
         return _numbers(about)
-    words = {"array": "list of texts", "boolean": "`true`, `false`", "string": "text"}
+    if about["type"] == "array" and about["items"]["type"] == "array":
+        return "list of lists of numbers"
+    words = {
+        "array": "list of texts",
+        "object": "table of paths",
+        "boolean": "`true`, `false`",
+        "string": "text",
+    }
     return "path" if about.get("format") == "path" else words[about["type"]]
 
 

@@ -20,7 +20,7 @@ from hearthlog.schemas.logs.provenance import provenance_records, unknown_versio
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, is_scenario, parse_topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _LATEST = 60 * NANOSECONDS  # of labels and diagnostics: of the older ones nothing is left
@@ -39,7 +39,10 @@ def is_of_bridge(topic: str) -> bool:
     if topic == DIAGNOSTICS:
         return True
     name = parse_topic(topic)
-    return name is not None and name.labelling == LIVE and name.kind in {"label", "segment", "gap"}
+    if name is None:
+        return False
+    kinds = {"label", "segment", "gap"} if name.labelling == LIVE else {"label", "segment"}
+    return (name.labelling == LIVE or is_scenario(name.labelling)) and name.kind in kinds
 
 
 def follow_home(

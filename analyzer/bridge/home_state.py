@@ -3,16 +3,16 @@
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.bridge.event_record import PAUSE_SECONDS, Event, EventRecord
 from hearthlog.analyzer.bridge.heard_now import HeardNow
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import parse_topic
+from hearthlog.schemas.messages.topics import SCENARIO, TopicName, is_scenario, parse_topic
 from hearthlog.schemas.times import NANOSECONDS
 
 FIELDS = {
@@ -34,12 +34,14 @@ class Health(NamedTuple):
 
 
 class MicrophoneState:
-    """What one microphone hears and heard.
+    """What one microphone hears and heard, by one of its models.
 
     Parameters
     ----------
     name : str
         Of the microphone.
+    unnamed : collection of str, optional
+        Classes of no events, of which none but silence is told.
 
     Attributes
     ----------
@@ -56,8 +58,10 @@ class MicrophoneState:
         When the first that is known of it began, in nanoseconds of UTC; 0 before there is any.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, unnamed: Collection[str] = (SILENCE,)) -> None:
         self.name = name
+        self._unnamed = unnamed
+        self._names: list[str] = []
         self.classes: list[str] = []
         self.heard = HeardNow([])
         self.label, self.confidence = "", 0.0
@@ -90,8 +94,9 @@ class MicrophoneState:
     def push_labels(self, columns: Columns) -> None:
         """Add labels, with the fields of `FIELDS`."""
         classes = _class_names(columns)
-        if classes and classes != self.classes:
-            self.classes = classes
+        if classes and classes != self._names:
+            self._names = classes
+            self.classes = [c for c in classes if c == SILENCE or c not in self._unnamed]
             self.heard = HeardNow(classes)
         self.heard.push(columns["label"].tolist(), columns.log_times)
         self.since = self.since or int(columns.log_times[0])
@@ -107,7 +112,7 @@ class MicrophoneState:
         for start, duration, label, confidence in zip(
             *(columns[name].tolist() for name in names), strict=True
         ):
-            if label == SILENCE or (label not in self._records and self._is_full()):
+            if label in self._unnamed or (label not in self._records and self._is_full()):
                 continue
             record = self._records.setdefault(label, EventRecord(self.name, label))
             before = record.current
@@ -162,6 +167,10 @@ class HomeState:
     Attributes
     ----------
     microphones : dict of str to MicrophoneState
+        By their names.
+    scenarios : dict of str to MicrophoneState
+        The same by the models of scenarios: by `<microphone>-<scenario>`, which is no name of a
+        microphone.
     health : dict of str to Health
         The last word on each thing: a microphone, the recorder, its disk …
     caught_up : bool
@@ -170,6 +179,7 @@ class HomeState:
 
     def __init__(self) -> None:
         self.microphones: dict[str, MicrophoneState] = {}
+        self.scenarios: dict[str, MicrophoneState] = {}
         self.health: dict[str, Health] = {}
         self.caught_up = False
         self._seen = -math.inf  # when anything came, by CLOCK_MONOTONIC
@@ -178,6 +188,10 @@ class HomeState:
     def is_recording(self) -> bool:
         """Tell whether anything was written in the last fifteen seconds."""
         return time.monotonic() - self._seen <= _AWAY_SECONDS
+
+    def every(self) -> list[MicrophoneState]:
+        """Return the states of the microphones, and those of their scenarios."""
+        return [*self.microphones.values(), *self.scenarios.values()]
 
     def begin_log(self) -> None:
         """Forget the health of what was spoken of in the log before the last one, and no more."""
@@ -210,9 +224,7 @@ class HomeState:
                 continue
             name = parse_topic(part.topic)
             assert name is not None
-            microphone = self.microphones.setdefault(
-                name.microphone, MicrophoneState(name.microphone)
-            )
+            microphone = self._state_of(name)
             if name.kind == "label":
                 microphone.push_labels(part)
                 microphone.seen = max(microphone.seen, seen)
@@ -221,6 +233,13 @@ class HomeState:
             else:
                 begun += microphone.push_segments(part)
         return begun
+
+    def _state_of(self, topic: TopicName) -> MicrophoneState:
+        if not is_scenario(topic.labelling):
+            name = topic.microphone
+            return self.microphones.setdefault(name, MicrophoneState(name))
+        name = f"{topic.microphone}-{topic.labelling.removeprefix(f'{SCENARIO}/')}"
+        return self.scenarios.setdefault(name, MicrophoneState(name, OF_EVERY_SCENARIO))
 
     def _time_seen(self, columns: Columns) -> float:
         """Tell when messages were written, by CLOCK_MONOTONIC.

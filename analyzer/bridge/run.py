@@ -72,7 +72,7 @@ class Bridge:
     def _tell(self, state: HomeState, begun: Sequence[Event], *, is_first: bool) -> None:
         now = time.time_ns()
         moment = today(now, self.home.zone)
-        ended = [event for each in state.microphones.values() for event in each.ended_events()]
+        ended = [event for each in state.every() for event in each.ended_events()]
         if is_first:
             give_back()  # what it took to read the log
             ended = [event for event in ended if now - event.end <= RECENT]
@@ -80,7 +80,7 @@ class Bridge:
         news = News(state, recent, ended, moment, self.home.zone)
         for name, output in self.outputs.items():
             self._try(name, partial(output.update, news))
-        for microphone in state.microphones.values():
+        for microphone in state.every():
             microphone.forget(min(moment.midnight, moment.night) - _FORGOTTEN, now + _AHEAD)
 
     def _try(self, name: str, step: Callable[[], None]) -> None:

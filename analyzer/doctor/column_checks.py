@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.topic_types import (
-    CANDIDATE_LABEL,
-    CANDIDATE_SEGMENT,
+    BESIDE_LABEL,
+    BESIDE_SEGMENT,
+    DIRECTION,
     GAP,
     LABEL,
     SEGMENT,
@@ -24,9 +25,10 @@ _ANY_DURATION = ("the clock was set", LOG_DAMAGED)  # with which the reasons beg
 _SUM_TOLERANCE = 1e-4
 _LATE = {  # ns, with what stamps may be off
     LABEL: 1_010_000_000,
-    CANDIDATE_LABEL: 1_010_000_000,
+    BESIDE_LABEL: 1_010_000_000,
     SEGMENT: 75_000_000_000,
-    CANDIDATE_SEGMENT: 75_000_000_000,
+    DIRECTION: 400_000_000,
+    BESIDE_SEGMENT: 75_000_000_000,
 }
 
 
@@ -55,7 +57,7 @@ def check_stamps(
     """
     times = columns.log_times
     stamps = columns["stamp" if kind == ROSOUT else STAMP]
-    if kind in {SEGMENT, CANDIDATE_SEGMENT, GAP}:
+    if kind in {SEGMENT, BESIDE_SEGMENT, GAP}:
         stamps = stamps + columns["duration"]
     late = times - stamps
     if kind == "info" and not named:
@@ -204,6 +206,36 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
     )
     if classes is not None:
         _check_names(findings, columns, classes)
+
+
+def check_directions(findings: Findings, columns: Columns) -> None:
+    """Check that directions are angles, and how sure they are a share.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    columns : Columns
+        Messages of type `AudioDirection`.
+
+    Raises
+    ------
+    LogError
+        If a field of the type is missing.
+    """
+    times, azimuths, confidence = columns.log_times, columns["azimuth"], columns["confidence"]
+    findings.rows(
+        "azimuth",
+        ~(np.abs(azimuths) <= np.float32(np.pi)),
+        times,
+        lambda i: f"{columns.topic}: azimuth is {azimuths[i]}",
+    )
+    findings.rows(
+        "confidence",
+        ~((confidence >= 0) & (confidence <= 1)),
+        times,
+        lambda i: f"{columns.topic}: confidence is {confidence[i]}",
+    )
 
 
 def check_gaps(findings: Findings, columns: Columns) -> None:

@@ -7,8 +7,16 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frame_steps import Steps, check_gaps, check_steps
-from hearthlog.analyzer.doctor.topic_types import FEATURES, GAP, LABEL, SEGMENT, STATISTICS
+from hearthlog.analyzer.doctor.topic_types import (
+    DIRECTION,
+    FEATURES,
+    GAP,
+    LABEL,
+    SEGMENT,
+    STATISTICS,
+)
 from hearthlog.models.classifiers.timing import LabelTiming
+from hearthlog.recorder.direction.srp_phat import BLOCK_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
@@ -71,7 +79,7 @@ class FrameSequence:
         Parameters
         ----------
         kind : str
-            `features`, `statistics`, `label`, `segment` or `gap`.
+            `features`, `statistics`, `direction`, `label`, `segment` or `gap`.
         rows : np.ndarray [shape=(n, 3)], int64
             As the class describes them (times in nanoseconds of UTC), in the order of their log
             times, behind those of this kind that were added before.
@@ -123,8 +131,9 @@ class FrameSequence:
         until : int or None
             Nanoseconds of UTC; None for everything that was added.
         """
-        features, statistics, labels, segments, gaps = (
-            self._take(kind, until) for kind in (FEATURES, STATISTICS, LABEL, SEGMENT, GAP)
+        kinds = FEATURES, STATISTICS, DIRECTION, LABEL, SEGMENT, GAP
+        features, statistics, directions, labels, segments, gaps = (
+            self._take(kind, until) for kind in kinds
         )
         if FEATURES in self._thinned:  # there is nothing to compare labels with
             self._gap_ends = np.concatenate([self._gap_ends, gaps[:, 0]])
@@ -133,6 +142,10 @@ class FrameSequence:
         runs = self._check_features(features, gaps)
         if STATISTICS not in self._thinned:
             self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
+        # Their log time is the stamp of the last frame of the block.
+        last = directions[:, 1] + BLOCK_FRAMES - 1
+        ends = np.stack([directions[:, 0], last, directions[:, 0]], axis=1)
+        self._check_same(features, ends, DIRECTION, None)
         if self._timing is not None:
             self._check_labels(features, labels, runs, self._timing)
         self._check_segments(segments)

@@ -14,6 +14,9 @@ from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
 from hearthlog.analyzer.doctor.mcap.message_batch import MessageBatch
 from hearthlog.analyzer.doctor.topic_types import (
+    BESIDE_LABEL,
+    BESIDE_SEGMENT,
+    DIRECTION,
     FEATURES,
     GAP,
     LABEL,
@@ -201,11 +204,19 @@ class MessageChecks:
                 column_checks.check_values(self._findings, columns, field, len(names))
         if kind == LABEL and info is not None:
             column_checks.check_labels(self._findings, columns, list(info["labels"]))
+        if kind == BESIDE_LABEL:
+            names = _class_names(columns)
+            column_checks.check_values(self._findings, columns, "probabilities", len(names))
+            column_checks.check_labels(self._findings, columns, names)
+        if kind == BESIDE_SEGMENT:
+            column_checks.check_segments(self._findings, columns, None)
         if kind == SEGMENT:
             classes = None if info is None else list(info["labels"])
             column_checks.check_segments(self._findings, columns, classes)
         if kind == GAP:
             column_checks.check_gaps(self._findings, columns)
+        if kind == DIRECTION:
+            column_checks.check_directions(self._findings, columns)
 
     def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
         every, timing = statistics_every(self._data), None
@@ -258,6 +269,16 @@ def statistics_every(data: DataSection) -> int | None:
     return every if isinstance(every, int) and every > 0 else None
 
 
+def _class_names(columns: Columns) -> list[str]:
+    """Return the names behind probabilities that the channel of labels has; none if it has none."""
+    try:
+        names = json.loads(columns.metadata["probabilities_names"])
+    except (KeyError, ValueError, RecursionError):
+        return []
+    is_list = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return names if is_list else []
+
+
 def _thinned_kinds(data: DataSection) -> set[str]:
     """Return which kinds of messages a file says were dropped when it grew old."""
     steps = {record.get(THINNED) for record in data.metadata.get(METADATA, [])}
@@ -304,7 +325,7 @@ def _sequence_rows(kind: str, columns: Columns) -> Int64 | None:
         parts = times, stamps, columns["frames_lost"]
     elif kind == SEGMENT:
         parts = times, stamps, stamps + columns["duration"]
-    elif kind in _WIDTHS:
+    elif kind in {*_WIDTHS, DIRECTION}:
         parts = times, columns["frame"], stamps
     else:
         return None

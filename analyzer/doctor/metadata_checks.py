@@ -14,7 +14,8 @@ from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
 from hearthlog.analyzer.doctor.message_checks import MessageChecks, allowed_delay
 from hearthlog.analyzer.doctor.topic_types import (
-    CANDIDATE_LABEL,
+    BESIDE_LABEL,
+    DIRECTION,
     LOG_NAME,
     split_topic,
     topic_type,
@@ -27,8 +28,9 @@ from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.log_stream import PROFILE, SCHEMA_ENCODING
 from hearthlog.schemas.logs.provenance import METADATA, describes_model, schema_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.logs.scenario_record import recorded_scenarios
 from hearthlog.schemas.messages.fields import difference, type_hash_of
-from hearthlog.schemas.messages.topics import Topic, topics_of
+from hearthlog.schemas.messages.topics import CANDIDATE, Topic, scenario_labelling, topics_of
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.messages.versions import SCHEMA_VERSION
 from hearthlog.schemas.times import NANOSECONDS
@@ -163,17 +165,20 @@ class MetadataChecks:
         """Compare the channels with those that a recorder writes."""
         expected: dict[str, Topic] = {}
         records = self._data.metadata.get(METADATA, [])
-        candidate = any(record.get("candidate") for record in records)
+        candidates = [CANDIDATE] if any(record.get("candidate") for record in records) else []
+        scenarios = [one for record in records for one in recorded_scenarios(record)]
         for microphone, info in self._infos.items():
             classes = list(info["labels"]) or None
-            topics = topics_of(
-                microphone, list(info["feature_names"]), classes, [] if candidate else None
-            )
+            own = [scenario_labelling(s.name) for s in scenarios if s.microphone == microphone]
+            beside: dict[str, list[str]] = {name: [] for name in (*candidates, *own)}
+            is_array = f"/{microphone}/{DIRECTION}" in self._channels
+            names = list(info["feature_names"])
+            topics = topics_of(microphone, names, classes, beside, directions=is_array)
             expected |= {topic.name: topic for topic in topics}
         for name, topic in expected.items():
             if name not in self._channels and split_topic(name)[0]:
                 self._error("topics", f"{name} is missing")
-            if name in self._channels and split_topic(name)[1] != CANDIDATE_LABEL:
+            if name in self._channels and split_topic(name)[1] != BESIDE_LABEL:
                 self._check_arrays(self._channels[name], topic)
         counts = Counter(c.topic for c in self._data.definitions.channels.values())
         for name, channel in self._channels.items():

@@ -3,10 +3,19 @@
 import re
 
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import CANDIDATE, DIAGNOSTICS, LIVE, ROSOUT, parse_topic
+from hearthlog.schemas.messages.topics import (
+    CANDIDATE,
+    DIAGNOSTICS,
+    LIVE,
+    ROSOUT,
+    SCENARIO,
+    parse_topic,
+)
 
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
-CANDIDATE_LABEL, CANDIDATE_SEGMENT = f"{CANDIDATE}/{LABEL}", f"{CANDIDATE}/{SEGMENT}"
+DIRECTION = "direction"  # only of an array
+_BESIDE = "beside"  # of a candidate or a scenario
+BESIDE_LABEL, BESIDE_SEGMENT = f"{_BESIDE}/{LABEL}", f"{_BESIDE}/{SEGMENT}"
 TYPES = {
     "info": message_types.STREAM_INFO,
     FEATURES: message_types.FEATURES,
@@ -14,8 +23,9 @@ TYPES = {
     LABEL: message_types.LABEL,
     SEGMENT: message_types.SEGMENT,
     GAP: message_types.GAP,
-    CANDIDATE_LABEL: message_types.LABEL,
-    CANDIDATE_SEGMENT: message_types.SEGMENT,
+    DIRECTION: message_types.DIRECTION,
+    BESIDE_LABEL: message_types.LABEL,
+    BESIDE_SEGMENT: message_types.SEGMENT,
 }
 ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
 LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)(_\d+)?\.mcap(\.active)?")
@@ -33,12 +43,16 @@ def split_topic(topic: str) -> tuple[str, str]:
     Returns
     -------
     microphone, kind : str
-        Such as `mic` and `features`; nothing and the whole topic if it is none of a microphone.
+        Such as `mic` and `features`, of a candidate or a scenario `BESIDE_LABEL` or
+        `BESIDE_SEGMENT`; nothing and the whole topic if it is none of a microphone.
     """
     name = parse_topic(topic)
     if name is None:
         return "", topic
-    kind = name.kind if name.labelling == LIVE else f"{name.labelling}/{name.kind}"
+    kind = name.kind
+    if name.labelling != LIVE:
+        is_beside = name.labelling.partition("/")[0] in {CANDIDATE, SCENARIO}
+        kind = f"{_BESIDE if is_beside else name.labelling}/{kind}"
     return (name.microphone, kind) if kind in TYPES else ("", topic)
 
 

@@ -29,6 +29,7 @@ from hearthlog.schemas.messages.topics import (
     labelling_topic,
     parse_topic,
     relabelling,
+    scenario_labelling,
 )
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
@@ -51,7 +52,7 @@ class LogContents(NamedTuple):
 class NamedLabelling(NamedTuple):
     """One labelling of one microphone."""
 
-    name: str  # `live`, `review`, or `relabel/<model>`
+    name: str  # `live`, `review`, `scenario/<name>` or `relabel/<model>`
     classes: tuple[str, ...]  # the labels that there may be
     labelling: Labelling  # in the order of time, one label at a time
 
@@ -116,7 +117,7 @@ class Labellings:
         Returns
         -------
         list of str
-            `live` first, then `relabel/<model>` and `review` in the order of the alphabet.
+            `live` first, then the others in the order of the alphabet.
         """
         names = {t.labelling for t in self._topics() if t.microphone == microphone}
         return sorted(names, key=lambda name: (name != LIVE, name))
@@ -128,13 +129,13 @@ class Labellings:
         ----------
         microphone : str
         text : str
-            `live`, `review`, `relabel/<model>`, the name of a model, or `relabel` if there is only
-            one.
+            `live`, `review`, `scenario/<name>`, `relabel/<model>`, the name of a scenario or of a
+            model, or `relabel` if there is only one.
 
         Returns
         -------
         str
-            `live`, `review` or `relabel/<model>`.
+            `live`, `review`, `scenario/<name>` or `relabel/<model>`.
 
         Raises
         ------
@@ -145,7 +146,8 @@ class Labellings:
         layers = [name for name in names if name.startswith(f"{RELABEL}/")]
         if text == RELABEL and len(layers) == 1:
             return layers[0]
-        for name in (text, relabelling(text.removeprefix(f"{RELABEL}/"))):
+        layer = relabelling(text.removeprefix(f"{RELABEL}/"))
+        for name in (text, layer, scenario_labelling(text)):
             if name in names:
                 return name
         there = f"there is {', '.join(names)}{self._first_loss()}"

@@ -18,6 +18,12 @@ from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.feature_record import (
+    DIGEST,
+    DISTRIBUTION,
+    VERSION,
+    features_of_microphone,
+)
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import read_provenance
@@ -145,7 +151,10 @@ def _info_of(
         model=info.get("model", ""),
         model_sha256=digest if _DIGEST.fullmatch(digest) else "",
         configuration=_configuration(path, attachments),
-        metadata={key: own.get(key, text) for key, text in record.items()},
+        metadata={
+            key: own.get(key, text)
+            for key, text in features_of_microphone(record, microphone).items()
+        },
         attachments=attachments,
         first_frame=first,
     )
@@ -210,12 +219,20 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
     try:
         features = feature_set(name)
     except ModelError as error:
-        raise LogError(f"{origin.path}: {error}") from error
-    version = origin.metadata.get("feature_set_version", "1")
+        source = origin.metadata.get(DISTRIBUTION, "")
+        known = f" (the recorder had it from {source[:64]})" if source else ""
+        raise LogError(f"{origin.path}: {error}{known}") from error
+    version = origin.metadata.get(VERSION, "1")
     if version != str(features.version):
         raise LogError(
             f"{origin.path}: has features of {name}, version {version[:20]!r}; here is version "
             f"{features.version}, which gives other values"
+        )
+    digest = origin.metadata.get(DIGEST, "")
+    if digest != features.digest:
+        raise LogError(
+            f"{origin.path}: has features of the network {name} with sha256 {digest[:12]!r}; here "
+            f"is {features.digest[:12]!r}, which gives other values"
         )
     return features
 

@@ -7,20 +7,29 @@ from pathlib import Path
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
-from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.log.description import LogDescription, with_scenarios
 from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.schemas.logs.feature_record import FEATURE_SET
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.topics import CANDIDATE, topics_of
+from hearthlog.schemas.messages.topics import (
+    CANDIDATE,
+    SCENARIO,
+    scenario_labelling,
+    topics_of,
+)
 
+_OF_RECORDER = (CANDIDATE, SCENARIO, FEATURE_SET)  # entries that are not those of the new log
 # How attachments begin that are about the models of microphones.
 _MODELS = tuple(name.partition(".")[0] + "." for name in (CARD, DESCRIPTION))
 
 
-def describe(
+def describe(  # noqa: PLR0913, PLR0917
     recorded: RecorderInfo,
     features: FeatureSet,
     model: Model | None,
+    scenarios: Mapping[str, Model],
     output: Path,
     replayed: Mapping[str, str],
 ) -> LogDescription:
@@ -34,6 +43,8 @@ def describe(
         Of the features in the new log.
     model : Model or None
         The model that labels the new log; None if there are no labels.
+    scenarios : mapping of str to Model
+        Those that label beside it, by the name of the scenario.
     output : Path
         Folder of the new log.
     replayed : mapping of str to str
@@ -46,19 +57,20 @@ def describe(
     attachments = [item for item in recorded.attachments if not item.name.startswith(_MODELS)]
     if model is not None:
         attachments += model_attachments(model)
-    return LogDescription(
+    named = {scenario_labelling(name): list(one.classes) for name, one in scenarios.items()}
+    description = LogDescription(
         root=output,
         node=recorded.node,
-        topics=topics_of(recorded.microphone, features.feature_names, classes),
+        topics=topics_of(recorded.microphone, features.feature_names, classes, named),
         infos=[info],
         metadata={
-            **{k: v for k, v in recorded.metadata.items() if not k.startswith(CANDIDATE)},
+            **{k: v for k, v in recorded.metadata.items() if not k.startswith(_OF_RECORDER)},
             **provenance(recorded.node),
-            "feature_set": features.name,
-            "feature_set_version": str(features.version),
+            **entries_of(features),
             "model": info.model,
             "model_sha256": info.model_sha256,
             **replayed,
         },
         attachments=attachments,
     )
+    return with_scenarios(description, recorded.microphone, scenarios)

@@ -1,6 +1,6 @@
 """How logs are replayed, and what came of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,8 @@ class ReplayOptions:
 
     kind: str = "features"  # or "audio", for clips
     model: Callable[[RecorderInfo], Model | None] = lambda _: None  # None: no labels
+    # By the name of the scenario: those that label beside it.
+    scenarios: Mapping[str, Model] = field(default_factory=dict)
     output: Path | None = None  # folder of the new log, if there is to be one
     start_offset: float = 0.0  # seconds from the first message
     duration: float | None = None  # seconds; None for all

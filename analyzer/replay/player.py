@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event as Flag
 
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, features_of
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, features_of, models_for
 from hearthlog.analyzer.replay.description import describe
 from hearthlog.analyzer.replay.options import Replay, ReplayOptions
 from hearthlog.analyzer.replay.recorded import Features, RecordedBatch
@@ -20,13 +20,14 @@ from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.topics import CANDIDATE, topic
+from hearthlog.schemas.messages.topics import CANDIDATE, SCENARIO, scenario_labelling, topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096
-_MODELS = "model", CANDIDATE
+_BESIDE = CANDIDATE, SCENARIO
 _LOST = "the log that was replayed does not have it"
 
 
@@ -174,7 +175,8 @@ class Player:
         classifier = None if model is None else Classifier(model)
         clips = self._options.kind != "features"  # which do not say how often
         every = LOGGED_EVERY if clips else configuration.statistics_every
-        self._pipeline = Pipeline(info.microphone, features, classifier, every)
+        beside = self._scenarios(info, features)
+        self._pipeline = Pipeline(info.microphone, features, classifier, every, beside)
         if self._options.output is not None:
             self._log = RollingLog(
                 self._describe(info, model),
@@ -194,6 +196,20 @@ class Player:
             check_model(info, model)
         return features_of(info)
 
+    def _scenarios(self, info: RecorderInfo, features: FeatureSet) -> dict[str, Classifier]:
+        """Return what labels beside the model, by labelling."""
+        beside = {}
+        for name, model in self._options.scenarios.items():
+            classifier = Classifier(model)
+            if classifier.feature_set != features:
+                theirs = classifier.feature_set.name
+                raise LogError(
+                    f"{info.path}: is replayed with feature set {features.name}; model "
+                    f"{model.name} of scenario {name} is for {theirs}: {models_for(features.name)}"
+                )
+            beside[scenario_labelling(name)] = classifier
+        return beside
+
     def _goes_on(self, info: RecorderInfo) -> bool:
         """Tell whether a log is of the same run of a recorder, but of another model."""
         assert self._info is not None
@@ -201,7 +217,7 @@ class Player:
             return False
         first = info.first_frame[0]
         follows = first == self._next or (self._after_gap and first > self._next)
-        same = _without(info, *_MODELS) == _without(self._info, *_MODELS)
+        same = _without(info, "model", *_BESIDE) == _without(self._info, "model", *_BESIDE)
         return self._next > 0 and follows and same
 
     def _change_model(self, info: RecorderInfo) -> None:
@@ -226,7 +242,8 @@ class Player:
         kind = "clips" if self._options.kind == "audio" else self._options.kind
         replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
         features = self._pipeline.feature_set
-        return describe(info, features, model, self._options.output, replayed)
+        scenarios = self._options.scenarios
+        return describe(info, features, model, scenarios, self._options.output, replayed)
 
     def _join(self, event: Features) -> None:
         """Begin anew or add a gap where frames do not follow the last ones, as the recorder did."""
@@ -327,7 +344,7 @@ def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool
     """Tell whether a log is of another run of a recorder than the last one."""
     if info.first_frame is not None and info.first_frame[0] < next_frame:
         return True
-    same = _without(info, CANDIDATE) == _without(last, CANDIDATE)
+    same = _without(info, *_BESIDE) == _without(last, *_BESIDE)
     return not same or info.model_sha256 != last.model_sha256
 
 

@@ -1,13 +1,15 @@
-"""The models that label the sound of microphones: one in use, and one on trial beside it."""
+"""The models that label the sound of microphones: one, a candidate, and those of scenarios."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
+from hearthlog.recorder.labelling.clashes import clash
 from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch
-from hearthlog.schemas.messages.topics import CANDIDATE, LIVE
+from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labelling
 
 
 class Change(NamedTuple):
@@ -16,7 +18,7 @@ class Change(NamedTuple):
     Attributes
     ----------
     labelling : str
-        `live`, or `candidate` for the model on trial.
+        `live`, `candidate` for the model on trial, or `scenario/<name>`.
     model : Model or None
         None for no labels.
     classifier : Classifier or None
@@ -37,33 +39,62 @@ class LabellingModels:
         Gives the models, one after the other; None for no labels.
     candidates : CandidateWatch or None
         Gives the models that label on trial beside them.
+    scenarios : mapping of str to ModelWatch, optional
+        Give the models of scenarios, by the name of the scenario.
 
     Attributes
     ----------
-    model, candidate : Model or None
-        In use, and on trial.
-    classifier, candidate_classifier : Classifier or None
-        Of these.
+    in_use : dict of str to Loaded
+        By labelling: `live`, `candidate` for the model on trial, `scenario/<name>`.
+
+    Raises
+    ------
+    ConfigurationError
+        If two of them, the one on trial aside, label the same class.
     """
 
     def __init__(
-        self, watch: ModelWatch | None = None, candidates: CandidateWatch | None = None
+        self,
+        watch: ModelWatch | None = None,
+        candidates: CandidateWatch | None = None,
+        scenarios: Mapping[str, ModelWatch] | None = None,
     ) -> None:
-        self._watch = watch
+        self._watches = {} if watch is None else {LIVE: watch}
+        for name, each in (scenarios or {}).items():
+            self._watches[scenario_labelling(name)] = each
         self._candidates = candidates
-        self.model: Model | None
-        self.classifier: Classifier | None
-        self.model, self.classifier = (None, None) if watch is None else watch.first
         self._offered = None if candidates is None else candidates.first
-        self.candidate: Model | None
-        self.candidate_classifier: Classifier | None
-        self.candidate, self.candidate_classifier = self._on_trial()
+        self.in_use: dict[str, Loaded] = {}
+        for labelling, each in self._watches.items():
+            if reason := clash(each.first.model, self._others(labelling)):
+                where = labelling.replace("/", " ")
+                raise ConfigurationError(f"{where}: model {each.first.model.name} {reason}")
+            self.in_use[labelling] = each.first
+        self._change_trial()
+
+    @property
+    def model(self) -> Model | None:
+        """The model that labels; None for no labels."""
+        return self.in_use[LIVE].model if LIVE in self.in_use else None
+
+    @property
+    def classifier(self) -> Classifier | None:
+        """Of that model."""
+        return self.in_use[LIVE].classifier if LIVE in self.in_use else None
+
+    def beside(self) -> dict[str, Loaded]:
+        """Return what labels beside that model, by labelling."""
+        return {name: loaded for name, loaded in self.in_use.items() if name != LIVE}
 
     def refusals(self) -> Sequence[str]:
         """Return why models were refused since the last call, and look for others."""
         refusals: list[str] = []
-        if self._watch is not None:
-            refusals += self._watch.refusals()
+        for labelling, watch in self._watches.items():
+            refusals += watch.refusals()
+            if watch.ready is None:
+                continue
+            if reason := clash(watch.ready.model, self._others(labelling)):
+                refusals.append(watch.refuse_ready(reason, self.in_use[labelling].model))
         if self._candidates is not None:
             for candidate in self._candidates.news():
                 self._offered = candidate
@@ -72,31 +103,44 @@ class LabellingModels:
 
     def may_change(self) -> bool:
         """Tell whether another model is ready to label."""
-        is_ready = self._watch is not None and self._watch.ready is not None
+        is_ready = any(watch.ready is not None for watch in self._watches.values())
         return is_ready or self._trial_changes()
 
     def change(self) -> list[Change]:
         """Put the models in use that are ready."""
         changes = []
-        if self._watch is not None and self._watch.ready is not None:
-            (self.model, self.classifier), self._watch.ready = self._watch.ready, None
-            changes.append(Change(LIVE, self.model, self.classifier))
+        for labelling, watch in self._watches.items():
+            if watch.ready is not None:
+                self.in_use[labelling], watch.ready = watch.ready, None
+                changes.append(Change(labelling, *self.in_use[labelling]))
         if self._trial_changes():
-            self.candidate, self.candidate_classifier = self._on_trial()
-            changes.append(Change(CANDIDATE, self.candidate, self.candidate_classifier))
+            changes.append(self._change_trial())
         return changes
 
-    def _trial_changes(self) -> bool:
-        model, _ = self._on_trial()
-        return _identity(model) != _identity(self.candidate)
+    def _others(self, labelling: str) -> dict[str, Model]:
+        """Return the models that a model of a labelling must not share classes with."""
+        others = {name: watch for name, watch in self._watches.items() if name != labelling}
+        loaded = {name: watch.ready or self.in_use.get(name) for name, watch in others.items()}
+        return {name: each.model for name, each in loaded.items() if each is not None}
 
-    def _on_trial(self) -> Loaded | tuple[None, None]:
+    def _change_trial(self) -> Change:
+        loaded = self._on_trial()
+        self.in_use.pop(CANDIDATE, None)
+        if loaded is None:
+            return Change(CANDIDATE, None, None)
+        self.in_use[CANDIDATE] = loaded
+        return Change(CANDIDATE, *loaded)
+
+    def _trial_changes(self) -> bool:
+        return _identity(self._on_trial()) != _identity(self.in_use.get(CANDIDATE))
+
+    def _on_trial(self) -> Loaded | None:
         """Return the candidate, unless it is the model in use."""
         in_use = "" if self.model is None else self.model.sha256
         if self._offered is None or self._offered.model.sha256 == in_use:
-            return None, None
+            return None
         return self._offered
 
 
-def _identity(model: Model | None) -> tuple[str, str] | None:
-    return None if model is None else (model.name, model.sha256)
+def _identity(loaded: Loaded | None) -> tuple[str, str] | None:
+    return None if loaded is None else (loaded.model.name, loaded.model.sha256)

@@ -1,6 +1,7 @@
 """The model file in use, watched: a file that replaces it is loaded and checked in a thread.
 
-A model that replaces another one labels only if there is a judgement that lets it.
+A model that replaces another one labels only if there is a judgement that lets it; one of a
+scenario needs none.
 """
 
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.judgement import judgement_path, read_judgement
 from hearthlog.models.modelfile.modelfile import load_model, name_and_digest
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL
@@ -67,6 +69,8 @@ class ModelWatch:
     requests : SimpleQueue
         An item makes the watch check at once, and report again what it has refused. Unlike an
         event, a queue can be used from a signal handler at any moment.
+    scenario : str, optional
+        Name of the one whose model it is; by default it is the one that labels the home.
 
     Attributes
     ----------
@@ -81,12 +85,14 @@ class ModelWatch:
         If the model at the start cannot be used.
     """
 
-    def __init__(self, path: Path, requests: SimpleQueue[None]) -> None:
+    def __init__(self, path: Path, requests: SimpleQueue[None], scenario: str = "") -> None:
         self._path = path
         self._requests = requests
+        self._scenario = scenario
         self._seen = file_identity(path)  # before it is loaded: a later file is another one
-        self._starts_with_starter = path == DEFAULT_MODEL and self._seen is None
-        self.first = load_checked(Path(GENERAL) if self._starts_with_starter else path)
+        is_default = path == DEFAULT_MODEL and not scenario
+        self._starts_with_starter = is_default and self._seen is None
+        self.first = self._load_first()
         self.ready: Loaded | None = None
         self._awaited: Path | None = None  # the judgement that the model in the file lacks
         self._judged: FileIdentity = None
@@ -96,6 +102,14 @@ class ModelWatch:
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
         self._thread.start()
+
+    def _load_first(self) -> Loaded:
+        if self._starts_with_starter:
+            return load_checked(Path(GENERAL))
+        try:
+            return load_checked(self._path)
+        except ModelError as error:
+            raise ModelError(f"{self._where()}{error}") from error
 
     def refusals(self) -> Iterator[str]:
         """Yield why models were refused since the last call, and update `ready`.
@@ -112,6 +126,27 @@ class ModelWatch:
                     yield result
                 else:
                     self.ready = result
+
+    def refuse_ready(self, reason: str, in_use: Model) -> str:
+        """Refuse the model that is ready.
+
+        Parameters
+        ----------
+        reason : str
+            Why it cannot be used.
+        in_use : Model
+            The one that goes on.
+
+        Returns
+        -------
+        str
+            A sentence about it.
+        """
+        assert self.ready is not None
+        name, self.ready, self._last = self.ready.model.name, None, in_use
+        text = self._refusal(name, reason)
+        say(text)
+        return text
 
     def close(self) -> None:
         """End the thread."""
@@ -167,6 +202,8 @@ class ModelWatch:
 
     def _unjudged(self, model: Model) -> str:
         """Tell why a model may not label; empty if it may."""
+        if self._scenario:
+            return ""
         folder = self._path.parent
         awaited = judgement_path(folder, model.sha256)
         judged = file_identity(awaited)  # before it is read: a later one is another one
@@ -180,10 +217,15 @@ class ModelWatch:
         return f"{judgement.reasons[0]}; `{promote} --anyway` insists"
 
     def _refuse(self, reason: str, name: str = "") -> None:
-        name = name or self._path.stem
-        text = f"model {name} refused: {reason}; going on with {self._last.name}"
+        text = self._refusal(name or self._path.stem, reason)
         self._results.put(text)
         say(text)
+
+    def _refusal(self, name: str, reason: str) -> str:
+        return f"{self._where()}model {name} refused: {reason}; going on with {self._last.name}"
+
+    def _where(self) -> str:
+        return f"scenario {self._scenario}: " if self._scenario else ""
 
 
 def _warn_if_simulated(model: Model) -> None:

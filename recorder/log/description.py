@@ -2,17 +2,20 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile.card import attachment_of, model_attachments
 from hearthlog.recorder.config import Settings
+from hearthlog.schemas.logs.feature_record import other_features
 from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.topics import Topic, topics_of
+from hearthlog.schemas.logs.scenario_record import RecordedScenario, scenario_entries
+from hearthlog.schemas.messages.topics import CANDIDATE, SCENARIO, Topic, topics_of
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class LogDescription:
     infos: Sequence[Any]  # `AudioStreamInfo` of each microphone; each file sets their stamps
     metadata: Mapping[str, str]  # the `hearthlog` record
     attachments: Sequence[Attachment]
+    # By microphone, what the lines of `/rosout` at the start of a file say besides.
+    lines: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def describe_log(
@@ -32,7 +37,7 @@ def describe_log(
     info: Any,
     features: FeatureSet,
     model: Model | None,
-    candidate: Model | None = None,
+    beside: Mapping[str, Model] | None = None,
 ) -> LogDescription:
     """Return the description of the logs of one microphone.
 
@@ -44,36 +49,80 @@ def describe_log(
     features : FeatureSet
     model : Model or None
         The model that labels the sound; None for no labels.
-    candidate : Model or None
-        A model on trial that labels beside it.
+    beside : mapping of str to Model, optional
+        Those that label beside it, by labelling: `candidate`, `scenario/<name>`.
     """
-    configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
+    beside = beside or {}
+    microphone = info.header.frame_id
+    elsewhere = {"output", "model", "scenarios"}  # of this machine
+    configuration = settings.model_dump_json(indent=2, exclude=elsewhere).encode()
     classes = None if model is None else list(model.classes)
     attachments = [Attachment("configuration.json", "application/json", configuration)]
     metadata = provenance(
         settings.node,
         configuration_sha256=hashlib.sha256(configuration).hexdigest(),
-        feature_set=features.name,
-        feature_set_version=str(features.version),
+        **entries_of(features),
         model=info.model,
         model_sha256=info.model_sha256,
         timezone=settings.timezone,
     )
-    if candidate is not None:
+    if (candidate := beside.get(CANDIDATE)) is not None:
         metadata |= {"candidate": candidate.name, "candidate_sha256": candidate.sha256}
-    return LogDescription(
+    if model is not None:
+        attachments += model_attachments(model)
+    named = {labelling: list(one.classes) for labelling, one in beside.items()}
+    description = LogDescription(
         root=settings.output,
         node=settings.node,
         topics=topics_of(
-            info.header.frame_id,
+            microphone,
             features.feature_names,
             classes,
-            None if candidate is None else list(candidate.classes),
+            named,
+            directions=bool(settings.settings_of(microphone).array),
         ),
         infos=[info],
         metadata=metadata,
-        attachments=attachments if model is None else [*attachments, *model_attachments(model)],
+        attachments=attachments,
     )
+    parts = {labelling.partition("/"): one for labelling, one in beside.items()}
+    scenarios = {name: one for (kind, _, name), one in parts.items() if kind == SCENARIO}
+    return with_scenarios(description, microphone, scenarios)
+
+
+def with_scenarios(
+    description: LogDescription, microphone: str, scenarios: Mapping[str, Model]
+) -> LogDescription:
+    """Add what logs say of the scenarios of a microphone, but their topics.
+
+    Parameters
+    ----------
+    description : LogDescription
+    microphone : str
+        Its name.
+    scenarios : mapping of str to Model
+        The models that label for them, by the name of the scenario.
+    """
+    entries = dict(description.metadata)
+    attachments = list(description.attachments)
+    for name, model in scenarios.items():
+        entries |= scenario_entries(RecordedScenario(microphone, name, model.name, model.sha256))
+        attachments += _scenario_attachments(name, model)
+    lines = [
+        f"scenario {name}: {len(model.classes)} labels by {model.name} ({model.sha256[:12]})"
+        for name, model in scenarios.items()
+    ]
+    return replace(
+        description,
+        metadata=entries,
+        attachments=attachments,
+        lines={**description.lines, microphone: lines},
+    )
+
+
+def _scenario_attachments(scenario: str, model: Model) -> list[Attachment]:
+    own = f"{SCENARIO}-{scenario}"  # no microphone is called so
+    return [replace(each, name=attachment_of(each.name, own)) for each in model_attachments(model)]
 
 
 def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
@@ -82,8 +131,8 @@ def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
     Parameters
     ----------
     descriptions : sequence of LogDescription
-        One for each microphone. The metadata are those of the first; attachments of another one
-        are named after it where they differ.
+        One for each microphone. The metadata are those of the first, with the scenarios of all;
+        attachments of another one are named after it where they differ.
     """
     first = descriptions[0]
     attachments = {each.name: each for each in first.attachments}
@@ -94,8 +143,20 @@ def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
                 name = attachment_of(each.name, info.header.frame_id)
                 attachments[name] = replace(each, name=name)
     topics = {topic.name: topic for each in descriptions for topic in each.topics}
+    features: dict[str, str] = {}
+    for other in descriptions[1:]:
+        (info,) = other.infos
+        features |= other_features(first.metadata, other.metadata, info.header.frame_id)
+    scenarios = {
+        key: text
+        for each in descriptions
+        for key, text in each.metadata.items()
+        if key.startswith(SCENARIO)
+    }
     return replace(
         first,
+        metadata={**first.metadata, **features, **scenarios},
+        lines={name: lines for each in descriptions for name, lines in each.lines.items()},
         topics=list(topics.values()),
         infos=[info for each in descriptions for info in each.infos],
         attachments=list(attachments.values()),

@@ -298,7 +298,7 @@ class RollingLog:
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
         for info in description.infos:
             info.header = header(stamp, info.header.frame_id)
-            for message in opening_messages(info):
+            for message in opening_messages(info, description.lines.get(info.header.frame_id, ())):
                 self._append(message)
         self._writer.flush()  # the file now says what it is, whatever happens next
         self._flush_at = None

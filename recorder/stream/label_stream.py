@@ -24,7 +24,7 @@ class LabelStream:
     microphone : str
         Its name.
     labelling : str
-        `live`, or `candidate`, whose segments are not told in `/rosout`.
+        `live`, or another one, whose segments are not told in `/rosout`.
     classifier : Classifier
 
     Attributes

@@ -1,9 +1,11 @@
 """Encoded messages, and those with which every file of a stream begins."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.recorder.events import OK, Notice
 from hearthlog.recorder.stream import rosout
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import message_types
@@ -52,21 +54,24 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
     )
 
 
-def opening_messages(info: Any) -> list[EncodedMessage]:
+def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessage]:
     """Return the first messages of every file: its `AudioStreamInfo`, and the same in words.
 
     Parameters
     ----------
     info : message
         `AudioStreamInfo`, with the start of the file as its stamp.
+    lines : sequence of str, optional
+        What is said besides.
 
     Returns
     -------
     list of EncodedMessage
-        Both at that time.
+        All at that time.
     """
-    stamp = nanoseconds(info.header.stamp)
+    stamp, microphone = nanoseconds(info.header.stamp), info.header.frame_id
+    said = [rosout.notice_line(microphone, stamp, Notice(OK, line)) for line in lines]
     return [
-        EncodedMessage(stamp, topic(info.header.frame_id, "info"), encode(info)),
-        EncodedMessage(stamp, ROSOUT, rosout.info_line(info)),
+        EncodedMessage(stamp, topic(microphone, "info"), encode(info)),
+        *(EncodedMessage(stamp, ROSOUT, line) for line in (rosout.info_line(info), *said)),
     ]

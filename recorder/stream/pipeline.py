@@ -1,7 +1,7 @@
 """Frames in, encoded messages out: features, statistics, labels and segments. No I/O."""
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
@@ -12,9 +12,11 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.diagnostics import diagnostics
+from hearthlog.recorder.stream.direction_messages import DirectionMessages
 from hearthlog.recorder.stream.feature_messages import FeatureMessages
 from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -24,7 +26,7 @@ from hearthlog.recorder.stream.veil import Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.gaps import encode_gap
-from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, ROSOUT, topic
+from hearthlog.schemas.messages.topics import LIVE, ROSOUT, topic
 
 
 class Pipeline:
@@ -40,11 +42,14 @@ class Pipeline:
         For this feature set. Without one there are no labels.
     statistics_every : int
         Frames from one statistics message to the next: those of the frames whose number it divides.
-    candidate : Classifier or None
-        Of a model on trial, which labels beside the other one.
+    beside : mapping of str to Classifier, optional
+        What labels beside it, for the same feature set, by labelling: `candidate`,
+        `scenario/<name>`.
     private : sequence of str
         Classes whose features are logged coarsely, as of `Veil`. With one, all messages come two
         seconds later at most, so that log time never runs backwards.
+    array : ArrayGeometry or None
+        Of an array of microphones; without one there are no directions.
 
     Attributes
     ----------
@@ -58,14 +63,16 @@ class Pipeline:
         features: FeatureSet,
         classifier: Classifier | None = None,
         statistics_every: int = LOGGED_EVERY,
-        candidate: Classifier | None = None,
+        beside: Mapping[str, Classifier] | None = None,
         private: Sequence[str] = (),
+        array: ArrayGeometry | None = None,
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
+        live = {} if classifier is None else {LIVE: classifier}
         self._streams = {
-            LIVE: self._stream(LIVE, classifier),
-            CANDIDATE: self._stream(CANDIDATE, candidate),
+            labelling: LabelStream(microphone, labelling, one)
+            for labelling, one in (live | dict(beside or {})).items()
         }
         window, width = features.window_frames, features.width
         self._features = features.extractor()
@@ -78,12 +85,13 @@ class Pipeline:
         self._recent_floors: Float64 | None = None  # of the last window
         self._recent_stamps = np.empty(0, np.int64)  # of the last window
         self._watch = SoundWatch()
+        self._directions = None if array is None else DirectionMessages(microphone, array)
         self._end = 0
         self._level = OK
 
     @property
     def _live(self) -> LabelStream | None:
-        return self._streams[LIVE]
+        return self._streams.get(LIVE)
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -114,12 +122,20 @@ class Pipeline:
         """
         if isinstance(event, Frames):
             self._watch.add_samples(event.samples)
-            return self.push_features(self._features(event.samples), event.first, event.stamps)
+            directions = [] if self._directions is None else self._directions(event)
+            features = self._features(event.samples)
+            return self.push_features(features, event.first, event.stamps, directions)
         if isinstance(event, Gap):
             return self.hold(self._push_gap(event))
         return self.hold(self._push_health(event))
 
-    def push_features(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
+    def push_features(
+        self,
+        features: Float32,
+        first: int,
+        stamps: Int64,
+        directions: Sequence[EncodedMessage] = (),
+    ) -> list[EncodedMessage]:
         """Turn the features of successive frames into messages.
 
         Parameters
@@ -129,6 +145,8 @@ class Pipeline:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
+        directions : sequence of EncodedMessage, optional
+            Of these frames.
 
         Returns
         -------
@@ -139,7 +157,7 @@ class Pipeline:
         logged = features, first, stamps
         if self._veil is not None:
             logged = self._veil.push(*logged, self.last_labels)
-        messages = [*self._feature_messages(*logged), *labels]
+        messages = [*self._feature_messages(*logged), *directions, *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
         return self.hold(messages)
@@ -215,7 +233,7 @@ class Pipeline:
         frame, stamp : int
             Number of the next frame, and its start in nanoseconds of UTC.
         labelling : str
-            `live`, or `candidate` for the model on trial.
+            `live`, `candidate` or `scenario/<name>`.
 
         Returns
         -------
@@ -225,12 +243,13 @@ class Pipeline:
             First messages of the log of this model.
         """
         held = self.flush()
-        earlier, stream = self._streams[labelling], self._stream(labelling, classifier)
-        self._streams[labelling] = stream
+        earlier = self._streams.pop(labelling, None)
         closing = [] if earlier is None else earlier.close(stamp)
-        self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
-        what = "model" if labelling == LIVE else labelling
-        opening = self.report("model", stamp, _from_frame(what, model, frame))
+        if classifier is not None:
+            stream = LabelStream(self.microphone, labelling, classifier)
+            self._streams[labelling] = stream
+            self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
+        opening = self.report("model", stamp, _from_frame(labelling, model, frame))
         if unknown := self.unknown_private():
             names = ", ".join(map(repr, unknown))
             text = (
@@ -243,13 +262,10 @@ class Pipeline:
         """Return the private classes that the model in use does not know."""
         return [] if self._veil is None else self._veil.unknown(self.classes)
 
-    def _stream(self, labelling: str, classifier: Classifier | None) -> LabelStream | None:
-        return None if classifier is None else LabelStream(self.microphone, labelling, classifier)
-
-    def _follow(self, stream: LabelStream | None, frame: int, unlabelled: int) -> None:
+    def _follow(self, stream: LabelStream, frame: int, unlabelled: int) -> None:
         """Let a stream begin at a frame, with what is remembered of the frames before."""
         recent, floors = self._recent, self._recent_floors
-        if stream is None or recent is None:
+        if recent is None:
             return
         stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
         if floors is not None:
@@ -287,13 +303,18 @@ class Pipeline:
         ----------
         health : SourceHealth
         """
-        if health.level == OK and (problem := self._watch.problem()):
+        problem = self._watch.problem()
+        if not problem and self._directions is not None:
+            problem = self._directions.problem()
+        if health.level == OK and problem:
             return replace(health, level=WARNING, summary=problem)
         return health
 
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
         held = self._unveil()
         self._features.restart()
+        if self._directions is not None:
+            self._directions.restart()
         self._feature_messages.restart()
         self._recent = None
         self._recent_floors = None
@@ -322,17 +343,15 @@ class Pipeline:
     def _labels(
         self, features: Float32, floors: Floors | None, first: int, stamps: Int64
     ) -> list[EncodedMessage]:
-        streams = [stream for stream in self._streams.values() if stream is not None]
         return [
             message
-            for stream in streams
+            for stream in self._streams.values()
             for message in stream.push(features, floors, first, stamps)
         ]
 
     def _close(self, end: int) -> list[EncodedMessage]:
         """End the segments at `end`; the next frame begins anew."""
-        streams = [stream for stream in self._streams.values() if stream is not None]
-        messages = [message for stream in streams for message in stream.close(end)]
+        messages = [message for stream in self._streams.values() for message in stream.close(end)]
         return sorted(messages, key=attrgetter("log_time"))
 
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
@@ -356,6 +375,7 @@ class Pipeline:
         return {"floor_dbfs": f"{decibels(self._recent_floors[-1, -1]):.1f}"}
 
 
-def _from_frame(what: str, model: Model | None, frame: int) -> Notice:
+def _from_frame(labelling: str, model: Model | None, frame: int) -> Notice:
+    what = "model" if labelling == LIVE else labelling
     who = f"no {what}" if model is None else f"{what} {model.name} ({model.sha256[:12]})"
     return Notice(OK, f"{who} from frame {frame} on")

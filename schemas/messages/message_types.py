@@ -21,6 +21,7 @@ SEGMENT = f"{PACKAGE}/msg/AudioSegment"
 MARK = f"{PACKAGE}/msg/AudioMark"
 REVIEWED = f"{PACKAGE}/msg/AudioReview"
 GAP = f"{PACKAGE}/msg/AudioGap"
+DIRECTION = f"{PACKAGE}/msg/AudioDirection"
 RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 LOG = "rcl_interfaces/msg/Log"
@@ -34,6 +35,7 @@ _DEFINED_HERE = (
     MARK,
     REVIEWED,
     GAP,
+    DIRECTION,
     RAW_AUDIO,
 )
 

@@ -10,12 +10,14 @@ from hearthlog.schemas.messages import message_types
 
 DIAGNOSTICS = "/diagnostics"
 ROSOUT = "/rosout"
-# Labellings: the recorder's, that of a model on trial beside it, a reviewer's, and by its model
-# `relabel/<model>`.
+# Labellings: the recorder's, that of a model on trial beside it, a reviewer's, by its name
+# `scenario/<name>`, and by its model `relabel/<model>`.
 LIVE, CANDIDATE, REVIEW, RELABEL = "live", "candidate", "review", "relabel"
-_MICROPHONE = "[a-z](?:_?[a-z0-9])*"
-_NOT_LIVE = rf"{CANDIDATE}|{REVIEW}|{RELABEL}/\w{{1,200}}"
+SCENARIO = "scenario"
+_MICROPHONE = "[a-z](?:_?[a-z0-9])*"  # and the name of a scenario
+_NOT_LIVE = rf"{CANDIDATE}|{REVIEW}|{SCENARIO}/{_MICROPHONE}|{RELABEL}/\w{{1,200}}"
 LABELLING = re.compile(f"{LIVE}|{_NOT_LIVE}", re.ASCII)
+_LONGEST_SCENARIO = 64
 _TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_NOT_LIVE})/)?(\w+)", re.ASCII)
 
 
@@ -74,6 +76,50 @@ def check_microphone_name(name: str) -> str:
     return name
 
 
+def check_scenario_name(name: str) -> str:
+    """Return the name of a scenario if it can be part of a ROS topic.
+
+    Parameters
+    ----------
+    name : str
+        As that of a microphone, of up to 64 characters.
+
+    Raises
+    ------
+    LogError
+        If the name has another form.
+    """
+    if len(name) > _LONGEST_SCENARIO or not re.fullmatch(_MICROPHONE, name):
+        raise LogError(
+            f"scenario name {name[:80]!r} cannot be part of a topic: use up to "
+            f"{_LONGEST_SCENARIO} lower-case letters, digits and single underscores, starting with "
+            "a letter"
+        )
+    return name
+
+
+def scenario_labelling(name: str) -> str:
+    """Name the labelling of a scenario: `scenario/<name>`.
+
+    Parameters
+    ----------
+    name : str
+        As `check_scenario_name` takes it.
+    """
+    return f"{SCENARIO}/{name}"
+
+
+def is_scenario(labelling: str) -> bool:
+    """Tell whether a labelling is that of a scenario.
+
+    Parameters
+    ----------
+    labelling : str
+        Such as `live` or `scenario/<name>`.
+    """
+    return labelling.startswith(f"{SCENARIO}/")
+
+
 def topic(microphone: str, kind: str) -> str:
     """Name the topic of one kind of a microphone: `/<microphone>/<kind>`.
 
@@ -91,7 +137,7 @@ class TopicName(NamedTuple):
     """The parts of the name of a topic."""
 
     microphone: str
-    labelling: str  # `live`, `candidate`, `review` or `relabel/<model>`
+    labelling: str  # `live`, `candidate`, `review`, `scenario/<name>` or `relabel/<model>`
     kind: str  # `features`, `label`, `segment` …
 
 
@@ -103,7 +149,7 @@ def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
     microphone : str
         Its name.
     labelling : str
-        `live`, `candidate`, `review` or `relabel/<model>`.
+        `live`, `candidate`, `review`, `scenario/<name>` or `relabel/<model>`.
     kind : str
         `label`, `segment` or `mark`.
     """
@@ -158,7 +204,7 @@ def label_topics(microphone: str, labelling: str, classes: Sequence[str]) -> tup
     microphone : str
         Its name.
     labelling : str
-        `live`, `candidate` or `relabel/<model>`.
+        `live`, `candidate`, `scenario/<name>` or `relabel/<model>`.
     classes : sequence of str
         Names of the classes, in the order of the probabilities.
 
@@ -177,7 +223,9 @@ def topics_of(
     microphone: str,
     feature_names: Sequence[str],
     classes: Sequence[str] | None,
-    candidate_classes: Sequence[str] | None = None,
+    beside: Mapping[str, Sequence[str]] | None = None,
+    *,
+    directions: bool = False,
 ) -> list[Topic]:
     """List the topics that a recorder writes for a microphone.
 
@@ -190,8 +238,10 @@ def topics_of(
     classes : sequence of str or None
         Names of the classes, in the order of the probabilities; None for a recorder without a
         model, which writes no labels and no segments.
-    candidate_classes : sequence of str or None
-        Those of a candidate, which labels beside it; None without one.
+    beside : mapping of str to sequence of str, optional
+        The same of the labellings beside it, such as `candidate` or `scenario/<name>`.
+    directions : bool
+        Whether it is an array, and has directions.
     """
     statistics = {"mean": feature_names, "std": feature_names}
     topics = [
@@ -206,10 +256,12 @@ def topics_of(
         Topic(DIAGNOSTICS, message_types.DIAGNOSTICS),
         Topic(ROSOUT, message_types.LOG, _OF_ROSOUT),
     ]
+    if directions:
+        topics.append(Topic(topic(microphone, "direction"), message_types.DIRECTION))
     if classes is not None:
         topics += label_topics(microphone, LIVE, classes)
-    if candidate_classes is not None:
-        topics += label_topics(microphone, CANDIDATE, candidate_classes)
+    for labelling, names in (beside or {}).items():
+        topics += label_topics(microphone, labelling, names)
     return topics
 
 

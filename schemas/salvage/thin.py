@@ -9,7 +9,7 @@ from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.log_stream import PROFILE
 from hearthlog.schemas.logs.provenance import THINNED, THINNED_OF, provenance_records
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.messages.topics import LIVE, parse_topic
+from hearthlog.schemas.messages.topics import LIVE, is_scenario, parse_topic
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.schemas.salvage.recover import check_copy
 from hearthlog.schemas.salvage.salvage import Salvage
@@ -41,7 +41,9 @@ class Thinning(NamedTuple):
         """Tell whether the messages of a topic are dropped."""
         parts = parse_topic(topic)
         if STEPS[self.step] == _REST:
-            return parts is None or parts.labelling != LIVE or parts.kind not in _KEPT
+            if parts is None or parts.kind not in _KEPT:
+                return True
+            return parts.labelling != LIVE and not is_scenario(parts.labelling)
         return parts is not None and parts.kind in _DROPPED[self.step]
 
 

@@ -74,4 +74,6 @@ def _value_lines(
 
 def _toml(value: Any) -> str:
     """Write a value down as TOML; empty for None, which TOML does not have."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_toml(each)}' for key, each in value.items())}}}"
     return "" if value is None else json.dumps(value, ensure_ascii=False)

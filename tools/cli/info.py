@@ -19,6 +19,7 @@ from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.summary import Summary
+    from hearthlog.schemas.logs.scenario_record import RecordedScenario
     from hearthlog.tools.cli.accuracy_text import Accuracy
 
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
@@ -50,19 +51,34 @@ def info(
     for stream in summary.streams:
         stream["starter"] = is_starter(stream["model"], stream["model_sha256"])
     following, accuracy = next_step(summary, path), _accuracy(summary, path)
+    scenarios = _scenarios(summary, path)
     if as_json:
         checked = None if accuracy is None else accuracy.as_json()
-        print(json.dumps(_as_json(summary) | {"checked": checked, "next": following}, indent=2))
+        said = {
+            "scenarios": [one._asdict() for one in scenarios],
+            "checked": checked,
+            "next": following,
+        }
+        print(json.dumps(_as_json(summary) | said, indent=2))
     else:
         _print(summary)
-        if (candidate := _candidate(summary, path)) is not None:
-            print(printable(candidate))
+        print_lines(_model_lines(summary, path, scenarios))
         for line in () if accuracy is None else accuracy.lines():
             print(printable(line))
         if following is not None:
             print(printable(f"next: {following}"))
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
+
+
+def _model_lines(
+    summary: "Summary", path: Path, scenarios: "Sequence[RecordedScenario]"
+) -> Iterator[str]:
+    """Name the models that label beside the recorder's."""
+    if (candidate := _candidate(summary, path)) is not None:
+        yield candidate
+    for one in scenarios:
+        yield f"scenario {one.name}, {one.microphone}: model {one.model} ({one.sha256[:12]})"
 
 
 def _candidate(summary: "Summary", path: Path) -> str | None:
@@ -81,6 +97,21 @@ def _candidate(summary: "Summary", path: Path) -> str | None:
             return f"candidate: {name} ({sha256}), {was}on trial: `{compare}`"
         later.add(node)
     return None
+
+
+def _scenarios(summary: "Summary", path: Path) -> "list[RecordedScenario]":
+    """Return the scenarios that have labels, each with the last model that labelled for it."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.schemas.logs.scenario_record import recorded_scenarios
+    from hearthlog.schemas.messages.topics import SCENARIO
+
+    if not any(f"/{SCENARIO}/" in name for name in summary.topics):
+        return []
+    last: dict[tuple[str, str, str], RecordedScenario] = {}
+    for record in find_home_logs([path]).records():
+        for one in recorded_scenarios(record):
+            last.setdefault((record.get("node", ""), one.microphone, one.name), one)
+    return [last[key] for key in sorted(last)]
 
 
 def _accuracy(summary: "Summary", path: Path) -> "Accuracy | None":

@@ -18,6 +18,7 @@ from hearthlog.tools.cli.options import (
     MinFreeSpace,
     RetentionDays,
     parse_time,
+    scenario_files,
 )
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
@@ -45,6 +46,14 @@ def record(
             help="Model file, or a link to one; general or bathroom, which come with hearthlog; "
             "none: no labels. Another file that takes its place speaks within about a second.",
             show_default="models/champion.safetensors if there is one, else general",
+        ),
+    ] = None,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE",
+            help="A model that labels beside it, on topics of its own, as "
+            "speakers=models/speakers.safetensors; may be repeated.",
         ),
     ] = None,
     device: Annotated[
@@ -107,6 +116,7 @@ def record(
     given = {
         "output": output,
         "model": model,
+        "scenarios": scenario_files(scenario) or None,
         "node": node,
         "max_bag_duration": max_bag_duration,
         "max_bag_size": max_bag_size,
@@ -130,7 +140,10 @@ def record(
             wrong_use("files take the place of one microphone; the configuration has several")
         begin = start_time(start, files[0])
         with share_done("recording") as progress:
-            source = FileSource(files, begin, realtime=realtime, progress=progress)
+            channels = settings.microphone[0].channels
+            source = FileSource(
+                files, begin, realtime=realtime, channels=channels, progress=progress
+            )
             recording = record_files(settings, source, stop, reload_requests)
     elif start is not None or realtime:
         wrong_use("--start and --realtime go with files")

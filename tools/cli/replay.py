@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hearthlog.tools.cli.browser import print_recording
-from hearthlog.tools.cli.options import Json, Microphone
+from hearthlog.tools.cli.options import Json, Microphone, scenario_files
 from hearthlog.tools.cli.text import moment, tell, wrong_use
 
 if TYPE_CHECKING:
@@ -47,6 +47,14 @@ def replay(
             "but no labels (exit status 3)."
         ),
     ] = None,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE",
+            help="A model that labels beside it, as in `hearthlog record`; may be repeated. "
+            "Without it the labels of scenarios are left out.",
+        ),
+    ] = None,
     microphone: Microphone = None,
     source: Annotated[
         Literal["features", "clips"],
@@ -71,6 +79,7 @@ def replay(
     """
     from hearthlog.analyzer.replay.log_set import LogSet
     from hearthlog.analyzer.replay.options import ReplayOptions
+    from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL, starter_file
     from hearthlog.schemas.logs.files import find_logs
 
@@ -78,6 +87,7 @@ def replay(
     if loop and output is not None:
         wrong_use("--loop writes no log: it would be written again and again; leave out --output")
     options = ReplayOptions(
+        scenarios={name: load_model(file) for name, file in scenario_files(scenario).items()},
         kind="audio" if source == "clips" else "features",
         output=output,
         start_offset=start_offset,

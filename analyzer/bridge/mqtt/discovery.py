@@ -11,6 +11,7 @@ from hearthlog.models.classes import SILENCE, in_words
 
 _BY = "Home Assistant"
 _PAUSE_MINUTES = 60
+_OF_SOUND = {"level", "recorder", "problem"}  # whichever model labels it
 
 
 def device_id(node: str, microphone: str) -> str:
@@ -32,6 +33,7 @@ def discovery(
     ----------
     topics : Topics
     microphone : str
+        Its name, or `<microphone>-<scenario>`, whose device has no level and no health.
     classes : sequence of str
         Those of its model.
     gone : sequence of str, optional
@@ -45,6 +47,8 @@ def discovery(
     own = device_id(topics.node, microphone)
     sounds = [name for name in classes if name != SILENCE]
     components = _of_microphone(topics, microphone, sounds)
+    if "-" in microphone:  # which no name of a microphone has
+        components = {kind: each for kind, each in components.items() if kind not in _OF_SOUND}
     for name, words in _words(sounds).items():
         components |= _of_class(topics, microphone, name, words)
     for key, component in components.items():

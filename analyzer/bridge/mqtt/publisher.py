@@ -87,10 +87,11 @@ class MqttPublisher:
     def update(self, news: News) -> None:
         """Say what is new."""
         self._connection.keep(self._topics.of_home("recorder"), _ONLINE[news.state.is_recording()])
+        for each in news.state.every():
+            if each.classes != self._classes.get(each.name, []):
+                self._describe(each)
+            self._say_state(each, news)
         for microphone in news.state.microphones.values():
-            if microphone.classes != self._classes.get(microphone.name, []):
-                self._describe(microphone)
-            self._say_state(microphone, news)
             self._say_problem(microphone, news.state)
         self._clear_others(news.state)
         self._describe_switches()
@@ -214,7 +215,7 @@ class MqttPublisher:
 
     def _clear_others(self, state: HomeState) -> None:
         """Have the broker forget the classes that earlier models had."""
-        for name in self._held.other_microphones(state.microphones):
+        for name in self._held.other_microphones([each.name for each in state.every()]):
             self._connection.keep(self._topics.of_microphone(name, "listening"), _ONLINE[False])
         for name, classes in self._classes.items():
             gone = self._held.other_classes(name, classes)
