@@ -216,3 +216,31 @@ def write_own(folder):
         sound = {"Toilet flush": "flushing_water", "other negative": "yelling"}.get(label, label)
         write_sound(folder / name, sound)
     return folder
+
+
+def write_ravdess(folder):
+    """Nine clips of three actors, and one that is called otherwise."""
+    for actor in (1, 2, 12):
+        for emotion, sound in ((5, "yelling"), (4, "crying"), (2, "speech")):
+            name = f"03-01-{emotion:02d}-01-02-01-{actor:02d}.wav"
+            write_sound(folder / f"Actor_{actor:02d}" / name, sound)
+    write_sound(folder / "Actor_01" / "copy of 03-01-05.wav", "speech")
+    return folder
+
+
+def write_emodb(folder):
+    """Nine clips of three actors, and one of an emotion that there is not."""
+    for actor in ("03", "08", "16"):
+        for letter, sound in (("W", "yelling"), ("T", "crying"), ("N", "speech")):
+            write_sound(folder / "wav" / f"{actor}a01{letter}a.wav", sound)
+    write_sound(folder / "wav" / "03a01Xa.wav", "speech")
+    return folder
+
+
+def write_voxceleb(folder):
+    """Ten clips of two people, each in five videos."""
+    for person, sound in (("id10001", "speech"), ("id10270", "yelling")):
+        for number in range(5):
+            video = f"{'abcde'[number]}{person[2:]}-_678"
+            write_sound(folder / "wav" / person / video / "00001.wav", sound)
+    return folder

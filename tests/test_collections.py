@@ -37,6 +37,9 @@ WRITERS = {
     "desed": made.write_desed,
     "vocalsound": made.write_vocalsound,
     "audioset-strong": made.write_audioset_strong,
+    "ravdess": made.write_ravdess,
+    "emodb": made.write_emodb,
+    "voxceleb": made.write_voxceleb,
     "folder": made.write_own,
 }
 # What two classes can be told apart in each of them.
@@ -45,7 +48,12 @@ CLASSES = {
     "desed": ("speech", "objects_activity"),
     "audioset-strong": ("coughing", "speech"),
     "folder": ("flushing_water", "laughing"),
+    "ravdess": ("anger", "sadness"),
+    "emodb": ("anger", "sadness"),
+    "voxceleb": ("id10001", "id10270"),
 }
+MOODS = {"anger", "sadness", "neutral", "id10001", "id10270"}
+KEPT = {"ravdess", "emodb", "voxceleb"}  # whose labels are moods or people
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +97,11 @@ def test_three_commands_make_a_manifest_a_model_and_an_evaluation(written, tmp_p
     table, model = tmp_path / "manifest.csv", tmp_path / "made.safetensors"
     first, second = CLASSES.get(name, ("coughing", "laughing"))
     scenario = tmp_path / "own.toml"
-    scenario.write_text(f'[classes]\none = ["{first}"]\ntwo = ["{second}"]\n')
+    more = ', "neutral"' if name in KEPT else ""
+    scenario.write_text(f'[classes]\none = ["{first}"]\ntwo = ["{second}"{more}]\n')
     done = command("manifest", name, written[name], "-o", table)
     assert done.exit_code == 0, done.stderr
-    clips = read_manifest(table, LABELS)
+    clips = read_manifest(table, LABELS | MOODS if name in KEPT else LABELS)
     assert f"{table}: {len(clips)} clips" in done.stdout
     done = command("train", "--data", table, "--scenario", scenario, "-o", model, "--json")
     assert done.exit_code == 0, done.stderr
@@ -200,6 +209,40 @@ def test_speakers_of_vocalsound_are_sources(written, tmp_path):
         "sneeze": "other_negative",
         "sigh": "other_negative",
     }
+
+
+def test_emotions_are_labels_and_their_actors_sources(written, tmp_path):
+    rows = rows_of("ravdess", written["ravdess"], tmp_path / "r.csv")
+    assert {(row["detail"], row["label"]) for row in rows} == {
+        *(("angry", "anger"), ("sad", "sadness"), ("calm", "neutral"))
+    }
+    assert {row["source_group"] for row in rows} == {"ravdess_01", "ravdess_02", "ravdess_12"}
+    rows = rows_of("emodb", written["emodb"], tmp_path / "e.csv")
+    assert {row["label"] for row in rows} == {"anger", "sadness", "neutral"}
+    assert {row["source_group"] for row in rows} == {"emodb_03", "emodb_08", "emodb_16"}
+
+
+def test_actors_may_lie_in_a_folder_of_their_own_or_of_all(written, tmp_path):
+    inner = tmp_path / "RAVDESS" / "Audio_Speech_Actors_01-24"
+    shutil.copytree(written["ravdess"], inner)
+    rows = rows_of("ravdess", inner.parent, tmp_path / "r.csv")
+    assert len(rows) == 9
+
+
+def test_people_are_labels_and_their_videos_sources(written, tmp_path):
+    rows = rows_of("voxceleb", written["voxceleb"], tmp_path / "v.csv")
+    assert {row["label"] for row in rows} == {"id10001", "id10270"}
+    assert len({row["source_group"] for row in rows}) == 10
+    assert rows[0]["source_group"] == "youtube_a10001-_678"
+
+
+def test_a_clip_in_another_place_than_those_of_a_collection_is_left_out(copied, tmp_path):
+    folder = copied("voxceleb")
+    shutil.copy(next(folder.rglob("*.wav")), folder / "wav" / "stray.wav")
+    done = command("manifest", "voxceleb", folder, "-o", tmp_path / "v.csv")
+    assert "left out: 1, not placed as a clip of the collection\n" in done.stdout
+    done = command("manifest", "emodb", copied("emodb"), "-o", tmp_path / "e.csv")
+    assert "left out: 1, not named as a clip of the collection\n" in done.stdout
 
 
 def test_sounds_of_desed_are_parts_of_files(written, tmp_path):
@@ -313,7 +356,7 @@ def test_the_map_that_is_printed_can_be_used(written, tmp_path, name):
     (tmp_path / "map.toml").write_text(printed.stdout)
     usual = rows_of(name, written[name], tmp_path / "a.csv")
     assert rows_of(name, written[name], tmp_path / "b.csv", map_file=tmp_path / "map.toml") == usual
-    assert set(read_map(name).label_of.values()) <= LABELS
+    assert name in KEPT or set(read_map(name).label_of.values()) <= LABELS
 
 
 def test_what_is_left_out_is_counted_by_its_reason(written, tmp_path):
@@ -343,8 +386,12 @@ def test_an_edited_map_changes_labels(written, tmp_path):
     [
         ("", "needs a table [labels]"),
         ("labels = 3", "needs a table [labels]"),
-        ('negative = ["a"]\n[labels]', "unknown key 'negative'; known are broad, labels, skip"),
+        (
+            'negative = ["a"]\n[labels]',
+            "unknown key 'negative'; known are broad, keep, labels, skip",
+        ),
         ('skip = "a"\n[labels]', "'skip' must be"),
+        ('keep = "a"\n[labels]', "'keep' must be true or false"),
         ("[labels]\nspeech = [1]", "'speech' must be"),
         ('[labels]\nspeech = "a"', "'speech' must be"),
         ('[labels]\n"" = ["a"]', "'' must be"),
@@ -428,7 +475,7 @@ def test_files_that_are_not_there_are_left_out_and_told(copied, tmp_path):
     assert len(read_manifest(tmp_path / "m.csv", LABELS)) == 7
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "folder"])
+@pytest.mark.parametrize("name", [name for name in WRITERS if name not in {"folder", *KEPT}])
 def test_a_collection_without_its_audio_is_refused(copied, tmp_path, name):
     folder = copied(name)
     for path in folder.rglob("*"):

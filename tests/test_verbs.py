@@ -50,6 +50,7 @@ READING = (
     "evaluate model first.safetensors --data clips",
     "diff logs live first",
     "discover logs --least 2",
+    "voices --help",
     "report logs --day 2026-03-01 --output day.html",
     "replay logs --model first.safetensors",
     "models list --folder .",

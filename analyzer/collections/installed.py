@@ -24,7 +24,8 @@ class Collection(NamedTuple):
     title : str
         In manifests and on cards of models.
     markers : tuple of str
-        Files or folders of which one is in every folder of the collection; empty for any folder.
+        Files or folders, or patterns of them, of which one is in every folder of the collection;
+        empty for any folder.
     """
 
     name: str
@@ -46,6 +47,9 @@ COLLECTIONS = (
     Collection("desed", "DESED", ("metadata/validation", "metadata/eval", "metadata/train")),
     Collection("vocalsound", "VocalSound", ("audio_16k", "audio_44k")),
     Collection("audioset-strong", "AudioSet", ("mid_to_display_name.tsv",)),
+    Collection("ravdess", "RAVDESS", ("Actor_??", "*/Actor_??")),
+    Collection("emodb", "EmoDB", ("wav/??[ab]??[WLEAFTN]*.wav",)),
+    Collection("voxceleb", "VoxCeleb", ("wav/id?????", "aac/id?????")),
     FOLDER,
 )
 NAMES = tuple(collection.name for collection in COLLECTIONS)
@@ -95,4 +99,4 @@ def check_folder(folder: Path, collection: Collection) -> None:
 
 
 def _is_of(folder: Path, collection: Collection) -> bool:
-    return any((folder / marker).exists() for marker in collection.markers)
+    return any(True for marker in collection.markers for _ in folder.glob(marker))

@@ -12,7 +12,7 @@ from hearthlog.models.classifiers.description import TEXT
 from hearthlog.schemas.storage.small_file import read_toml
 from hearthlog.schemas.text import listed
 
-_KEYS = {"labels", "broad", "skip"}
+_KEYS = {"labels", "broad", "skip", "keep"}
 BROAD = "only broad categories"
 SKIPPED = "may be one of ours"
 SEVERAL = "several sounds at once"
@@ -48,17 +48,20 @@ class LabelMap:
         Categories that say nothing beside others, such as the parents of others.
     skip : frozenset of str
         Categories in which one of the labels may be heard.
+    keep : bool
+        Whether a category that is named nowhere is a label itself.
     """
 
     label_of: Mapping[str, str]
     broad: frozenset[str]
     skip: frozenset[str]
+    keep: bool = False
 
     def decide(self, categories: Iterable[str]) -> Decision:
         """Return the label of categories that are heard together.
 
         Broad ones are passed over. The others must all have one label; without one in the map it
-        is `other_negative`.
+        is `other_negative`, or the category itself.
 
         Parameters
         ----------
@@ -66,7 +69,7 @@ class LabelMap:
         """
         told = [name for name in categories if name not in self.broad]
         detail = " + ".join(sorted(set(told)))
-        labels = {self.label_of.get(name, OTHER_NEGATIVE) for name in told}
+        labels = {self.label_of.get(name, name if self.keep else OTHER_NEGATIVE) for name in told}
         skipped = [name for name in told if name in self.skip]
         if not told:
             return Decision("", "", BROAD)
@@ -143,6 +146,9 @@ def read_map(name: str, path: Path | None = None) -> LabelMap:
     labels = content.get("labels")
     if not isinstance(labels, dict):
         raise DataError(f"{path}: needs a table [labels]")
+    keep = content.get("keep", False)
+    if not isinstance(keep, bool):
+        raise DataError(f"{path}: 'keep' must be true or false")
     rows = [(label, _categories(path, label, names)) for label, names in labels.items()]
     broad, skip = (_categories(path, key, content.get(key, [])) for key in ("broad", "skip"))
     every = [name for names in (broad, skip, *(names for _, names in rows)) for name in names]
@@ -150,7 +156,7 @@ def read_map(name: str, path: Path | None = None) -> LabelMap:
         twice = next(name for name in every if every.count(name) > 1)
         raise DataError(f"{path}: {twice[:64]!r} is in two places")
     label_of = {name: label for label, names in rows for name in names}
-    return LabelMap(label_of, frozenset(broad), frozenset(skip))
+    return LabelMap(label_of, frozenset(broad), frozenset(skip), keep)
 
 
 def _shipped(name: str) -> Path:

@@ -10,6 +10,7 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 _ENERGY = "energy"
 _WEIGHT = 0.3  # power of the energy: the loud part of a sound says most, and its end a little
 _LEAST_ENERGY = 1e-12
+_AT_ONCE = 16_384  # frames of sounds, or one sound: what a small box has room for
 
 
 def descriptor_width(names: Sequence[str]) -> int:
@@ -34,9 +35,19 @@ def describe(values: Float32, names: Sequence[str], first: Int64, last: Int64) -
         Means, standard deviations and mean absolute differences of successive frames, each
         feature by feature, and the binary logarithm of the number of frames.
     """
-    counts = last - first
-    if not len(counts):
+    if not len(first):
         return np.empty((0, descriptor_width(names)), np.float32)
+    block = np.cumsum(last - first) // _AT_ONCE
+    begins = np.flatnonzero(np.diff(block, prepend=-1))
+    ends = np.append(begins[1:], len(first))
+    blocks = zip(begins, ends, strict=True)
+    return np.concatenate(
+        [_described(values, names, first[begin:end], last[begin:end]) for begin, end in blocks]
+    )
+
+
+def _described(values: Float32, names: Sequence[str], first: Int64, last: Int64) -> Float32:
+    counts = last - first
     sound, rows = ranges(first, counts)
     begins = np.cumsum(counts) - counts
     x = values[rows][:, _used(names)].astype(np.float64)

@@ -10,11 +10,13 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 
 LEAST = 8  # sounds of a group, by default
 MOST_GROUPS = 1_000  # in a file
-_DIMENSIONS = 16
+MOST_DIMENSIONS = 16
 _CLOSE = 3  # neighbours by which a density is judged
-_EXAMPLES = 200  # that are kept of a group
+MOST_EXAMPLES = 200  # that are kept of a group
 _RADIUS = 95  # percentile of the distances of its examples to the next one
 _LEAST_RADIUS = 1e-6  # of sounds that are all the same
+_AT_ONCE = 1024  # points
+_ROUNDING = 1e-9  # of squares of distances that are computed by products
 NO_GROUP = -1
 
 
@@ -64,13 +66,14 @@ class Groups:
 
         Of several groups it is that to whose examples a point is nearest, by their radii.
         """
-        from scipy.spatial import cKDTree  # noqa: PLC0415  takes long, and not always needed
-
+        examples = [self.examples[self.of == row] for row in range(len(self.radii))]
         nearest, found = np.full(len(points), np.inf), np.full(len(points), NO_GROUP)
-        for row, radius in enumerate(self.radii):
-            away = cKDTree(self.examples[self.of == row]).query(points)[0] / radius
-            closer = (away <= 1.0) & (away < nearest)
-            nearest[closer], found[closer] = away[closer], row
+        for first in range(0, len(points), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            for row, radius in enumerate(self.radii):
+                away = _distances(points[part], examples[row], radius) / radius
+                closer = (away <= 1.0) & (away < nearest[part])
+                nearest[part][closer], found[part][closer] = away[closer], row
         return found
 
 
@@ -89,7 +92,7 @@ def make_space(features: Sequence[str], descriptors: Float32) -> Groups:
     x = descriptors.astype(np.float64)
     mean, scale = x.mean(axis=0), x.std(axis=0)
     scale[scale == 0.0] = 1.0
-    dimensions = min(_DIMENSIONS, *x.shape)
+    dimensions = min(MOST_DIMENSIONS, *x.shape)
     axes = PCA(dimensions, svd_solver="full").fit((x - mean) / scale).components_
     nothing = np.empty(0)
     return Groups(
@@ -143,10 +146,25 @@ def identified(groups: Groups) -> Groups:
     return replace(groups, id=digest[:8])
 
 
+def _distances(points: Float64, examples: Float64, radius: float) -> Float64:
+    """Return how far each point is from the nearest example; infinity beyond the radius.
+
+    Products of matrices, which are fast and not exact, only tell which points are surely beyond.
+    """
+    own, theirs = (points**2).sum(axis=1), (examples**2).sum(axis=1)
+    squares = own[:, np.newaxis] + theirs - 2.0 * points @ examples.T
+    slack = _ROUNDING * (radius**2 + own.max() + theirs.max())
+    near = np.flatnonzero(squares.min(axis=1) <= radius**2 + slack)
+    away = np.full(len(points), np.inf)
+    differences = points[near][:, np.newaxis] - examples
+    away[near] = np.sqrt((differences**2).sum(axis=2).min(axis=1))
+    return away
+
+
 def _add(groups: Groups, points: Float64) -> Groups:
     from scipy.spatial import cKDTree  # noqa: PLC0415
 
-    examples = points[np.linspace(0, len(points) - 1, min(len(points), _EXAMPLES)).astype(int)]
+    examples = points[np.linspace(0, len(points) - 1, min(len(points), MOST_EXAMPLES)).astype(int)]
     steps = cKDTree(examples).query(examples, 2)[0][:, 1]
     radius = max(float(np.percentile(steps, _RADIUS)), _LEAST_RADIUS)
     number = groups.numbers.max(initial=0) + 1

@@ -14,7 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from safetensors.numpy import load, save
 
 from hearthlog.analyzer.discover.descriptors import descriptor_width
-from hearthlog.analyzer.discover.groups import MOST_GROUPS, Groups
+from hearthlog.analyzer.discover.groups import (
+    MOST_DIMENSIONS,
+    MOST_EXAMPLES,
+    MOST_GROUPS,
+    Groups,
+)
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.storage.new_files import replaced_file
@@ -119,11 +124,12 @@ def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
         and arrays["numbers"].shape == arrays["radii"].shape == (count,)
         and of.shape == examples.shape[:1]
         and np.array_equal(np.unique(of), np.arange(count))
+        and np.bincount(of, minlength=1).max() <= MOST_EXAMPLES
         and len(np.unique(arrays["numbers"])) == count
         and (arrays["radii"] >= _SMALL).all()
         and (arrays["scale"] >= _SMALL).all()
         and (arrays["numbers"] >= _LEAST_NUMBER).all()
         and (arrays["numbers"] <= _MOST_NUMBER).all()
-        and len(axes)
+        and 1 <= len(axes) <= MOST_DIMENSIONS
     )
     return "" if fits else "its arrays do not fit each other"

@@ -1,11 +1,13 @@
 """A group that gets a name: every sound of it becomes a mark, and is none again when asked."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from hearthlog.analyzer.discover.groups import Groups
-from hearthlog.analyzer.discover.read_sounds import HomeSounds
+from hearthlog.analyzer.discover.read_sounds import lost_text, read_log_sounds
+from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.marks.marks import (
     Mark,
     MarkedSpan,
@@ -14,69 +16,138 @@ from hearthlog.analyzer.marks.marks import (
     read_reviewed,
     write_marks,
 )
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.progress import Progress, ignore_progress
+
+_NEVER = 1 << 62
 
 
-def mark_group(  # noqa: PLR0913
-    logs: Iterable[Path], sounds: HomeSounds, rows: Int64, *, reason: str, label: str, reviewer: str
-) -> tuple[int, int]:
-    """Mark the sounds of a group; marks that it has get the label, if it had another name.
+class Looked(NamedTuple):
+    """In which sounds names are looked for.
+
+    Attributes
+    ----------
+    choice : str
+        One of `hearthlog.analyzer.discover.sound_spans.CHOICES`.
+    start, end : int or None
+        In nanoseconds of UTC.
+    """
+
+    choice: str
+    start: int | None = None
+    end: int | None = None
+
+
+class Marked(NamedTuple):
+    """What a name of a group has changed.
+
+    Attributes
+    ----------
+    made : int
+        Marks that were made, or got another label.
+    left : int
+        Sounds that were left as they are, because somebody has marked them, or looked at them.
+    """
+
+    made: int = 0
+    left: int = 0
+
+
+def name_groups(  # noqa: PLR0913, PLR0917
+    home: HomeLogs,
+    groups: Groups,
+    names: Mapping[int, str],
+    looked: Looked,
+    reviewer: str,
+    progress: Progress = ignore_progress,
+) -> tuple[dict[int, Marked], list[str]]:
+    """Mark the sounds of groups; marks that they have get the name, if they had another one.
+
+    One log is read at a time, so a box with little memory can name what another one has grouped.
 
     Parameters
     ----------
-    logs : iterable of Path
-        Of the home.
-    sounds : HomeSounds
-    rows : np.ndarray [shape=(n,)], int64
-        Those of the group.
-    reason : str
-        `reason_of` the group.
-    label : str
-        The class that they are.
+    home : HomeLogs
+    groups : Groups
+    names : mapping of int to str
+        Classes, by the numbers of groups that there are.
+    looked : Looked
     reviewer : str
         Who says so.
+    progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
 
     Returns
     -------
-    made, left : int
-        How many marks were made or got another label, and how many sounds were left as they are
-        because somebody has marked them, or looked at them.
+    marked : dict of int to Marked
+        By the numbers of the groups.
+    losses : list of str
+        What cannot be read, a log in a line.
 
     Raises
     ------
     LogError
         If a review layer cannot be read or written.
     """
-    made = left = 0
-    now, wanted = time.time_ns(), _wanted(sounds, rows)
-    for log in dict.fromkeys([*logs, *sounds.logs]):
-        old, reviewed = read_marks(log), read_reviewed(log)
-        own = [mark for mark in old if mark.reason == reason]
-        others: list[Mark | ReviewedSpan] = [mark for mark in old if mark.reason != reason]
-        others += reviewed
-        spans = [span for span in wanted.get(log, ()) if not _any_overlap(span, own)]
-        free = [span for span in spans if not _any_overlap(span, others)]
-        new = [Mark(*span, label, reviewer, now, LIVE, reason) for span in free]
-        new += [
-            mark._replace(label=label, reviewer=reviewer, made=now)
-            for mark in own
-            if mark.label != label
-        ]
-        if new:
-            write_marks(log, new)
-        made, left = made + len(new), left + len(spans) - len(free)
-    return made, left
+    marked, losses = dict.fromkeys(names, Marked()), list(home.losses)
+    logs = home.between(0, _NEVER)
+    inside = {entry.path for entry in home.between(looked.start or 0, looked.end or _NEVER)}
+    for count, (log, *_) in enumerate(logs, 1):
+        spans: dict[int, list[MarkedSpan]] = {}
+        if log in inside:
+            try:
+                spans = _spans(log, groups, looked, losses)
+            except LogError as error:
+                losses.append(str(error))
+        for number, label in names.items():
+            made, left = _mark(
+                log, spans.get(number, []), reason_of(groups, number), label, reviewer
+            )
+            before = marked[number]
+            marked[number] = Marked(before.made + made, before.left + left)
+        progress(count / len(logs))
+    return marked, losses
 
 
-def _wanted(sounds: HomeSounds, rows: Int64) -> dict[Path, list[MarkedSpan]]:
-    wanted: dict[Path, list[MarkedSpan]] = {}
-    starts, ends = sounds.spans.starts.tolist(), sounds.spans.ends.tolist()
-    for row in rows.tolist():
-        name = sounds.microphones[sounds.microphone[row]]
-        span = MarkedSpan(name, starts[row], ends[row])
-        wanted.setdefault(sounds.logs[sounds.log[row]], []).append(span)
-    return wanted
+def _spans(
+    log: Path, groups: Groups, looked: Looked, losses: list[str]
+) -> dict[int, list[MarkedSpan]]:
+    """Find the sounds of groups in a log, by the numbers of the groups."""
+    found: dict[int, list[MarkedSpan]] = {}
+    for sounds in read_log_sounds(log, *looked):
+        if sounds.features != groups.features:
+            raise LogError(f"{log}: has other features than the groups; left out")
+        if sounds.lost:
+            losses.append(lost_text(log, sounds.lost))
+        of = groups.find(groups.points(sounds.descriptors))
+        starts, ends = sounds.spans.starts.tolist(), sounds.spans.ends.tolist()
+        for row, start, end in zip(of.tolist(), starts, ends, strict=True):
+            if row >= 0:
+                span = MarkedSpan(sounds.microphone, start, end)
+                found.setdefault(int(groups.numbers[row]), []).append(span)
+    return found
+
+
+def _mark(
+    log: Path, wanted: Sequence[MarkedSpan], reason: str, label: str, reviewer: str
+) -> Marked:
+    """Mark sounds of a log; marks with this reason get the label."""
+    now, old, reviewed = time.time_ns(), read_marks(log), read_reviewed(log)
+    own = [mark for mark in old if mark.reason == reason]
+    others: list[Mark | ReviewedSpan] = [mark for mark in old if mark.reason != reason]
+    others += reviewed
+    spans = [span for span in wanted if not _any_overlap(span, own)]
+    free = [span for span in spans if not _any_overlap(span, others)]
+    new = [Mark(*span, label, reviewer, now, LIVE, reason) for span in free]
+    new += [
+        mark._replace(label=label, reviewer=reviewer, made=now)
+        for mark in own
+        if mark.label != label
+    ]
+    if new:
+        write_marks(log, new)
+    return Marked(len(new), len(spans) - len(free))
 
 
 def unmark_group(logs: Iterable[Path], reason: str) -> int:

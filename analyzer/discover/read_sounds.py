@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,27 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 
 _FIELDS = {"header.stamp", "values", "label", "confidence"}
 _NEVER = 1 << 62
+
+
+class LogSounds(NamedTuple):
+    """Sounds of one microphone in one log.
+
+    Attributes
+    ----------
+    microphone : str
+    features : tuple of str
+        Names of the features that they are described by.
+    spans : SoundSpans
+    descriptors : np.ndarray [shape=(n, width)], float32
+    lost : int
+        Sounds that are left out, for they have features that are no numbers.
+    """
+
+    microphone: str
+    features: tuple[str, ...]
+    spans: SoundSpans
+    descriptors: Float32
+    lost: int
 
 
 @dataclass(frozen=True)
@@ -101,6 +122,50 @@ def read_sounds(
         yield reader.sounds(store, home.losses)
 
 
+def read_log_sounds(
+    log: Path, choice: str, start: int | None = None, end: int | None = None
+) -> Iterator[LogSounds]:
+    """Read the sounds of a log.
+
+    Parameters
+    ----------
+    log : Path
+    choice : str
+        One of `hearthlog.analyzer.discover.sound_spans.CHOICES`.
+    start, end : int, optional
+        In nanoseconds of UTC.
+
+    Yields
+    ------
+    LogSounds
+        Of each microphone that has features and labels.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read.
+    """
+    columns = read_columns([log], None, start, end, fields=_FIELDS)
+    for features in columns.values():
+        name = features.topic.split("/")[1]
+        labels = columns.get(topic(name, "label"))
+        if features.type != message_types.FEATURES or labels is None or not len(labels):
+            continue
+        names = checked_array_names(log, features, "values")
+        stamps, values = _by_time(features, "values")
+        spans = find_sounds(stamps, FrameLabels(*_by_time(labels, "label", "confidence")))
+        spans = spans.chosen(choice)
+        described = describe(values, names, spans.first, spans.last)
+        is_finite: Bool = np.isfinite(described).min(axis=1, initial=True)
+        lost = int((~is_finite).sum())
+        yield LogSounds(name, names, spans.rows(is_finite), described[is_finite], lost)
+
+
+def lost_text(log: Path, lost: int) -> str:
+    """Say how many sounds of a log are left out, and why."""
+    return f"{log}: {lost} sounds with features that are no numbers; left out"
+
+
 class _Reader:
     def __init__(self, choice: str, start: int | None, end: int | None) -> None:
         self.losses: list[str] = []
@@ -113,32 +178,16 @@ class _Reader:
         self._parts: list[tuple[Int64, Int64, SoundSpans]] = []
 
     def read(self, log: Path, store: IO[bytes]) -> None:
-        columns = read_columns([log], None, *self._span, fields=_FIELDS)
-        for features in columns.values():
-            name = features.topic.split("/")[1]
-            labels = columns.get(topic(name, "label"))
-            if features.type != message_types.FEATURES or labels is None or not len(labels):
-                continue
-            names = checked_array_names(log, features, "values")
-            self._features = self._features or names
-            if names != self._features:
+        for sounds in read_log_sounds(log, self._choice, *self._span):
+            self._features = self._features or sounds.features
+            if sounds.features != self._features:
                 raise LogError(f"{log}: has other features than the later logs; left out")
-            stamps, values = _by_time(features, "values")
-            spans = find_sounds(stamps, FrameLabels(*_by_time(labels, "label", "confidence")))
-            self._describe(log, name, spans.chosen(self._choice), values, store)
+            if sounds.lost:
+                self.losses.append(lost_text(log, sounds.lost))
+            store.write(sounds.descriptors.tobytes())
+            self._add(log, sounds.microphone, sounds.spans)
         if log not in self._logs:
             self.without += 1
-
-    def _describe(
-        self, log: Path, microphone: str, spans: SoundSpans, values: Float32, store: IO[bytes]
-    ) -> None:
-        described = describe(values, self._features, spans.first, spans.last)
-        is_finite: Bool = np.isfinite(described).min(axis=1, initial=True)
-        if not is_finite.all():
-            count = int((~is_finite).sum())
-            self.losses.append(f"{log}: {count} sounds with features that are no numbers; left out")
-        store.write(described[is_finite].tobytes())
-        self._add(log, microphone, spans.rows(is_finite))
 
     def _add(self, log: Path, microphone: str, spans: SoundSpans) -> None:
         if microphone not in self._microphones:

@@ -1,69 +1,25 @@
 """What there is to say of each group of sounds."""
 
-from dataclasses import dataclass
 from datetime import date, tzinfo
-from pathlib import Path
 
 import numpy as np
 
 from hearthlog.analyzer.discover.groups import Groups
 from hearthlog.analyzer.discover.read_sounds import HomeSounds
+from hearthlog.analyzer.discover.summary_file import (
+    LONGEST_TEXT,
+    MOST_LABELS,
+    MOST_MICROPHONES,
+    Example,
+    GroupSummary,
+)
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.text import printable, shortened
+from hearthlog.schemas.times import NANOSECONDS, time_text
 
 _HOURS = 24
-_USUAL = 0.8  # of the sounds are in the usual hours
 _SHOWN = 3
-
-
-@dataclass(frozen=True)
-class Example:
-    """A sound that stands for its group; times in nanoseconds of UTC."""
-
-    log: Path
-    microphone: str
-    start: int
-    end: int
-
-
-@dataclass(frozen=True)
-class GroupSummary:
-    """A group of sounds that are alike.
-
-    Attributes
-    ----------
-    number : int
-    name : str
-        The class that a person named it; empty where nobody did.
-    times : int
-        How many sounds there are of it.
-    days : int
-        On how many days, at home.
-    hours : list of int
-        How many of them began in each hour of the day, at home.
-    seconds : float
-        Their median length.
-    alike : float
-        0: they differ as any sounds of the home do; 1: they are all the same.
-    labels : dict of str to float
-        What share of them each label has, the most frequent first.
-    microphones : list of str
-        Which heard them.
-    examples : list of Example
-        Those in the middle of the group.
-    """
-
-    number: int
-    name: str
-    times: int
-    days: int
-    hours: list[int]
-    seconds: float
-    alike: float
-    labels: dict[str, float]
-    microphones: list[str]
-    examples: list[Example]
 
 
 def summarise(
@@ -107,27 +63,31 @@ def _summary(  # noqa: PLR0913, PLR0917
     away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
     seconds = np.median(spans.ends[rows] - spans.starts[rows]) / NANOSECONDS
     middle = rows[np.argsort(away, kind="stable")[:_SHOWN]]
+    names = {sounds.microphones[i] for i in sounds.microphone[rows]}
     return GroupSummary(
-        number,
-        name,
-        len(rows),
-        len(days),
-        hours.tolist(),
-        float(seconds),
-        max(1.0 - float(np.median(away)) / apart, 0.0) if apart else 1.0,
-        {str(labels[i]): float(counts[i]) / len(rows) for i in order},
-        sorted({sounds.microphones[i] for i in sounds.microphone[rows]}),
-        [_example(sounds, row) for row in middle.tolist()],
+        number=number,
+        name=name,
+        times=len(rows),
+        days=len(days),
+        hours=hours.tolist(),
+        seconds=float(seconds),
+        alike=max(1.0 - float(np.median(away)) / apart, 0.0) if apart else 1.0,
+        labels={
+            shortened(str(labels[i]), LONGEST_TEXT): float(counts[i]) / len(rows)
+            for i in order[:MOST_LABELS]
+        },
+        microphones=[shortened(each, LONGEST_TEXT) for each in sorted(names)[:MOST_MICROPHONES]],
+        examples=[_example(sounds, row) for row in middle.tolist()],
     )
 
 
 def _example(sounds: HomeSounds, row: int) -> Example:
     spans = sounds.spans
     return Example(
-        sounds.logs[sounds.log[row]],
-        sounds.microphones[sounds.microphone[row]],
-        int(spans.starts[row]),
-        int(spans.ends[row]),
+        log=printable(sounds.logs[sounds.log[row]]),
+        microphone=shortened(sounds.microphones[sounds.microphone[row]], LONGEST_TEXT),
+        start=time_text(int(spans.starts[row])),
+        end=time_text(int(spans.ends[row])),
     )
 
 
@@ -135,25 +95,3 @@ def _typical_distance(points: Float64) -> float:
     if not len(points):
         return 0.0
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-
-
-def usual_hours(hours: list[int]) -> str:
-    """Return the shortest span of the day that has four fifths of the sounds, as `07 to 09`.
-
-    Parameters
-    ----------
-    hours : list of int
-        How many began in each hour of the day.
-
-    Returns
-    -------
-    str
-        Empty if that takes more than half of the day.
-    """
-    twice = np.cumsum([0, *hours, *hours])
-    for length in range(1, _HOURS // 2 + 1):
-        sums = twice[length : length + _HOURS] - twice[:_HOURS]
-        if sums.max() >= _USUAL * sum(hours):
-            first = int(sums.argmax())
-            return f"{first:02d} to {(first + length) % _HOURS:02d}"
-    return ""

@@ -64,6 +64,29 @@ def in_room(
     silence : bool
         Whether nothing happens in the sound: then the noise is of any level.
     """
+    sound, level = other_room(frames, rng, silence=silence)
+    return in_noise(sound, level, features, rng, silence=silence)
+
+
+def other_room(
+    frames: Float32, rng: np.random.Generator, *, silence: bool
+) -> tuple[Float64, float]:
+    """Put a sound into another room, before another microphone, without the noise there.
+
+    Parameters
+    ----------
+    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        At least one frame.
+    rng : np.random.Generator
+    silence : bool
+        Whether nothing happens in the sound: then the noise is of any level.
+
+    Returns
+    -------
+    sound : np.ndarray [shape=(n * FRAME_SAMPLES,)], float64
+    level : float
+        Of the noise, in dBFS.
+    """
     sound = frames.ravel().astype(np.float64) * 10.0 ** (rng.uniform(*_GAIN_DB) / 20.0)
     if rng.random() < _SHARE:
         seconds, direct = rng.uniform(*_REVERBERATION_SECONDS), rng.uniform(*_DIRECT_DB)
@@ -73,9 +96,7 @@ def in_room(
     noise_level = level_of(sound) - rng.uniform(*_SIGNAL_TO_NOISE_DB)
     if silence:
         noise_level = rng.uniform(*_SILENCE_DBFS)
-    return in_noise(
-        sound, float(np.clip(noise_level, *_NOISE_DBFS)), features, rng, silence=silence
-    )
+    return sound, float(np.clip(noise_level, *_NOISE_DBFS))
 
 
 def in_noise(

@@ -48,7 +48,7 @@ from hearthlog.models.classifiers.description import (
     TrainingData,
 )
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.arrays import Float64
+from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
 
@@ -57,12 +57,13 @@ SMOOTHINGS = ("hmm", "merge")
 _SHUFFLES = 20
 
 
-def train_model(
+def train_model(  # noqa: PLR0913, PLR0917
     data: Dataset,
     scenario: Scenario,
     progress: Progress,
     method: Method = DEFAULT,
     smoothing: str = "hmm",
+    others: tuple[Float32, Indices] | None = None,
 ) -> Model:
     """Learn a model, and calibrate and measure it on folds that never split a source group.
 
@@ -76,6 +77,9 @@ def train_model(
     method : Method, optional
     smoothing : str
         `hmm` or `merge`, as field `method` of `Smoothing` has it.
+    others : (np.ndarray [shape=(k, width)], np.ndarray [shape=(k,)]), optional
+        Inputs of further windows that are always learned from, and their classes, which may have no
+        segments.
 
     Raises
     ------
@@ -87,8 +91,15 @@ def train_model(
         If the feature set of the method is not installed.
     """
     check_varied(data)
-    sources, collections = group_folds(data), collection_folds(data)
+    sources = group_folds(data if others is None else _with_segments(data))
+    collections = collection_folds(data)
     examples, fits = prepare(method, data), len(sources) + len(collections) + 1
+    if others is not None:
+        inputs, target = others
+        examples = examples._replace(
+            more_inputs=np.concatenate([examples.more_inputs, inputs]),
+            more_target=np.concatenate([examples.more_target, target]),
+        )
 
     def decide(folds: list[Fold], before: int) -> Float64:
         def report(share: float) -> None:
@@ -101,8 +112,8 @@ def train_model(
     decisions += bias
     inverse, elsewhere = inverse_temperature(decisions, data.target), None
     if collections:
-        others = decide(collections, len(sources)) + bias
-        inverse, elsewhere = calibrate_elsewhere(others, data, collections)
+        left_out = decide(collections, len(sources)) + bias
+        inverse, elsewhere = calibrate_elsewhere(left_out, data, collections)
     learned = method.fit(examples)
     progress(1.0)
     model = Model(
@@ -132,6 +143,12 @@ def train_model(
         training_target=data.target.astype(np.int64),
         training_group=data.group.astype(np.int64),
     )
+
+
+def _with_segments(data: Dataset) -> Dataset:
+    """Return the data without the classes that have no segments."""
+    numbers, target = np.unique(data.target, return_inverse=True)
+    return replace(data, classes=tuple(data.classes[each] for each in numbers), target=target)
 
 
 def check_varied(data: Dataset) -> None:
@@ -195,7 +212,8 @@ def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Me
         data.target, predicted, labels=numbers, zero_division=0.0
     )
     confusion = confusion_matrix(data.target, predicted, labels=numbers)
-    known = [number for number in numbers if data.classes[number] != UNKNOWN]
+    told = np.bincount(data.target, minlength=len(data.classes)) > 0
+    known = [number for number in numbers if data.classes[number] != UNKNOWN and told[number]]
     return Metrics(
         folds=folds,
         macro_f1=float(f1[known].mean()),
@@ -232,6 +250,7 @@ def _method_fields(method: Method, learned: Learned, classes: Sequence[str]) -> 
         "method": method.name,
         "feature_set": features.name,
         "feature_set_version": features.version,
+        "feature_set_sha256": features.digest,
         "feature_names": list(features.feature_names),
         "inputs": method.inputs,
         "window_seconds": window * FRAME_SECONDS,

@@ -25,8 +25,8 @@ from hearthlog.tools.cli.text import tell
 VERBS = (
     *("record", "pause", "resume", "install_service", "devices", "info", "catalog", "cat"),
     *("export", "merge", "cut", "doctor", "recover", "retain", "manifest", "train", "enrol"),
-    *("diff", "discover", "review", "watch", "bridge", "report", "replay", "relabel", "demo"),
-    *("alerts", "annotate", "config", "evaluate", "models"),
+    *("diff", "discover", "voices", "review", "watch", "bridge", "report", "replay", "relabel"),
+    *("demo", "alerts", "annotate", "config", "evaluate", "models"),
 )
 _MODULES = {"resume": "pause"}  # of a verb that shares one
 _NAMED = 10  # of many files with the same fault

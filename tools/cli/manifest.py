@@ -22,7 +22,8 @@ def manifest(
     collection: Annotated[
         str,
         typer.Argument(
-            help="esc50, fsd50k, urbansound8k, desed, vocalsound, audioset-strong, or folder."
+            help="esc50, fsd50k, urbansound8k, desed, vocalsound, audioset-strong, ravdess, "
+            "emodb, voxceleb, or folder."
         ),
     ],
     folder: Annotated[Path | None, typer.Argument(help="Folder of the collection.")] = None,

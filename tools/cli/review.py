@@ -81,6 +81,9 @@ def review(
         Path | None,
         typer.Option(help="Groups of `hearthlog discover`, a file; their sounds are a lane."),
     ] = None,
+    voices: Annotated[
+        Path | None, typer.Option(help="Voices of `hearthlog voices`, a file; they are a lane.")
+    ] = None,
     timezone: Timezone = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the viewer.")] = None,
 ) -> None:
@@ -105,6 +108,8 @@ def review(
             timeline = read_timeline(logs, *limits, zone=timezone, progress=progress)
         if groups is not None:
             _add_groups(timeline, logs, groups)
+        if voices is not None:
+            _add_voices(timeline, logs, voices)
         return timeline
 
     chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
@@ -143,6 +148,29 @@ def _add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
         if name in timeline.microphones:
             timeline.microphones[name].recurring = LabelledSpans(*spans)
     timeline.losses += [text for text in losses if text not in timeline.losses]
+
+
+def _add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
+    """Add the turns of voices to a timeline."""
+    from hearthlog.analyzer.discover.home_voices import find_voices
+    from hearthlog.analyzer.discover.read_speech import read_speech
+    from hearthlog.analyzer.discover.voice_summary import spoken_spans
+    from hearthlog.analyzer.discover.voices_file import load_voices
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.review.timeline.model import LabelledSpans
+
+    known = load_voices(file)
+    if known is None:
+        raise DataError(f"{file}: no such file of voices; `hearthlog voices` makes one")
+    with share_done("telling voices apart") as progress:
+        span = timeline.grid.start, timeline.grid.end
+        speech = read_speech(find_home_logs(logs), *span, progress)
+    voices, of = find_voices(speech, known)
+    for name, spans in spoken_spans(speech, voices, of).items():
+        if name in timeline.microphones:
+            timeline.microphones[name].spoken = LabelledSpans(*spans)
+    timeline.losses += [text for text in speech.losses if text not in timeline.losses]
 
 
 class ReviewCommand(TyperCommand):

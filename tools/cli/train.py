@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
+_SPEAKERS = "speakers"  # the scenario of who speaks
 
 
 def train(
@@ -84,15 +85,16 @@ def train(
     """
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
 
-    if not data:
-        if scenario or not home or scheduler or (cost, gamma) != (None, None):
-            wrong_use("give --data and --scenario, or --home without what is about --data")
+    speakers = scenario == _SPEAKERS
+    if speakers or data:
+        _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
+    elif scenario or not home or scheduler or (cost, gamma) != (None, None):
+        wrong_use("give --data and --scenario, or --home without what is about --data")
+    else:
         base = base or _model_of(home)
-    elif output is None or scenario is None or base is not None:
-        wrong_use("--data goes with --scenario and --output, and without --base")
     if output is not None:
         check_output(output)
-    if not data:
+    if not data and not speakers:
         assert base is not None
         assert home is not None
         model, segments = _adapted(base, home)
@@ -102,11 +104,11 @@ def train(
 
         chosen = chosen_method(method, cost=cost, gamma=gamma)
         with fits_on(scheduler):
-            model, segments = _learned(data, scenario, home or [], chosen, smoothing)
+            model, segments = _learned(data or [], scenario, home or [], chosen, smoothing)
     output = output or _next_of_home()
     save_model(model, output)
     saved = load_model(output)
-    verdict = _judged(saved, output, home) if home else None
+    verdict = _judged(saved, output, home) if home and not speakers else None
     if as_json:
         result = {"model": str(output), "sha256": saved.sha256, "skipped": dict(segments.skipped)}
         if verdict is not None:
@@ -180,11 +182,12 @@ def _learned(
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
-    from hearthlog.analyzer.training.train import SMOOTHINGS, train_model
+    from hearthlog.analyzer.training.train import train_model
     from hearthlog.models.classes import UNKNOWN
 
-    if smoothing not in SMOOTHINGS:
-        wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
+    _check_smoothing(smoothing)
+    if scenario == _SPEAKERS:
+        return _learned_voices(data, home, method, smoothing)
     chosen = load_scenario(scenario)
     clips = [clip for path in data for clip in read_manifest(manifest_path(path), chosen.labels)]
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
@@ -199,6 +202,57 @@ def _learned(
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         model = train_model(segments, chosen, report, method, smoothing)
+    return model, segments
+
+
+def _check_use(
+    *,
+    speakers: bool,
+    home: list[Path] | None,
+    output: Path | None,
+    scenario: str | None,
+    base: Path | None,
+) -> None:
+    if speakers and (not home or output is None or base is not None):
+        wrong_use("--scenario speakers goes with --home and --output, and without --base")
+    if not speakers and (output is None or scenario is None or base is not None):
+        wrong_use("--data goes with --scenario and --output, and without --base")
+
+
+def _check_smoothing(name: str) -> None:
+    from hearthlog.analyzer.training.train import SMOOTHINGS
+
+    if name not in SMOOTHINGS:
+        wrong_use(f"--smoothing {name}: choose one of {', '.join(SMOOTHINGS)}")
+
+
+def _learned_voices(
+    data: list[Path], home: list[Path], method: "Method", smoothing: str
+) -> tuple["Model", "Dataset"]:
+    """Learn who of those that are enrolled speaks."""
+    from hearthlog.analyzer.discover.enrolled_voices import check_voices
+    from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
+    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.speakers import (
+        others_of,
+        speaker_recordings,
+        speakers_scenario,
+    )
+    from hearthlog.analyzer.training.train import train_model
+    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.starter import GENERAL, starter_file
+
+    _check_smoothing(smoothing)
+    enrolled = list(speaker_recordings(home, method.features))
+    scenario = speakers_scenario(enrolled)
+    check_voices(enrolled, method.features)
+    clips = [clip for path in data for clip in read_manifest(manifest_path(path), scenario.labels)]
+    others = others_of(load_model(starter_file(GENERAL)), method, scenario)
+    with share_done(f"listening to {len(clips)} clips", announce=bool(clips)) as report:
+        more = list(clip_recordings(clips, scenario, report, method.features, method.rooms))
+    segments = cut_recordings([*enrolled, *more], scenario, method.features)
+    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
+        model = train_model(segments, scenario, report, method, smoothing, others)
     return model, segments
 
 
@@ -266,6 +320,8 @@ def _print_figures(model: "Model") -> None:
     rows = []
     for name in description.classes:
         amount, result = data.classes[name], metrics.classes[name]
+        if not amount.segments:  # learned from another model alone
+            continue
         figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
         rows.append((name, *_amounts(amount), *figures))
     head = "class", "sources", "seconds", "segments", "precision", "recall", "F1"

@@ -1,0 +1,255 @@
+"""The speech of a home, conversation by conversation, with the voices in each told apart."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.discover.voice_space import (
+    WINDOW_FRAMES,
+    describe_speech,
+    has_voices,
+    voice_space,
+    window_starts,
+)
+from hearthlog.analyzer.discover.voices import Evidence, summed, tell_apart
+from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
+from hearthlog.models.classes import SPEECH, class_name
+from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.times import NANOSECONDS
+
+_FIELDS = {"header.stamp", "values", "duration", "label"}
+_NEVER = 1 << 62
+_PAUSE = 30 * NANOSECONDS  # between conversations
+_MOST_FRAMES = 6_000  # of a conversation: five minutes
+_LEAST_FRAMES = 10
+LEAST_WINDOWS = 10  # of a voice in a conversation: five seconds
+_BREATH = FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2  # within a turn; stamps follow a clock
+
+
+class Turns(NamedTuple):
+    """When somebody speaks without a pause, in the order of logs, and in each of time.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    log, microphone : np.ndarray [shape=(n,)], int64
+        Where each is in the lists of `HomeSpeech`.
+    voice : np.ndarray [shape=(n,)], int64
+        The row of the voice in its conversation.
+    """
+
+    starts: Int64
+    ends: Int64
+    log: Int64
+    microphone: Int64
+    voice: Int64
+
+
+@dataclass(frozen=True)
+class HomeSpeech:
+    """Speech of a home.
+
+    Attributes
+    ----------
+    logs : list of Path
+        In the order of time.
+    microphones : list of str
+    turns : Turns
+    voices : Evidence
+        Of each voice of each conversation.
+    losses : list of str
+        What cannot be read, a log in a line.
+    without : int
+        Logs that have no features by which voices are told apart, or no segments.
+    """
+
+    logs: list[Path]
+    microphones: list[str]
+    turns: Turns
+    voices: Evidence
+    losses: list[str]
+    without: int
+
+    @property
+    def seconds(self) -> float:
+        """How long somebody speaks."""
+        return float((self.turns.ends - self.turns.starts).sum()) / NANOSECONDS
+
+
+def read_speech(
+    home: HomeLogs,
+    start: int | None = None,
+    end: int | None = None,
+    progress: Progress = ignore_progress,
+) -> HomeSpeech:
+    """Read the speech of a home, by the recorder's segments, log by log.
+
+    Parameters
+    ----------
+    home : HomeLogs
+    start, end : int, optional
+        In nanoseconds of UTC.
+    progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
+    """
+    reader = _Reader(start, end)
+    entries = home.between(start or 0, end or _NEVER)
+    for number, entry in enumerate(entries, 1):
+        try:
+            reader.read(entry.path)
+        except LogError as error:
+            reader.losses.append(str(error))
+        progress(number / len(entries))
+    return reader.speech(home.losses)
+
+
+class _Reader:
+    def __init__(self, start: int | None, end: int | None) -> None:
+        self.losses: list[str] = []
+        self._span = start, end
+        self._logs: list[Path] = []
+        self._microphones: list[str] = []
+        self._turns = [Turns(*(np.empty(0, np.int64) for _ in Turns._fields))]
+        dimensions = len(voice_space().spread)
+        self._voices = [Evidence(np.empty(0), np.empty((0, dimensions)))]
+        self._count = self._without = 0
+
+    def read(self, log: Path) -> None:
+        columns = read_columns([log], None, *self._span, fields=_FIELDS)
+        is_used = False
+        for features in columns.values():
+            microphone = features.topic.split("/")[1]
+            segments = columns.get(topic(microphone, "segment"))
+            if features.type != message_types.FEATURES or segments is None:
+                continue
+            names = checked_array_names(log, features, "values")
+            if has_voices(names):
+                is_used = True
+                self._add(log, microphone, features, names, speech_spans(segments))
+        self._without += not is_used
+
+    def _add(
+        self, log: Path, microphone: str, features: Columns, names: Sequence[str], speech: Spans
+    ) -> None:
+        if log not in self._logs:
+            self._logs.append(log)
+        if microphone not in self._microphones:
+            self._microphones.append(microphone)
+        place = len(self._logs) - 1, self._microphones.index(microphone)
+        stamps, values = features["header.stamp"], features["values"]
+        order = np.argsort(stamps, kind="stable")  # a clock may have been set back
+        order = order[rows_at(speech, stamps[order]) >= 0]
+        stamps, values = stamps[order], values[order]
+        is_finite = np.isfinite(values).all(axis=1)
+        for rows in _conversations(stamps[is_finite]):
+            self._tell_apart(stamps[is_finite][rows], values[is_finite][rows], names, place)
+
+    def _tell_apart(
+        self, stamps: Int64, values: Float32, names: Sequence[str], place: tuple[int, int]
+    ) -> None:
+        of, points = voices_of(values, names)
+        count = int(of.max()) + 1
+        starts, ends, voice = _turns(stamps, _of_frames(of, len(stamps)))
+        log, microphone = (np.full(len(starts), each) for each in place)
+        self._turns.append(Turns(starts, ends, log, microphone, voice + self._count))
+        self._voices.append(summed(points, of, count))
+        self._count += count
+
+    def speech(self, losses: Sequence[str]) -> HomeSpeech:
+        return HomeSpeech(
+            self._logs,
+            self._microphones,
+            Turns(*(np.concatenate(each) for each in zip(*self._turns, strict=True))),
+            Evidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True))),
+            [*losses, *self.losses],
+            self._without,
+        )
+
+
+def speech_spans(segments: Columns) -> Spans:
+    """Return when a labelling says that somebody speaks.
+
+    Parameters
+    ----------
+    segments : Columns
+    """
+    labels = segments["label"]
+    names = {label for label in set(labels.tolist()) if class_name(label) == SPEECH}
+    rows = np.isin(labels.astype(str), sorted(names))
+    starts = segments["header.stamp"][rows]
+    return joined(starts, starts + segments["duration"][rows])
+
+
+def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:
+    """Tell apart the voices in the features of a conversation.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(frames, f)], float32
+        Of speech.
+    names : sequence of str
+        Of the features.
+
+    Returns
+    -------
+    of : np.ndarray [shape=(n,)], int64
+        The voice of each window, from 0 on.
+    points : np.ndarray [shape=(n, d)], float64
+        Where they lie.
+    """
+    space = voice_space()
+    points = space.points(describe_speech(values, names))
+    return tell_apart(points, space.spread, LEAST_WINDOWS), points
+
+
+def speech_voices(
+    stamps: Int64, values: Float32, names: Sequence[str]
+) -> tuple[Int64, Int64, Int64]:
+    """Return the turns of a conversation: their starts, their ends, and whose they are.
+
+    Parameters
+    ----------
+    stamps : np.ndarray [shape=(frames,)], int64
+        Of frames of speech, in nanoseconds, ascending.
+    values : np.ndarray [shape=(frames, f)], float32
+    names : sequence of str
+        Of the features.
+    """
+    of, _ = voices_of(values, names)
+    return _turns(stamps, _of_frames(of, len(stamps)))
+
+
+def _conversations(stamps: Int64) -> Iterator[slice]:
+    """Yield the rows of conversations, of which long ones are cut."""
+    breaks = np.flatnonzero(np.diff(stamps) > _PAUSE) + 1
+    for first, last in zip([0, *breaks], [*breaks, len(stamps)], strict=True):
+        parts = -(-(last - first) // _MOST_FRAMES)
+        edges = np.linspace(first, last, parts + 1).astype(int)
+        for start, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            if end - start >= _LEAST_FRAMES:
+                yield slice(start, end)
+
+
+def _of_frames(of: Int64, frames: int) -> Int64:
+    """Return the voice of each frame: that of the window whose middle is nearest."""
+    middles = window_starts(frames) + WINDOW_FRAMES / 2
+    return of[np.searchsorted((middles[1:] + middles[:-1]) / 2, np.arange(frames))]
+
+
+def _turns(stamps: Int64, voice: Int64) -> tuple[Int64, Int64, Int64]:
+    is_new = (np.diff(stamps) > _BREATH) | (np.diff(voice) != 0)
+    first = np.concatenate([[0], np.flatnonzero(is_new) + 1])
+    last = np.append(first[1:], len(stamps)) - 1
+    return stamps[first], stamps[last] + FRAME_NANOSECONDS, voice[first]

@@ -1,0 +1,167 @@
+"""Which points of speech are of one voice: by how much likelier that is than two voices."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.schemas.arrays import Bool, Float64, Int64
+
+_INDEPENDENT = 0.2  # of a window: windows overlap, and what is said lasts
+_MOST_CERTAIN = 4.0  # windows: nobody sounds the same twice, however long one speaks
+_SMOOTHED = 1  # windows at either side
+_ROUNDS = 2
+
+
+class Evidence(NamedTuple):
+    """Points of speech, taken together.
+
+    Attributes
+    ----------
+    counts : np.ndarray [shape=(n,)], float64
+        How many points there are of each.
+    sums : np.ndarray [shape=(n, d)], float64
+        Their sums.
+    """
+
+    counts: Float64
+    sums: Float64
+
+    def rows(self, rows: Int64 | Bool) -> "Evidence":
+        """Return some of it."""
+        return Evidence(self.counts[rows], self.sums[rows])
+
+
+def summed(points: Float64, of: Int64, count: int) -> Evidence:
+    """Take points together.
+
+    Parameters
+    ----------
+    points : np.ndarray [shape=(n, d)], float64
+    of : np.ndarray [shape=(n,)], int64
+        What each is of, from 0 to `count`, which is left out.
+    count : int
+    """
+    own = (of == np.arange(count)[:, np.newaxis]).astype(np.float64)
+    return Evidence(own.sum(axis=1), own @ points)
+
+
+def same_voice(one: Evidence, others: Evidence, spread: Float64) -> Float64:
+    """Return by how much likelier one voice is than two: the logarithm of the ratio.
+
+    Both are means of points of which those of a voice have variance 1 around its own mean, and
+    voices the variance `spread` (the two-covariance model of Brümmer and de Villiers, Odyssey
+    2010).
+
+    Parameters
+    ----------
+    one : Evidence
+        Of one row, or of as many as the others.
+    others : Evidence
+    spread : np.ndarray [shape=(d,)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+    """
+    a, b = _as_independent(one), _as_independent(others)
+    both = Evidence(a.counts + b.counts, a.sums + b.sums)
+    ratio: Float64 = _likelihood(both, spread) - _likelihood(a, spread) - _likelihood(b, spread)
+    return ratio
+
+
+def _as_independent(evidence: Evidence) -> Evidence:
+    """Return evidence of the same means by as many independent points as it is worth."""
+    counts = _INDEPENDENT * evidence.counts
+    counts = counts / (1.0 + counts / _MOST_CERTAIN)
+    return Evidence(counts, evidence.sums * (counts / evidence.counts)[:, np.newaxis])
+
+
+def _likelihood(evidence: Evidence, spread: Float64) -> Float64:
+    """Return the logarithm of how likely one voice is, beside the mean of all voices."""
+    scale = 1.0 + evidence.counts[:, np.newaxis] * spread
+    terms: Float64 = evidence.sums**2 * spread / scale - np.log(scale)
+    return 0.5 * terms.sum(axis=1)
+
+
+def joined(evidence: Evidence, spread: Float64) -> Int64:
+    """Join what is likelier of one voice than of two, the likeliest first.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        The time that it takes grows with the square of its rows.
+    spread : np.ndarray [shape=(d,)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], int64
+        The voice of each row, from 0 on.
+    """
+    counts, sums = evidence.counts.copy(), evidence.sums.copy()
+    size = len(counts)
+    of = np.arange(size)
+    ratios = np.full((size, size), -np.inf)
+    for row in range(size - 1):
+        later = np.arange(row + 1, size)
+        one, others = evidence.rows(np.array([row])), evidence.rows(later)
+        ratios[row, later] = ratios[later, row] = same_voice(one, others, spread)
+    best = ratios.max(axis=1, initial=-np.inf)
+    while size and best.max() > 0.0:
+        row = int(best.argmax())
+        other = int(ratios[row].argmax())
+        counts[row] += counts[other]
+        sums[row] += sums[other]
+        of[of == other] = row
+        ratios[other] = ratios[:, other] = -np.inf
+        there = np.flatnonzero(np.isfinite(ratios[row]))
+        now = Evidence(counts[[row]], sums[[row]])
+        ratios[row, there] = ratios[there, row] = same_voice(
+            now, Evidence(counts[there], sums[there]), spread
+        )
+        changed = [row, other, *there]
+        best[changed] = ratios[changed].max(axis=1)
+    _, of = np.unique(of, return_inverse=True)
+    return of.astype(np.int64)
+
+
+def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
+    """Tell the voices of a conversation apart.
+
+    Parameters
+    ----------
+    points : np.ndarray [shape=(n, d)], float64
+        Of its windows, in the order of time.
+    spread : np.ndarray [shape=(d,)], float64
+    least : int
+        Windows of a voice; what has fewer goes to other voices, if there are any.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], int64
+        The voice of each window, from 0 on.
+    """
+    of = joined(Evidence(np.ones(len(points)), points), spread)
+    for _ in range(_ROUNDS):
+        counts = np.bincount(of)
+        kept = np.flatnonzero(counts >= min(least, counts.max()))
+        voices = summed(points, of, len(counts)).rows(kept)
+        of = _smoothed(_likeness(points, voices, spread)).argmax(axis=1)
+        _, of = np.unique(of, return_inverse=True)
+    return of.astype(np.int64)
+
+
+def _likeness(points: Float64, voices: Evidence, spread: Float64) -> Float64:
+    """Return the expected log likelihoods of points, but for what all voices have in common."""
+    counts, sums = _INDEPENDENT * voices.counts, _INDEPENDENT * voices.sums
+    variance = spread / (1.0 + counts[:, np.newaxis] * spread)
+    mean = variance * sums
+    likeness: Float64 = points @ mean.T - 0.5 * (mean**2 + variance).sum(axis=1)
+    return likeness
+
+
+def _smoothed(values: Float64) -> Float64:
+    """Take the mean of each row and its neighbours."""
+    width = 2 * _SMOOTHED + 1
+    padded = np.pad(values, ((_SMOOTHED, _SMOOTHED), (0, 0)), "edge")
+    smoothed: Float64 = np.lib.stride_tricks.sliding_window_view(padded, width, 0).mean(axis=-1)
+    return smoothed

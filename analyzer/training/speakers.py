@@ -1,0 +1,127 @@
+"""The scenario of speakers: who of those that are enrolled speaks, or somebody else."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.dataset import Recording
+from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
+from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
+from hearthlog.analyzer.training.method import Method
+from hearthlog.analyzer.training.scenario import LABELS, Scenario
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, find_class
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.schemas.arrays import Float32, Indices
+from hearthlog.schemas.frames import FRAME_SECONDS
+
+SPEAKERS = "speakers"
+_LEAST_SECONDS = 10.0  # of a voice
+_LEAST_TIMES = 2
+
+
+def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterator[Recording]:
+    """Read the marks of a training set of voices; each log is a source.
+
+    Parameters
+    ----------
+    folders : iterable of Path
+    features : FeatureSet
+
+    Yields
+    ------
+    Recording
+        Of a voice, of silence, or of another sound; those have labels of the table of classes.
+
+    Raises
+    ------
+    LogError, DataError
+        As of `hearthlog.analyzer.training.home_data.home_recordings`.
+    """
+    for folder in folders:
+        for sound in read_reviewed_sound(folder, features):
+            for one in marked_recordings([teaching(sound)], folder, features, 0.0):
+                yield one._replace(group=f"{HOME} {sound.log.stem}", most=None)
+
+
+def is_voice(label: str) -> bool:
+    """Tell whether a label is somebody's name, for no class of sound is called so."""
+    return find_class(label) is None
+
+
+def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
+    """Return the scenario of the voices that are enrolled, silence, and all else as `unknown`.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+
+    Raises
+    ------
+    DataError
+        If no voice is enrolled, or one only once, or for less than ten seconds.
+    """
+    groups: dict[str, set[str]] = {}
+    seconds: dict[str, float] = {}
+    for one in recordings:
+        if is_voice(one.label):
+            groups.setdefault(one.label, set()).add(one.group)
+            heard = seconds.get(one.label, 0.0) + len(one.features) * FRAME_SECONDS
+            seconds[one.label] = heard
+    if not groups:
+        raise DataError("nobody is enrolled; begin with `hearthlog enrol anna --home voices`")
+    for name in sorted(groups):
+        if len(groups[name]) < _LEAST_TIMES:
+            raise DataError(
+                f"{name} is enrolled once: enrol {name} at another time, too, to be tested on "
+                "speech that was not learned from"
+            )
+        if seconds[name] < _LEAST_SECONDS:
+            raise DataError(
+                f"{name} is enrolled for {seconds[name]:.0f} s: {_LEAST_SECONDS:.0f} s are needed"
+            )
+    others = tuple(sorted(LABELS - {SILENCE}))
+    names = {name: (name,) for name in sorted(groups)}
+    return Scenario(SPEAKERS, {SILENCE: (SILENCE,), **names, UNKNOWN: others})
+
+
+def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32, Indices]:
+    """Return what a model of sounds has learned from: in the scenario silence, or unknown.
+
+    Parameters
+    ----------
+    model : Model
+        Such as the starter model `general`.
+    method : Method
+        That learns the scenario.
+    scenario : Scenario
+
+    Returns
+    -------
+    (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
+        Inputs of windows, and the numbers of their classes.
+
+    Raises
+    ------
+    DataError
+        If it has not kept what it learned from as inputs of the method.
+    """
+    description = model.description
+    remembered = method_named(description.method).as_of(description).remembered(model)
+    if remembered is None or (method.feature_set, method.inputs) != (
+        description.feature_set,
+        description.inputs,
+    ):
+        raise DataError(
+            f"method {method.name} cannot learn from {model.name} how others sound; use --method "
+            f"{description.method}, or give --data with silence and the speech of others"
+        )
+    inputs, target = remembered
+    classes = list(scenario.classes)
+    numbers = [
+        classes.index(SILENCE if class_name(name) == SILENCE else UNKNOWN) for name in model.classes
+    ]
+    return inputs, np.array(numbers)[target]

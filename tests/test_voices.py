@@ -1,0 +1,354 @@
+"""Voices are told apart where somebody speaks, are known again, and get a name."""
+
+import csv
+import json
+import shutil
+
+import pytest
+
+pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.numpy import save_file
+from spoken import ALLISON, DAY, START, THEO, record_conversation, two_voices
+
+from hearthlog.analyzer.discover.home_voices import NO_VOICE, Voices, find_voices
+from hearthlog.analyzer.discover.read_speech import (
+    HomeSpeech,
+    Turns,
+    read_speech,
+    speech_voices,
+)
+from hearthlog.analyzer.discover.voice_space import (
+    describe_speech,
+    has_voices,
+    voice_space,
+    window_starts,
+)
+from hearthlog.analyzer.discover.voice_summary import spoken_spans
+from hearthlog.analyzer.discover.voices import Evidence, joined, same_voice, summed, tell_apart
+from hearthlog.analyzer.discover.voices_file import VOICES, load_voices, save_voices
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
+from hearthlog.analyzer.review.timeline.model import LabelledSpans
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.schemas.times import NANOSECONDS, read_time
+from hearthlog.tools.bench.conversations import converse
+
+SPREAD = voice_space().spread
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return two_voices(tmp_path_factory.mktemp("clips"))
+
+
+@pytest.fixture(scope="module")
+def two_days(clips, tmp_path_factory):
+    """Logs of a minute on each of two days, and when who spoke."""
+    folder, turns = tmp_path_factory.mktemp("spoken"), []
+    for day in range(2):
+        logs, said = record_conversation(clips, folder, START + day * DAY, day)
+        turns.append(said)
+    return logs, turns
+
+
+@pytest.fixture
+def home(two_days, tmp_path):
+    """A copy of the logs."""
+    return shutil.copytree(two_days[0], tmp_path / "logs")
+
+
+def told(logs, known=None):
+    """Tell voices apart; return them, and when each speaks."""
+    speech = read_speech(find_home_logs([logs]))
+    voices, of = find_voices(speech, known)
+    return voices, of[speech.turns.voice], speech
+
+
+def seconds_by(voice, of, speech, turns, start):
+    """How long each voice that was found speaks in the turns of a person."""
+    sums = dict.fromkeys(set(of.tolist()), 0.0)
+    for first, last, found in zip(speech.turns.starts, speech.turns.ends, of, strict=True):
+        for turn in turns:
+            if turn.voice == voice:
+                times = ((each - start) / NANOSECONDS for each in (first, last))
+                begin, end = max(next(times), turn.start), min(next(times), turn.end)
+                sums[int(found)] += max(end - begin, 0.0)
+    return sums
+
+
+def run(hearthlog, *arguments):
+    done = hearthlog("voices", *arguments)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def as_json(hearthlog, *arguments):
+    return json.loads(run(hearthlog, *arguments, "--json").stdout)
+
+
+def test_two_people_who_talk_are_two_voices_on_both_days(two_days):
+    logs, days = two_days
+    voices, of, speech = told(logs)
+    assert voices.numbers.tolist() == [1, 2]
+    whose = set()
+    for day, turns in enumerate(days):
+        for person in (THEO, ALLISON):
+            sums = seconds_by(person, of, speech, turns, START + day * DAY)
+            voice = max(sums, key=sums.get)
+            assert sums[voice] > 0.8 * sum(sums.values())
+            whose.add((person, voice))
+    assert len(whose) == 2, "each has the same voice on both days, and no two have one"
+
+
+def test_one_person_is_one_voice(clips, tmp_path):
+    logs, _ = record_conversation({ALLISON: clips[ALLISON]}, tmp_path, START, 3)
+    voices, of, _ = told(logs)
+    assert voices.numbers.tolist() == [1]
+    assert set(of.tolist()) == {0}
+
+
+def test_the_voices_of_one_day_are_known_again_on_the_next(clips, two_days, tmp_path):
+    first, _ = record_conversation(clips, tmp_path, START - DAY, 5)
+    known, _, _ = told(first)
+    voices, of, _ = told(two_days[0], known)
+    assert voices.numbers.tolist() == [1, 2]
+    assert np.array_equal(voices.evidence.sums, known.evidence.sums)
+    assert NO_VOICE not in of
+
+
+def test_each_voice_of_a_conversation_is_the_one_that_is_like_it():
+    where, of = points(3, 3, 40)
+    likes = summed(where[::2], of[::2], 3)
+    known = Voices(np.array([4, 7]), likes.rows(np.array([0, 1])), ["anna", ""], "0" * 8)
+    turns = Turns(*(np.empty(0, np.int64) for _ in Turns._fields))
+    heard = summed(where[1::2], of[1::2], 3).rows(np.array([1, 2, 0]))
+    voices, found = find_voices(HomeSpeech([], [], turns, heard, [], 0), known)
+    assert voices.numbers[found].tolist() == [7, 8, 4]
+    assert voices.names == ["anna", "", ""]
+    few = summed(where[80:100:2], of[80:100:2], 3).rows(np.array([2]))
+    _, found = find_voices(HomeSpeech([], [], turns, few, [], 0), known)
+    assert found.tolist() == [NO_VOICE], "of five seconds nobody new is made"
+
+
+def test_turns_lie_where_the_labels_say_speech(two_days):
+    _, _, speech = told(two_days[0])
+    starts, ends = speech.turns.starts, speech.turns.ends
+    assert (starts[1:] >= ends[:-1]).all()
+    assert 60 < speech.seconds < 110, "of two minutes with pauses"
+
+
+def test_the_same_logs_give_the_same_voices_again_and_again(home, hearthlog):
+    first = run(hearthlog, home)
+    content = (home / VOICES).read_bytes()
+    again = run(hearthlog, home)
+    assert again.stdout == first.stdout
+    assert (home / VOICES).read_bytes() == content
+
+
+def test_a_voice_gets_a_name_is_enrolled_and_loses_the_name_again(home, hearthlog, tmp_path):
+    enrolled = tmp_path / "voices"
+    done = run(hearthlog, home, "--name", "1=Anna", "--home", enrolled)
+    assert "s of anna enrolled in" in done.stderr
+    logs = [path for path in enrolled.rglob("anna_*.mcap") if "review" not in path.name]
+    assert len(logs) > 1
+    listed = as_json(hearthlog, home)["voices"]
+    assert [each["name"] for each in listed] == ["anna", ""]
+    undone = as_json(hearthlog, home, "--undo", "1")["voices"]
+    assert [each["name"] for each in undone] == ["", ""]
+    assert not list(home.rglob("*.review.mcap")), "no mark corrects the labels of the home"
+
+
+def test_who_speaks_when_is_a_table(home, hearthlog, tmp_path):
+    table = tmp_path / "turns.csv"
+    run(hearthlog, home, "--name", "2=ben", "--output", table)
+    with table.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["voice"] for row in rows} == {"voice 1", "ben"}
+    assert {row["microphone"] for row in rows} == {"mic"}
+    starts = [read_time(row["start"]) for row in rows]
+    assert starts == sorted(starts)
+    again = hearthlog("voices", home, "--output", table)
+    assert again.returncode == 1
+    assert "exists already" in again.stderr
+
+
+def test_the_review_shows_who_speaks(home, hearthlog, tmp_path):
+    drawing = tmp_path / "day.rrd"
+    nobody = hearthlog("review", home, "--voices", home / VOICES, "--save", drawing)
+    assert "no such file of voices; `hearthlog voices` makes one" in nobody.stderr
+    run(hearthlog, home, "--name", "2=ben")
+    shown = hearthlog("review", home, "--voices", home / VOICES, "--save", drawing)
+    assert shown.returncode == 0, shown.stderr
+    timeline = read_timeline([home])
+    speech = read_speech(find_home_logs([home]))
+    spans = spoken_spans(speech, *find_voices(speech, load_voices(home / VOICES)))["mic"]
+    timeline.microphones["mic"].spoken = LabelledSpans(*spans)
+    (lane,) = [each for each in timeline_lanes(timeline) if each.name == "Voices"]
+    assert set(lane.spans.texts) == {"Voice 1", "Ben"}
+
+
+def test_too_little_speech_is_told(clips, tmp_path, hearthlog):
+    logs, _ = record_conversation(clips, tmp_path, START, 1, seconds=20)
+    done = hearthlog("voices", logs)
+    assert done.returncode == 1
+    assert "s of speech are too few to tell voices apart: it takes 20 s" in done.stderr
+    assert not (logs / VOICES).exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "reason"),
+    [
+        (("--name", "7=anna"), 1, "there is no voice 7"),
+        (("--undo", "7"), 1, "there is no voice 7"),
+        (("--name", "1=speech"), 2, "speech is a class of sound; give a person's name"),
+        (("--name", "anna"), 2, "say the number of a voice and a name, as 2=anna"),
+        (("--name", "1=anna", "--name", "1=ben"), 2, "voice 1 has another name already"),
+        (("--home", "voices"), 2, "--home goes with --name"),
+        (("--output", "turns.txt"), 2, "a table is named *.csv"),
+    ],
+)
+def test_wrong_use_is_told(home, hearthlog, options, status, reason):
+    done = hearthlog("voices", home, *options)
+    assert done.returncode == status
+    assert reason in done.stderr
+    assert not (home / VOICES).exists()
+
+
+def points(draw_seed, voices, each):
+    """Points of voices, each of which differs along an axis of its own."""
+    rng = np.random.default_rng(draw_seed)
+    means = 8 * np.eye(voices, len(SPREAD))
+    of = np.repeat(np.arange(voices), each)
+    return means[of] + rng.standard_normal((len(of), len(SPREAD))), of
+
+
+@given(seed=st.integers(0, 999), voices=st.integers(1, 4))
+def test_voices_far_apart_are_told_apart_whatever_their_order(seed, voices):
+    where, of = points(seed, voices, 20)
+    order = np.random.default_rng(seed).permutation(len(of))
+    found = joined(Evidence(np.ones(len(of)), where[order]), SPREAD)
+    pairs = set(zip(found.tolist(), of[order].tolist(), strict=True))
+    assert len(pairs) == len(np.unique(found)) == voices
+
+
+@given(seed=st.integers(0, 999))
+def test_one_voice_with_another_is_as_likely_as_the_other_with_it(seed):
+    where, of = points(seed, 2, 8)
+    evidence = summed(where, of, 2)
+    one, other = evidence.rows(np.array([0])), evidence.rows(np.array([1]))
+    assert same_voice(one, other, SPREAD) == pytest.approx(same_voice(other, one, SPREAD))
+    assert same_voice(one, one, SPREAD) > same_voice(one, other, SPREAD)
+
+
+def test_a_few_words_of_nobody_else_go_to_who_else_speaks():
+    where, _ = points(1, 2, 40)
+    where[40:] = where[:40].mean(axis=0)
+    where[60:64] += 12.0
+    assert tell_apart(where, SPREAD, 10).max() == 0
+    assert tell_apart(where, SPREAD, 2).max() == 1
+
+
+def test_a_louder_voice_is_the_same_voice(clips):
+    frames = np.concatenate(clips[ALLISON])
+    frames = frames[: len(frames) // 800 * 800].reshape(-1, 800)
+    names = DEFAULT.feature_names
+    soft, loud = (
+        voice_space().points(describe_speech(DEFAULT.extractor()(frames * gain), names))
+        for gain in (0.3, 0.9)
+    )
+    away = np.linalg.norm(soft - loud, axis=1)
+    steps = np.linalg.norm(np.diff(loud, axis=0), axis=1)
+    assert np.median(away) < 0.4 * np.median(steps)
+
+
+def test_every_frame_of_speech_is_in_a_turn(clips):
+    samples, _ = converse(clips, 30.0, 2)
+    values = DEFAULT.extractor()(samples[:480_000].reshape(-1, 800))
+    stamps = np.arange(len(values)) * 50_000_000
+    starts, ends, _ = speech_voices(stamps, values, DEFAULT.feature_names)
+    assert starts[0] == 0
+    assert ends[-1] == len(values) * 50_000_000
+    assert np.array_equal(starts[1:], ends[:-1])
+
+
+@given(frames=st.integers(1, 500))
+def test_windows_cover_speech_of_any_length(frames):
+    starts = window_starts(frames)
+    assert starts[0] == 0
+    assert frames < 30 or 0 <= frames - (starts[-1] + 30) < 10
+    values = np.random.default_rng(frames).random((frames, DEFAULT.width), np.float32)
+    assert len(describe_speech(values, DEFAULT.feature_names)) == len(starts)
+
+
+def test_features_of_other_sets_have_no_voices():
+    assert has_voices(DEFAULT.feature_names)
+    assert not has_voices(["energy", "octave_1"])
+
+
+def a_file(tmp_path):
+    numbers, counts = np.array([1, 2]), np.array([30.0, 20.0])
+    voices = Voices(numbers, Evidence(counts, np.ones((2, len(SPREAD)))), ["anna", ""], "0" * 8)
+    path = tmp_path / VOICES
+    save_voices(voices, path)
+    return path
+
+
+def test_a_file_of_voices_is_read_as_it_was_written(tmp_path):
+    voices = load_voices(a_file(tmp_path))
+    assert voices.names == ["anna", ""]
+    assert voices.evidence.counts.tolist() == [30.0, 20.0]
+    assert load_voices(tmp_path / "none") is None
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"numbers": np.array([1, 1])},
+        {"numbers": np.array([0, 1])},
+        {"counts": np.array([np.nan, 1.0])},
+        {"counts": np.array([0.0, 1.0])},
+        {"sums": np.full((2, len(SPREAD)), np.inf)},
+        {"sums": np.ones((2, 3))},
+        {"counts": np.ones(2, np.float32)},
+        {"more": np.ones(2)},
+    ],
+)
+def test_a_file_of_voices_that_cannot_be_is_refused(tmp_path, spoilt):
+    path = tmp_path / VOICES
+    arrays = {
+        "numbers": np.array([1, 2]),
+        "counts": np.ones(2),
+        "sums": np.ones((2, len(SPREAD))),
+    }
+    head = json.dumps({"format": 1, "id": "0" * 8, "names": ["anna", ""]})
+    save_file(arrays, path, {"hearthlog_voices": head})
+    assert load_voices(path) is not None
+    save_file(arrays | spoilt, path, {"hearthlog_voices": head})
+    with pytest.raises(DataError, match="is damaged; move it away to begin anew"):
+        load_voices(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"RIFF", b"\xff" * 64, b"\x08" + bytes(7) + b"{}" * 4])
+def test_another_file_is_no_file_of_voices(tmp_path, content):
+    path = tmp_path / VOICES
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="is no file of voices"):
+        load_voices(path)
+
+
+def test_conversations_have_the_turns_that_they_say(clips):
+    samples, turns = converse(clips, 40.0, 4)
+    power = (samples[: len(samples) // 800 * 800].reshape(-1, 800) ** 2).mean(axis=1)
+    inside = np.zeros(len(power), bool)
+    for turn in turns:
+        inside[int(turn.start * 20) : int(turn.end * 20) + 1] = True
+    assert power[inside].mean() > 20 * power[~inside].mean()
+    assert {turn.voice for turn in turns} == {THEO, ALLISON}
+    again, _ = converse(clips, 40.0, 4)
+    assert np.array_equal(samples, again)
