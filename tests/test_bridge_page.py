@@ -1,10 +1,8 @@
 """The page of the home: who may read it, what it shows, and how one says what a sound was."""
 
 import json
-import socket
-import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from datetime import UTC, datetime
 from http.client import HTTPConnection, HTTPException
 from zoneinfo import ZoneInfo
@@ -12,7 +10,8 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 from homelife import GENERAL
-from livehome import LiveHome, midday_zone
+from livehome import LiveHome
+from servedhome import JSON, PALE_TEXTS, Phone, serving
 from viewers import address_of, browsing, free_port, patiently
 
 from hearthlog.analyzer.bridge.day import today
@@ -30,9 +29,8 @@ from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.page.now_heard import NowHeard
 from hearthlog.analyzer.bridge.page.said import REVIEWER, Said, class_of
 from hearthlog.analyzer.bridge.page.words import length, when
-from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
-from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs
@@ -41,106 +39,6 @@ from hearthlog.schemas.times import NANOSECONDS
 
 LIVED = [name for name in GENERAL if name not in {"silence", "crying"}]
 HOSTILE = '<img src=x onerror="document.title=1">'
-JSON = {"Content-Type": "application/json"}
-
-
-class Served:
-    """A home whose log is being written, and its page."""
-
-    def __init__(self, folder, **options):
-        self.log = LiveHome(folder / "logs", **options)
-        self.home = Home(folder / "logs", "home", midday_zone())
-        self.state, self.said, self.port = folder / "state", [], free_port()
-        self._start()
-
-    def _start(self):
-        settings = PageSettings(port=self.port)
-        page = HomePage(settings, self.home, self.state, self.said.append)
-        self.url = self.said[-1].partition(": ")[2]
-        self.token = self.url.partition("=")[2]
-        now = today(time.time_ns(), self.home.zone)
-        self._stop = threading.Event()
-        bridge = Bridge(self.home, min(now.midnight, now.night), {"page": page}, self.said.append)
-        self._thread = threading.Thread(target=bridge.run, args=(self._stop,))
-        self._thread.start()
-
-    def end(self):
-        self._stop.set()
-        self._thread.join()
-
-    def restart(self):
-        self.end()
-        self._start()
-
-    def close(self):
-        self.end()
-        self.log.close()
-
-    def connect(self):
-        return socket.create_connection(("127.0.0.1", self.port), timeout=30)
-
-    def cookie(self):
-        _, fields, _ = self.ask("GET", f"/?token={self.token}", cookie=None)
-        return fields["Set-Cookie"].partition(";")[0]
-
-    def ask(self, method, path, body=None, cookie="own", **fields):
-        """Send a request; return status, fields and body of the answer."""
-        named = {name.replace("_", "-"): value for name, value in fields.items()}
-        if cookie is not None:
-            named["Cookie"] = self.cookie() if cookie == "own" else cookie
-        connection = HTTPConnection("127.0.0.1", self.port, timeout=30)
-        try:
-            connection.request(method, path, body, named)
-            answer = connection.getresponse()
-            return answer.status, answer.headers, answer.read().decode()
-        finally:
-            connection.close()
-
-    def mark(self, event, label, **fields):
-        body = json.dumps({"event": event, "label": label})
-        own = {"Origin": f"http://127.0.0.1:{self.port}", **JSON, **fields}
-        status, _, answer = self.ask("POST", "/mark", body, **own)
-        return status, answer
-
-    def marks(self):
-        return [mark for log in find_logs(self.log.folder) for mark in read_marks(log)]
-
-    def open_stream(self):
-        """Ask for the stream of news; return the connection, or None if there are too many."""
-        connection = self.connect()
-        head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n"
-        connection.sendall(f"{head}Cookie: {self.cookie()}\r\n\r\n".encode())
-        if connection.recv(12) == b"HTTP/1.1 200":
-            return connection
-        connection.close()
-        return None
-
-    @contextmanager
-    def stream(self):
-        """Open the stream of news; yield what waits for a part of the page."""
-        with (
-            patiently(self.open_stream, bool) as connection,
-            connection.makefile("r", encoding="utf-8") as lines,
-        ):
-
-            def next_part(name, is_enough=lambda _: True):
-                for line in lines:
-                    if line.strip() == f"event: {name}":
-                        part = json.loads(next(lines).removeprefix("data: "))
-                        if is_enough(part):
-                            return part
-                raise AssertionError(name)
-
-            yield next_part
-
-
-@contextmanager
-def serving(folder, **options):
-    served = Served(folder, **options)
-    try:
-        yield served
-    finally:
-        served.close()
 
 
 @pytest.fixture(scope="module")
@@ -565,111 +463,6 @@ def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
 
 # In a browser
 
-_WATCH = """
-window.seen = [];
-for (const kind of ["error", "unhandledrejection", "securitypolicyviolation"])
-  addEventListener(kind, (e) =>
-    seen.push(`${kind} ${e.message ?? e.reason ?? e.blockedURI}`), true);
-console.error = (...texts) => seen.push(texts.join(" "));
-"""
-# The texts with too little contrast to the ground below them, after WCAG 2.
-_PALE_TEXTS = """
-(() => {
-  const parts = (colour) => colour.match(/[\\d.]+/g).map(Number);
-  const linear = (v) => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
-  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
-  const ground = (e) => {
-    for (; e; e = e.parentElement) {
-      const found = parts(getComputedStyle(e).backgroundColor);
-      if (found.length === 3 || found[3] === 1) return found;
-    }
-    return [255, 0, 0];
-  };
-  const pale = [];
-  for (const e of document.body.querySelectorAll("*")) {
-    const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
-    if (!own || !e.getClientRects().length || e.closest(".hidden, defs, title")) continue;
-    const style = getComputedStyle(e);
-    const colour = e instanceof SVGElement ? style.fill : style.color;
-    const [one, other] = [light(parts(colour)), light(ground(e))].sort((a, b) => b - a);
-    if ((one + 0.05) / (other + 0.05) < 4.5) pale.push(`${e.textContent} ${colour}`);
-  }
-  return pale;
-})()
-"""
-
-
-class Phone:
-    """A browser that is shown the page."""
-
-    def __init__(self, browser):
-        self._browser = browser
-        browser.call("Page.enable")
-        browser.call("Page.addScriptToEvaluateOnNewDocument", source=_WATCH)
-
-    def open(self, served, width=390, height=844, scheme="light"):
-        self._browser.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
-        features = [{"name": "prefers-color-scheme", "value": scheme}]
-        self._browser.call("Emulation.setEmulatedMedia", features=features)
-        self._browser.call("Page.navigate", url=served.url)
-        patiently(self._is_there, bool)
-
-    def _is_there(self):
-        with suppress(AssertionError):  # it is still going on from the entrance
-            return self.of('document.querySelectorAll("#events li, .lanes svg").length > 1')
-
-    def of(self, expression):
-        return self._browser.evaluate(expression)
-
-    def until(self, expression):
-        return patiently(lambda: self.of(f"!!({expression})"), bool)
-
-    def text(self, selector):
-        return self.of(f"document.querySelector({selector!r})?.innerText")
-
-    def shows(self, selector, text):
-        patiently(lambda: self.text(selector), lambda shown: text.lower() in (shown or "").lower())
-
-    def press(self, key, text=""):
-        for kind in ("keyDown", "keyUp"):
-            code = {"Enter": 13, "Tab": 9, " ": 32}.get(key, 0)
-            self._browser.call(
-                "Input.dispatchKeyEvent",
-                type=kind,
-                key=key,
-                windowsVirtualKeyCode=code,
-                **({"text": text} if text and kind == "keyDown" else {}),
-            )
-
-    def write(self, text):
-        self._browser.call("Input.insertText", text=text)
-
-    def focus(self):
-        return self.of("document.activeElement.innerText || document.activeElement.value")
-
-    def tree(self):
-        """What a screen reader is told: role and name of everything that is not passed over."""
-        nodes = self._browser.call("Accessibility.getFullAXTree")["nodes"]
-        return [
-            (node["role"]["value"], node.get("name", {}).get("value", ""))
-            for node in nodes
-            if not node["ignored"]
-        ]
-
-    def framed(self):
-        """The addresses that a frame could not show."""
-        frames = self._browser.call("Page.getFrameTree")["frameTree"].get("childFrames", [])
-        return [f["frame"]["unreachableUrl"] for f in frames if "unreachableUrl" in f["frame"]]
-
-    def picture(self, path):
-        path.write_bytes(self._browser.picture())
-
 
 @pytest.fixture(scope="module")
 def phone(tmp_path_factory):
@@ -705,7 +498,7 @@ def test_the_page_fits_the_screen_and_can_be_read(phone, lived, size, scheme, tm
     phone.picture(tmp_path / "seen.png")
     assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
     assert phone.of("location.href") == lived.url.partition("?")[0]
-    assert phone.of(_PALE_TEXTS) == []
+    assert phone.of(PALE_TEXTS) == []
     dark = phone.of("getComputedStyle(document.body).backgroundColor") == "rgb(15, 20, 24)"
     assert dark == (scheme == "dark")
     assert phone.of("seen") == []

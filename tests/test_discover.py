@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -11,19 +13,22 @@ import pytest
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
+from conftest import HEARTHLOG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recurring import RECURRING, names_of, record_recurring
 from sklearn.metrics import adjusted_rand_score
 
+from hearthlog.analyzer.discover import descriptors
 from hearthlog.analyzer.discover import read_sounds as read_sounds_module
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
 from hearthlog.analyzer.discover.discover import discover
 from hearthlog.analyzer.discover.group_spans import group_spans
 from hearthlog.analyzer.discover.groups import NO_GROUP, add_groups, make_space
 from hearthlog.analyzer.discover.groups_file import GROUPS, load_groups, save_groups
+from hearthlog.analyzer.discover.hours import usual_hours
 from hearthlog.analyzer.discover.read_sounds import read_sounds
-from hearthlog.analyzer.discover.summary import usual_hours
+from hearthlog.analyzer.discover.summary_file import summary_path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write_marks
@@ -52,6 +57,20 @@ def two_days(tmp_path_factory):
 def home(two_days, tmp_path):
     """A copy of the logs."""
     return shutil.copytree(two_days[0], tmp_path / "logs")
+
+
+@pytest.fixture(scope="module")
+def two_grouped_days(two_days, tmp_path_factory):
+    """A copy of the logs, grouped."""
+    folder = shutil.copytree(two_days[0], tmp_path_factory.mktemp("grouped") / "logs")
+    subprocess.run([*HEARTHLOG, "discover", folder], check=True, capture_output=True)
+    return folder
+
+
+@pytest.fixture
+def grouped_home(two_grouped_days, tmp_path):
+    """A copy of the logs and their groups."""
+    return shutil.copytree(two_grouped_days, tmp_path / "logs")
 
 
 def logs_of(folder):
@@ -171,6 +190,80 @@ def test_what_somebody_has_looked_at_is_not_marked(home, hearthlog):
     write_marks(Path(example["log"]), [], reviewed=[span])
     done = run(hearthlog, home, "--name", f"{largest['number']}=dish")
     assert "; 1 are marked or looked at by somebody already" in done.stderr
+
+
+_WITHOUT = """
+import sys
+from importlib.abc import MetaPathFinder
+class Missing(MetaPathFinder):
+    def find_spec(self, name, *_):
+        if name in {"sklearn", "scipy", "matplotlib", "joblib", "pyarrow"}:
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Missing())
+from hearthlog.tools.cli.main import main
+main()
+"""
+
+
+def test_a_box_without_the_analyzer_names_what_another_one_has_grouped(grouped_home):
+    for asked, status, says in (
+        (["--name", "1=dish"], 0, "marks of dish"),
+        (["--undo", "1"], 0, "marks taken back"),
+        ([], 1, "sklearn is not installed; try: pip install"),
+    ):
+        arguments = [sys.executable, "-c", _WITHOUT, "discover", grouped_home, *asked]
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == status, done.stderr
+        assert says in done.stderr
+
+
+def test_a_name_adds_no_group(grouped_home, hearthlog):
+    file = grouped_home / GROUPS
+    groups = load_groups(file)
+    own = groups.of == 0
+    parts = {"examples": groups.examples[own], "of": groups.of[own], "names": [""]}
+    first = {"numbers": groups.numbers[:1], "radii": groups.radii[:1]}
+    save_groups(replace(groups, **parts, **first), file)
+    run(hearthlog, grouped_home, "--name", f"{groups.numbers[0]}=dish")
+    assert load_groups(file).names == ["dish"]
+
+
+def test_what_is_printed_for_programs_is_kept_beside_the_groups(grouped_home, hearthlog):
+    kept = json.loads(summary_path(grouped_home / GROUPS).read_text())
+    named = as_json(hearthlog, grouped_home, "--name", "1=dish")
+    for each in kept["groups"]:
+        each["name"] = "dish" if each["number"] == 1 else ""
+    assert named == kept
+    assert named == json.loads(summary_path(grouped_home / GROUPS).read_text())
+
+
+def test_nothing_is_marked_beside_a_summary_that_is_damaged(grouped_home, hearthlog):
+    summary_path(grouped_home / GROUPS).write_text("{}")
+    done = hearthlog("discover", grouped_home, "--name", "1=dish")
+    assert done.returncode == 1
+    assert "is no summary of groups; `hearthlog discover` writes it anew" in done.stderr
+    assert not any(review_path(log).exists() for log in logs_of(grouped_home))
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 1 << 30), st.integers(0, 2100), st.integers(1, 4), st.floats(1e-3, 1e3))
+def test_a_point_is_of_the_group_with_the_nearest_example_by_its_radius(seed, count, k, scale):
+    rng = np.random.default_rng(seed)
+    of = np.repeat(np.arange(k), 20)
+    examples = scale * rng.normal(size=(len(of), 3))
+    groups = replace(
+        make_space(("a",), rng.normal(size=(9, 3)).astype(np.float32)),
+        examples=examples,
+        of=of,
+        radii=scale * rng.uniform(0.05, 1.0, k),
+    )
+    points = np.concatenate([scale * rng.normal(size=(count, 3)), examples])
+    away = np.array(
+        [np.sqrt(((points[:, None] - examples[of == row]) ** 2).sum(2)).min(1) for row in range(k)]
+    )
+    away /= groups.radii[:, None]
+    expected = np.where(away.min(0) <= 1.0, away.argmin(0), NO_GROUP)
+    assert groups.find(points).tolist() == expected.tolist()
 
 
 def test_groups_of_another_file_are_other_groups(home, hearthlog, tmp_path):
@@ -359,6 +452,15 @@ def test_a_file_of_groups_with_hostile_numbers_is_refused(two_days, tmp_path, na
         load_groups(tmp_path / GROUPS)
 
 
+def test_a_file_of_more_examples_than_a_group_has_is_refused(two_days, tmp_path):
+    groups, _, _ = grouped([two_days[0]])
+    examples = np.concatenate([groups.examples, np.repeat(groups.examples[-1:], 300, axis=0)])
+    of = np.append(groups.of, np.full(300, groups.of[-1]))
+    save_groups(replace(groups, examples=examples, of=of), tmp_path / GROUPS)
+    with pytest.raises(DataError, match="do not fit each other"):
+        load_groups(tmp_path / GROUPS)
+
+
 @settings(deadline=None)
 @given(st.integers(0, 1 << 30), st.integers(4, 60), st.floats(0.01, 100.0))
 def test_a_description_does_not_depend_on_the_level_nor_on_what_is_around(seed, count, level):
@@ -373,6 +475,17 @@ def test_a_description_does_not_depend_on_the_level_nor_on_what_is_around(seed, 
         alone = values[first[row] : last[row]] * np.float32([level, 1.0, 1.0])
         again = describe(alone, names, np.array([0]), np.array([len(alone)]))
         np.testing.assert_allclose(both[row], again[0], rtol=1e-4, atol=1e-5)
+
+
+def test_descriptions_are_the_same_in_blocks_of_any_size(monkeypatch):
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(5000, 3)).astype(np.float32)
+    names, first = ("energy", "centroid", "rolloff"), np.arange(0, 4800, 60)
+    last = first + rng.integers(4, 60, len(first))
+    whole = describe(values, names, first, last)
+    for size in (1, 100, 1 << 30):
+        monkeypatch.setattr(descriptors, "_AT_ONCE", size)
+        assert np.array_equal(describe(values, names, first, last), whole)
 
 
 def test_a_description_is_what_it_says():

@@ -1,14 +1,15 @@
 """`hearthlog discover`: the sounds that recur in a home, and what they are called."""
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.options import End, Json, Start, Timezone, parse_span, reviewer_name
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
@@ -18,9 +19,9 @@ if TYPE_CHECKING:
     from datetime import tzinfo
 
     from hearthlog.analyzer.discover.groups import Groups
-    from hearthlog.analyzer.discover.read_sounds import HomeSounds
-    from hearthlog.analyzer.discover.summary import GroupSummary
-    from hearthlog.schemas.arrays import Int64
+    from hearthlog.analyzer.discover.naming import Looked
+    from hearthlog.analyzer.discover.summary_file import GroupSummary, HomeSummary
+    from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 _LABELS = 2  # that are shown of a group
 
@@ -58,40 +59,30 @@ def discover(
     Groups keep their numbers in later runs. Where a person has marked a sound already, it stays so.
     Exit status 3: a log is damaged, unfinished or of other features; the others were used.
     """
-    from hearthlog.analyzer.discover.discover import discover as find_groups
-    from hearthlog.analyzer.discover.groups_file import load_groups, locked_groups, save_groups
-    from hearthlog.analyzer.discover.read_sounds import read_sounds
+    from hearthlog.analyzer.discover.groups_file import locked_groups
+    from hearthlog.analyzer.discover.naming import Looked
     from hearthlog.analyzer.discover.sound_spans import CHOICES
-    from hearthlog.analyzer.discover.summary import summarise
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
 
     if of not in CHOICES:
         wrong_use(f"--of {of}: it is one of {', '.join(CHOICES)}")
-    first, last = parse_span(start, end)
+    looked = Looked(of, *parse_span(start, end))
     names, who = _names(name or []), reviewer_name(reviewer)
     home = find_home_logs(logs)
-    every = [entry.path for entry in home.between(0, 1 << 62)]
     zone = home_zone(timezone, home.records())
     file = groups or _default_file(logs)
     with locked_groups(file):
-        known = _undo(load_groups(file), file, every, undo or [])
-        with (
-            share_done("reading what was heard") as progress,
-            read_sounds(home, of, first, last, progress) as sounds,
-        ):
-            found, rows, points = find_groups(sounds, known, least)
-            _check_numbers(found, names)
-            save_groups(found, file)  # before there are marks of it
-            found = _name(found, every, sounds, rows, names, who)
-            save_groups(found, file)
-            summaries = summarise(sounds, found, rows, points, zone)
+        if names or undo:
+            summary, losses = _name(home, file, undo or [], names, looked, who)
+        else:
+            summary, losses = _group(home, file, looked, least, zone)
     if as_json:
-        print_json(_as_json(summaries, len(rows), file, zone))
+        print_json(summary.model_dump())
     else:
-        _print(summaries, len(rows), sounds.without, zone)
-        _tell_next(summaries, logs)
-    end_with_warnings(sounds.losses)
+        _print(summary, zone)
+        _tell_next(summary, logs)
+    end_with_warnings(losses)
 
 
 def _default_file(logs: Sequence[Path]) -> Path:
@@ -120,59 +111,96 @@ def _names(given: Sequence[str]) -> dict[int, str]:
     return names
 
 
-def _check_numbers(groups: "Groups | None", numbers: Iterable[int]) -> None:
+def _group(
+    home: "HomeLogs", file: Path, looked: "Looked", least: int, zone: "tzinfo"
+) -> tuple["HomeSummary", list[str]]:
+    """Group what is heard, and keep the groups and their summary."""
+    from hearthlog.analyzer.discover.discover import discover as find_groups
+    from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
+    from hearthlog.analyzer.discover.read_sounds import read_sounds
+    from hearthlog.analyzer.discover.summary import summarise
+    from hearthlog.analyzer.discover.summary_file import HomeSummary, save_summary, summary_path
+
+    known = load_groups(file)
+    with (
+        share_done("reading what was heard") as progress,
+        read_sounds(home, *looked, progress) as sounds,
+    ):
+        groups, rows, points = find_groups(sounds, known, least)
+        summary = HomeSummary(
+            id=groups.id,
+            sounds=len(rows),
+            timezone=str(zone),
+            groups_file=printable(file),
+            groups=summarise(sounds, groups, rows, points, zone),
+        )
+    save_groups(groups, file)
+    save_summary(summary, summary_path(file))
+    if sounds.without:
+        tell(f"{number(sounds.without, 'log')} without features and labels")
+    return summary, sounds.losses
+
+
+def _name(
+    home: "HomeLogs",
+    file: Path,
+    undo: Sequence[int],
+    names: Mapping[int, str],
+    looked: "Looked",
+    reviewer: str,
+) -> tuple["HomeSummary", list[str]]:
+    """Take names of known groups back, and give others; what is heard is not grouped anew."""
+    from hearthlog.analyzer.discover.groups_file import load_groups
+    from hearthlog.analyzer.discover.naming import name_groups, reason_of, unmark_group
+    from hearthlog.analyzer.discover.summary_file import load_summary, summary_path
+
+    groups = _known(load_groups(file), [*undo, *names])
+    summary = load_summary(summary_path(file))
+    for each in undo:
+        count = unmark_group(
+            [log.path for log in home.between(0, 1 << 62)], reason_of(groups, each)
+        )
+        tell(f"group {each}: {number(count, 'mark')} taken back")
+        groups, summary = _renamed(groups, summary, {each: ""}, file)
+    losses: list[str] = []
+    if names:
+        with share_done("reading what was heard") as progress:
+            marked, losses = name_groups(home, groups, names, looked, reviewer, progress)
+        for each, (made, left) in marked.items():
+            more = f"; {left} are marked or looked at by somebody already" if left else ""
+            tell(f"group {each}: {number(made, 'mark')} of {names[each]}{more}")
+        groups, summary = _renamed(groups, summary, names, file)
+    return summary, losses
+
+
+def _known(groups: "Groups | None", numbers: Iterable[int]) -> "Groups":
+    """Return the groups, if there are those of some numbers."""
     from hearthlog.analyzer.errors import DataError
 
     for each in numbers:
         if groups is None or each not in groups.numbers:
             raise DataError(f"there is no group {each}; `hearthlog discover LOGS` lists them")
+    assert groups is not None
+    return groups
 
 
-def _undo(
-    groups: "Groups | None", file: Path, logs: Sequence[Path], numbers: Sequence[int]
-) -> "Groups | None":
+def _renamed(
+    groups: "Groups", summary: "HomeSummary", names: Mapping[int, str], file: Path
+) -> tuple["Groups", "HomeSummary"]:
+    """Give groups other names, and keep them; an empty name takes one away."""
     from hearthlog.analyzer.discover.groups_file import save_groups
-    from hearthlog.analyzer.discover.naming import reason_of, unmark_group
+    from hearthlog.analyzer.discover.summary_file import save_summary, summary_path
 
-    _check_numbers(groups, numbers)
-    if groups is None:
-        return None
-    for each in numbers:
-        count = unmark_group(logs, reason_of(groups, each))
-        tell(f"group {each}: {number(count, 'mark')} taken back")
-        groups = _named(groups, each, "")
-        save_groups(groups, file)
-    return groups
+    numbers = groups.numbers.tolist()
+    kept = [names.get(each, name) for each, name in zip(numbers, groups.names, strict=True)]
+    groups, summary = replace(groups, names=kept), summary.named(names)
+    save_groups(groups, file)
+    save_summary(summary, summary_path(file))
+    return groups, summary
 
 
-def _name(
-    groups: "Groups",
-    logs: Sequence[Path],
-    sounds: "HomeSounds",
-    of: "Int64",
-    names: dict[int, str],
-    reviewer: str,
-) -> "Groups":
-    from hearthlog.analyzer.discover.naming import mark_group, reason_of
-
-    for each, label in names.items():
-        rows = (of == groups.numbers.tolist().index(each)).nonzero()[0]
-        made, left = mark_group(
-            logs, sounds, rows, reason=reason_of(groups, each), label=label, reviewer=reviewer
-        )
-        more = f"; {left} are marked or looked at by somebody already" if left else ""
-        tell(f"group {each}: {number(made, 'mark')} of {label}{more}")
-        groups = _named(groups, each, label)
-    return groups
-
-
-def _named(groups: "Groups", group: int, label: str) -> "Groups":
-    row = groups.numbers.tolist().index(group)
-    return replace(groups, names=[*groups.names[:row], label, *groups.names[row + 1 :]])
-
-
-def _print(summaries: "Sequence[GroupSummary]", total: int, without: int, zone: "tzinfo") -> None:
-    from hearthlog.analyzer.discover.summary import usual_hours
+def _print(summary: "HomeSummary", zone: "tzinfo") -> None:
+    from hearthlog.analyzer.discover.hours import usual_hours
 
     head = ("group", "name", "heard as", "listen to", "times", "days", "hours", "seconds", "alike")
     rows = [
@@ -187,44 +215,25 @@ def _print(summaries: "Sequence[GroupSummary]", total: int, without: int, zone: 
             f"{each.seconds:.1f}",
             f"{each.alike:.2f}",
         )
-        for each in summaries
+        for each in summary.groups
     ]
     print_table(head, rows, words=4)
-    grouped = sum(each.times for each in summaries)
-    print(f"{number(total, 'sound')}, of which {grouped} recur in {number(len(rows), 'group')}")
-    if without:
-        print(f"{number(without, 'log')} without features and labels")
+    grouped = sum(each.times for each in summary.groups)
+    total = number(summary.sounds, "sound")
+    print(f"{total}, of which {grouped} recur in {number(len(rows), 'group')}")
 
 
-def _place(summary: "GroupSummary", zone: "tzinfo") -> str:
+def _place(group: "GroupSummary", zone: "tzinfo") -> str:
     from hearthlog.analyzer.logs.local_time import local_time
+    from hearthlog.schemas.times import read_time
 
-    example = summary.examples[0]
-    return f"{local_time(example.start, zone):%Y-%m-%d %H:%M:%S} {example.microphone}"
+    example = group.examples[0]
+    start = local_time(read_time(example.start), zone)
+    return f"{start:%Y-%m-%d %H:%M:%S} {example.microphone}"
 
 
-def _tell_next(summaries: "Sequence[GroupSummary]", logs: Sequence[Path]) -> None:
-    unnamed = [each.number for each in summaries if not each.name]
+def _tell_next(summary: "HomeSummary", logs: Sequence[Path]) -> None:
+    unnamed = [each.number for each in summary.groups if not each.name]
     if unnamed:
         where = " ".join(quote(str(log)) for log in logs)
         tell(f"next: name one: hearthlog discover {where} --name {unnamed[0]}=doorbell")
-
-
-def _as_json(
-    summaries: "Sequence[GroupSummary]", total: int, file: Path, zone: "tzinfo"
-) -> dict[str, Any]:
-    from hearthlog.schemas.times import time_text
-
-    def example(each: Any) -> dict[str, Any]:
-        times = {key: time_text(getattr(each, key)) for key in ("start", "end")}
-        return {"log": str(each.log), "microphone": each.microphone, **times}
-
-    return {
-        "sounds": total,
-        "timezone": str(zone),
-        "groups_file": str(file),
-        "groups": [
-            {**asdict(each), "examples": [example(one) for one in each.examples]}
-            for each in summaries
-        ],
-    }

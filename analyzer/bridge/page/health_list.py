@@ -19,7 +19,7 @@ class HealthLine(NamedTuple):
     text: str
 
 
-def health_list(news: News, node: str, started: int) -> list[Any]:
+def health_list(news: News, node: str, started: int, recurring: str = "") -> list[Any]:
     """Say how everything is, for JSON.
 
     Parameters
@@ -29,8 +29,13 @@ def health_list(news: News, node: str, started: int) -> list[Any]:
         Name of the recorder.
     started : int
         When the bridge was started, in nanoseconds of UTC.
+    recurring : str, optional
+        Why the sounds that recur are not shown.
     """
-    return [line._asdict() for line in _lines(news, node, started)]
+    lines = [*_lines(news, node, started)]
+    if recurring:
+        lines.append(HealthLine("Sounds that recur", _WARNING, recurring))
+    return [line._asdict() for line in lines]
 
 
 def _lines(news: News, node: str, started: int) -> Iterator[HealthLine]:

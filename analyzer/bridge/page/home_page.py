@@ -17,6 +17,8 @@ from hearthlog.analyzer.bridge.page.event_list import last_events
 from hearthlog.analyzer.bridge.page.health_list import health_list
 from hearthlog.analyzer.bridge.page.now_heard import NowHeard
 from hearthlog.analyzer.bridge.page.page_token import page_token
+from hearthlog.analyzer.bridge.page.recurring import Recurring
+from hearthlog.analyzer.bridge.page.recurring_list import Moment
 from hearthlog.analyzer.bridge.page.said import Said
 from hearthlog.analyzer.bridge.page.server import PageServer
 from hearthlog.analyzer.bridge.page.words import clock, room
@@ -28,7 +30,7 @@ _EVERY_SECONDS = 1.0
 
 
 class HomePage:
-    """Shows a home to browsers, and takes what people say that its events were.
+    """Shows a home to browsers, and takes what people say that its sounds were.
 
     Parameters
     ----------
@@ -61,10 +63,12 @@ class HomePage:
         self._events: dict[str, Event] = {}
         self._now = NowHeard()
         self._said = Said(home.folder, home.node)
+        self._recurring = Recurring(home.folder)
         self._is_read_back = False
         token = page_token(settings.token_file, state)
         self._board = Board()
-        self._server = PageServer(settings.bind, settings.port, token, self._board, self._mark)
+        actions = {"/mark": self._mark, "/group": self._recurring.name}
+        self._server = PageServer(settings.bind, settings.port, token, self._board, actions)
         host = f"[{settings.bind}]" if bind.version == 6 else settings.bind
         say(f"the page of the home: http://{host}:{settings.port}/?token={token}")
         if not bind.is_loopback:
@@ -87,7 +91,8 @@ class HomePage:
         self._put("now", self._now.describe(news))
         self._put("home", {"home": room(self._node), "clock": clock(news.today.now, news.zone)})
         self._put("events", last.shown)
-        self._put("health", health_list(news, self._node, self._started))
+        self._put("recurring", self._recurring.describe(Moment(news.today.now, news.zone)))
+        self._put("health", health_list(news, self._node, self._started, self._recurring.problem))
         key = _day_key(news)
         if key != self._day_key:
             self._day_key = key
@@ -96,6 +101,7 @@ class HomePage:
     def close(self) -> None:
         """End, and let browsers know."""
         self._server.end()
+        self._recurring.close()
 
     def _put(self, name: str, content: Any) -> None:
         self._board.put(name, json.dumps(content, allow_nan=False).encode())

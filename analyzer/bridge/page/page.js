@@ -161,13 +161,14 @@ function showDay(day) {
 }
 
 let classes = [];
-const shown = new Map(); // items of the list by the ids of events
+const shownEvents = new Map(), shownGroups = new Map(); // items of the lists by ids
 
 function choice(name, value, ...words) {
   return make("label", {}, make("input", { type: "radio", name, value, required: "" }), ...words);
 }
 
-function form(item, event) {
+// A form in which one says what a sound was; `save` is told it, and answers what came of it.
+function form(item, { legend, choices, save }) {
   const own = make("input", { type: "text", maxlength: 64, autocomplete: "off", "aria-label": "What was it?" });
   const something = choice("label", "", "Something else:");
   something.classList.add("own");
@@ -175,17 +176,15 @@ function form(item, event) {
   own.addEventListener("input", () => { something.firstElementChild.checked = true; });
   const problem = make("p", { class: "problem", role: "alert" });
   const button = make("button", {}, "Save");
-  const asked = make("form", {}, make("fieldset", {},
-    make("legend", {}, `${event.words} at ${event.time}: that was …`),
-    ...classes.map(([label, words]) => choice("label", label, words)),
-    choice("label", "silence", "Nothing"), something), problem, button);
+  const asked = make("form", {}, make("fieldset", {}, make("legend", {}, legend),
+    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, button);
   asked.addEventListener("submit", async (submitted) => {
     submitted.preventDefault();
     const label = new FormData(asked).get("label") || own.value.trim();
     if (!label) { write(problem, "Write what it was."); own.focus(); return; }
     button.disabled = true;
     write(problem, "");
-    const answer = await mark(event.id, label);
+    const answer = await save(label);
     button.disabled = false;
     if (answer.error) { write(problem, answer.error); return; }
     write(item.said, answer.said);
@@ -195,12 +194,12 @@ function form(item, event) {
   return asked;
 }
 
-async function mark(event, label) {
+async function send(path, asked) {
   try {
-    const answer = await fetch("/mark", {
+    const answer = await fetch(path, {
       method: "POST",
       headers: { "Content-Type": "application/json" },
-      body: JSON.stringify({ event, label }),
+      body: JSON.stringify(asked),
     });
     if (answer.status === 200 || answer.status === 422) return await answer.json();
     return { error: "It was not saved: open the page by its whole address again." };
@@ -209,9 +208,10 @@ async function mark(event, label) {
   }
 }
 
-function begin(event) {
+// An item of a list of sounds, with a form that `question` describes when it is opened.
+function begin(question) {
   const item = {
-    what: make("p", { class: "what" }, swatch(event.colour), event.words),
+    what: make("p", { class: "what" }),
     about: make("p", { class: "about" }),
     said: make("p", { class: "said", role: "status" }),
     summary: make("summary", {}, "That was …"),
@@ -220,35 +220,87 @@ function begin(event) {
   item.element = make("li", {}, make("div", {}, item.what, item.about, item.said), item.details);
   item.summary.append(item.hint = make("span", { class: "hidden" }));
   item.details.addEventListener("toggle", () => {
-    if (item.details.open && item.details.children.length === 1) item.details.append(form(item, item.event));
+    if (item.details.open && item.details.children.length === 1) item.details.append(form(item, question(item)));
     if (!item.details.open) item.details.querySelector("form")?.remove();
   });
   return item;
 }
 
-function showEvents({ events, classes: known }) {
-  classes = known;
-  const list = place("events");
-  const ids = new Set(events.map(({ id }) => id));
-  for (const [id, item] of shown) {
-    if (ids.has(id) || item.details.open) continue; // somebody is just saying what it was
+// The items of a list in its order, by the ids of what they show; one in which somebody is just
+// saying what it was stays.
+function arrange(list, items, entries, begun, show) {
+  const ids = new Set(entries.map(({ id }) => id));
+  for (const [id, item] of items) {
+    if (ids.has(id) || item.details.open) continue;
     item.element.remove();
-    shown.delete(id);
+    items.delete(id);
   }
   let before = null;
-  for (const event of events) {
-    let item = shown.get(event.id);
-    if (!item) shown.set(event.id, item = begin(event));
-    item.event = event;
-    const about = [event.time, event.length, event.sure, event.room].filter(Boolean).join(" · ");
-    write(item.about, about);
-    write(item.said, event.said);
-    write(item.hint, ` (${event.words}, ${event.time})`);
+  for (const entry of entries) {
+    let item = items.get(entry.id);
+    if (!item) items.set(entry.id, item = begun(entry));
+    show(item, entry);
     const next = before ? before.nextSibling : list.firstChild;
     if (item.element !== next) list.insertBefore(item.element, next);
     before = item.element;
   }
+}
+
+function beginEvent({ id, words, colour, time }) {
+  const item = begin(() => ({
+    legend: `${words} at ${time}: that was …`,
+    choices: [...classes, ["silence", "Nothing"]],
+    save: (label) => send("/mark", { event: id, label }),
+  }));
+  item.what.append(swatch(colour), words);
+  return item;
+}
+
+function showEvents({ events, classes: known }) {
+  classes = known;
+  arrange(place("events"), shownEvents, events, beginEvent, (item, event) => {
+    write(item.about, [event.time, event.length, event.sure, event.room].filter(Boolean).join(" · "));
+    write(item.said, event.said);
+    write(item.hint, ` (${event.words}, ${event.time})`);
+  });
   place("no-events").hidden = events.length > 0;
+}
+
+function beginGroup({ id }) {
+  const item = begin(({ words }) => ({
+    legend: `${words}: that was …`,
+    choices: classes,
+    save: (label) => send("/group", { group: id, label }),
+  }));
+  [item.heard, item.listen] = [make("p", { class: "about" }), make("p", { class: "about" })];
+  item.about.after(item.heard, item.listen);
+  item.back = make("button", { type: "button", class: "back" }, "Take back");
+  item.back.append(item.backHint = make("span", { class: "hidden" }));
+  item.details.after(item.back);
+  item.back.addEventListener("click", async () => {
+    item.back.disabled = true;
+    const answer = await send("/group", { group: id, label: "" });
+    item.back.disabled = false;
+    write(item.said, answer.error ?? answer.said);
+  });
+  return item;
+}
+
+function showRecurring({ looked, more, groups }) {
+  place("recurs").hidden = !groups.length;
+  write(place("looked"), looked ? `, as they were found at ${looked}` : "");
+  write(place("more"), more);
+  arrange(place("recurring"), shownGroups, groups, beginGroup, (item, group) => {
+    item.words = group.words;
+    write(item.what, group.words);
+    write(item.about, group.about);
+    write(item.heard, group.heard);
+    write(item.listen, group.listen);
+    write(item.said, group.said);
+    write(item.hint, ` (${group.words})`);
+    write(item.backHint, ` the name ${group.words}`);
+    item.back.hidden = !group.is_named;
+  });
 }
 
 function showHealth(lines) {
@@ -289,7 +341,8 @@ function beat() {
 
 function connect() {
   const source = new EventSource("/events");
-  const shows = { home: showHome, now: showNow, day: showDay, events: showEvents, health: showHealth };
+  const shows = { home: showHome, now: showNow, day: showDay, events: showEvents, recurring: showRecurring,
+    health: showHealth };
   for (const [name, show] of Object.entries(shows)) {
     source.addEventListener(name, ({ data }) => show(JSON.parse(data)));
   }

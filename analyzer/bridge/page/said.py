@@ -16,8 +16,12 @@ from hearthlog.schemas.logs.files import find_logs, log_name, review_path
 from hearthlog.schemas.messages.labels import spelt
 
 REVIEWER = "page of the home"
+READ_ONLY = (
+    "It was not saved: the bridge may only read the logs, not write beside them. Whoever set up "
+    "the box can change that."
+)
 _MOST_LOGS = 64  # whose marks are read: of more than a day and a half
-_READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _BY_WORDS = {spelt(row.words): row.name for row in CLASSES}
 
 
@@ -134,10 +138,7 @@ def _explained(error: BridgeError) -> HearthlogError:
     """Say for people at home why something was not saved."""
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, OSError) and cause.errno in _READ_ONLY:
-            return BridgeError(
-                "It was not saved: the bridge may only read the logs, not write beside them. "
-                "Whoever set up the box can change that."
-            )
+        if isinstance(cause, OSError) and cause.errno in _FORBIDDEN:
+            return BridgeError(READ_ONLY)
         cause = cause.__cause__
     return BridgeError(f"It was not saved: {error}")

@@ -28,6 +28,7 @@ _FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
 }
+_ASKED = {"/mark": "event", "/group": "group"}  # what a label is given to
 _TEXT, _JSON = "text/plain; charset=utf-8", "application/json"
 _REFUSED = (
     "This page opens with its whole address only. `hearthlog bridge` says the address when it "
@@ -64,9 +65,9 @@ class PageServer(ThreadingHTTPServer):
     token : str
     board : Board
         What the page shows.
-    mark : callable
-        Told the id of an event, and what somebody says that it was; returns what was marked, in
-        words, and raises HearthlogError.
+    actions : mapping of str to callable
+        Of `/mark` and `/group`: told the id of an event, or of a group of sounds, and what somebody
+        says that it was; returns what was marked, in words, and raises HearthlogError.
 
     Raises
     ------
@@ -78,7 +79,12 @@ class PageServer(ThreadingHTTPServer):
     request_queue_size = 16
 
     def __init__(
-        self, bind: str, port: int, token: str, board: Board, mark: Callable[[str, str], str]
+        self,
+        bind: str,
+        port: int,
+        token: str,
+        board: Board,
+        actions: Mapping[str, Callable[[str, str], str]],
     ) -> None:
         self.address_family = socket.AF_INET6 if ":" in bind else socket.AF_INET
         try:
@@ -88,7 +94,7 @@ class PageServer(ThreadingHTTPServer):
                 f"the page cannot listen on {bind}, port {port} ({error.strerror or error}); "
                 "choose another `bind` or `port` in [bridge.page]"
             ) from error
-        self.board, self.mark = board, mark
+        self.board, self.actions = board, actions
         self.admission = PageAdmission(bind, self.server_address[1], token)
         self.streams = threading.BoundedSemaphore(_MOST_STREAMS)
         self._free = threading.BoundedSemaphore(_MOST_CONNECTIONS)
@@ -200,19 +206,19 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def do_POST(self) -> None:
-        """Take what somebody says that an event was."""
+        """Take what somebody says that an event was, or the sounds of a group."""
         if not self._is_admitted(changes=True):
             return
-        if self.path != "/mark":
+        if self.path not in _ASKED:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        asked = self._body()
+        asked = self._body(_ASKED[self.path])
         if isinstance(asked, HTTPStatus):
             self.send_error(asked)
             return
         self._server.give_time(self.connection, _MARK_SECONDS)
         try:
-            answer, code = {"said": self._server.mark(*asked)}, HTTPStatus.OK
+            answer, code = {"said": self._server.actions[self.path](*asked)}, HTTPStatus.OK
         except HearthlogError as error:
             answer, code = {"error": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY
         self._server.give_time(self.connection, _SECONDS)
@@ -225,8 +231,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.FORBIDDEN, _REFUSED.encode(), _TEXT)
         return False
 
-    def _body(self) -> tuple[str, str] | HTTPStatus:
-        """Read an event and a class, or return what is wrong."""
+    def _body(self, what: str) -> tuple[str, str] | HTTPStatus:
+        """Read what is labelled and its label, or return what is wrong."""
         length = self.headers.get("Content-Length", "")
         if self.headers.get_content_type() != _JSON:
             return HTTPStatus.UNSUPPORTED_MEDIA_TYPE
@@ -236,12 +242,12 @@ class _Handler(BaseHTTPRequestHandler):
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE
         try:
             asked = json.loads(self.rfile.read(int(length)))
-            event, label = asked["event"], asked["label"]
+            labelled, label = asked[what], asked["label"]
         except (ValueError, KeyError, TypeError, RecursionError):
             return HTTPStatus.BAD_REQUEST
-        if not (isinstance(event, str) and isinstance(label, str)):
+        if not (isinstance(labelled, str) and isinstance(label, str)):
             return HTTPStatus.BAD_REQUEST
-        return event, label
+        return labelled, label
 
     def _stream(self) -> None:
         """Send what the board has, and then what changes."""

@@ -1,0 +1,393 @@
+"""The sounds that recur, on the page of the home: what it says of them, and names for them."""
+
+import json
+import os
+import shutil
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recurring import record_recurring
+from servedhome import PALE_TEXTS, Phone, serving
+from viewers import browsing, patiently
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.page import group_naming
+from hearthlog.analyzer.bridge.page.group_naming import GroupNaming
+from hearthlog.analyzer.bridge.page.recurring import Recurring
+from hearthlog.analyzer.bridge.page.recurring_list import Moment, recurring_list
+from hearthlog.analyzer.bridge.page.said import REVIEWER
+from hearthlog.analyzer.discover.groups_file import GROUPS
+from hearthlog.analyzer.discover.summary_file import (
+    SUMMARY,
+    Example,
+    GroupSummary,
+    HomeSummary,
+    load_summary,
+    save_summary,
+    summary_path,
+)
+from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.times import NANOSECONDS
+
+NOW = int(datetime(2026, 3, 3, 12, tzinfo=UTC).timestamp()) * NANOSECONDS
+MOMENT = Moment(NOW, UTC)
+HOSTILE = '<img src=x onerror="document.title=1">'
+
+
+def group(number, name="", times=84, *, microphones=("mic",), **changes):
+    hours = [0] * 24
+    hours[8] = times
+    examples = [
+        Example(
+            log="a.mcap",
+            microphone=microphones[0],
+            start=f"2026-03-0{day}T08:07:5{day}Z",
+            end=f"2026-03-0{day}T08:07:59Z",
+        )
+        for day in (3, 1, 2)
+    ]
+    fields = {
+        "days": 2,
+        "hours": hours,
+        "seconds": 1.7,
+        "alike": 0.74,
+        "labels": {"yelling": 0.62, "phone_ring": 0.31, "music": 0.07},
+        "microphones": list(microphones),
+        "examples": examples,
+    }
+    return GroupSummary(number=number, name=name, times=times, **(fields | changes))
+
+
+def summary_of(*groups):
+    return HomeSummary(
+        id="5b4e0d1c", sounds=1000, timezone="UTC", groups_file=GROUPS, groups=list(groups)
+    )
+
+
+def keep(folder, *groups):
+    folder.mkdir(exist_ok=True)
+    save_summary(summary_of(*groups), folder / SUMMARY)
+
+
+# What is said of them
+
+
+def test_a_sound_that_recurs_is_described_in_words():
+    shown = recurring_list(summary_of(group(4)), NOW - 3600 * NANOSECONDS, {4: "so"}, MOMENT)
+    assert shown["looked"] == "11:00"
+    assert shown["groups"] == [
+        {
+            "id": "4 of 5b4e0d1c",
+            "words": "Sound 4",
+            "is_named": False,
+            "about": "84 times on 2 days, mostly between 08 and 09 o'clock, 2 seconds each",
+            "heard": "Heard as Shouting (62\N{NO-BREAK SPACE}%) or Telephone ringing "
+            "(31\N{NO-BREAK SPACE}%)",
+            "listen": "For instance 1 March 08:07:51, yesterday 08:07:52 and 08:07:53",
+            "said": "so",
+        }
+    ]
+
+
+def test_those_without_a_name_come_first_and_ten_of_them_at_a_time():
+    named = [group(number, "kettle") for number in range(1, 4)]
+    unnamed = [group(number) for number in range(4, 20)]
+    shown = recurring_list(summary_of(*named, *unnamed), NOW, {}, MOMENT)
+    words = [each["words"] for each in shown["groups"]]
+    assert words == [*(f"Sound {number}" for number in range(4, 14)), *["Kettle"] * 3]
+    assert shown["more"] == "6 more without a name come later."
+
+
+def test_rooms_are_named_where_there_are_several():
+    home = summary_of(group(1), group(2, microphones=("bath_room",)))
+    shown = recurring_list(home, NOW, {}, MOMENT)["groups"]
+    assert "08:07:53 (Mic)" in shown[0]["listen"]
+    assert "08:07:53 (Bath room)" in shown[1]["listen"]
+
+
+def test_a_summary_from_the_future_is_of_now():
+    for looked in (-(1 << 70), 1 << 80):
+        assert recurring_list(summary_of(group(1)), looked, {}, MOMENT)["looked"]
+
+
+def test_without_a_summary_there_is_nothing_and_a_new_one_is_seen(tmp_path):
+    recurring = Recurring(tmp_path)
+    assert recurring.describe(MOMENT)["groups"] == []
+    keep(tmp_path, group(1))
+    assert [each["words"] for each in recurring.describe(MOMENT)["groups"]] == ["Sound 1"]
+    keep(tmp_path, group(1, "door_bell"))
+    assert [each["words"] for each in recurring.describe(MOMENT)["groups"]] == ["Door bell"]
+    (tmp_path / SUMMARY).unlink()
+    assert recurring.describe(MOMENT)["groups"] == []
+    assert recurring.problem == ""
+
+
+def test_the_summary_lies_beside_the_groups():
+    assert summary_path(Path(GROUPS)).name == SUMMARY
+
+
+# Files that are none
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{}",
+        b"\xff",
+        b"[" * 100_000,
+        b" " * (5 << 20),
+        summary_of(group(1)).model_dump_json().replace("0.62", "NaN").encode(),
+        summary_of(group(1)).model_dump_json().replace("2026-03-01", "9999-12-31").encode(),
+        summary_of(group(1)).model_dump_json().replace('"format":1', '"format":2').encode(),
+        summary_of(group(1)).model_dump_json().replace('"name":""', '"name":"a\\u0000"').encode(),
+    ],
+    ids=range(9),
+)
+def test_a_file_that_is_no_summary_is_one_line_among_what_needs_a_look(tmp_path, content):
+    (tmp_path / SUMMARY).write_bytes(content)
+    recurring = Recurring(tmp_path)
+    assert recurring.describe(MOMENT)["groups"] == []
+    assert recurring.problem.startswith(f"{tmp_path / SUMMARY}: ")
+    assert "\n" not in recurring.problem
+    keep(tmp_path, group(1))
+    assert recurring.describe(MOMENT)["groups"]
+    assert recurring.problem == ""
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_a_damaged_summary_is_shown_or_refused_and_nothing_else(tmp_path_factory, data):
+    content = bytearray(summary_of(group(1), group(2, "kettle")).model_dump_json().encode())
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        content[place] = data.draw(st.integers(0, 255))
+    folder = tmp_path_factory.mktemp("damaged")
+    (folder / SUMMARY).write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
+    recurring = Recurring(folder)
+    shown = json.dumps(recurring.describe(MOMENT), allow_nan=False)
+    assert bool(recurring.problem) == ("Sound 1" not in shown and "Kettle" not in shown)
+
+
+def test_a_pipe_in_place_of_the_summary_holds_nobody_up(tmp_path):
+    os.mkfifo(tmp_path / SUMMARY)
+    recurring = Recurring(tmp_path)
+    recurring.describe(MOMENT)
+    assert "Not a regular file" in recurring.problem
+
+
+# The process that names
+
+
+def acting(monkeypatch, text):
+    """Let a few lines of Python stand for the command."""
+    monkeypatch.setattr(group_naming, "module_command", lambda _: [sys.executable, "-c", text])
+
+
+@pytest.mark.parametrize(
+    ("acts", "says"),
+    [
+        (
+            "print('hearthlog: group 3: 7 marks of a; 1 are marked'); print('hearthlog: next')",
+            "7 marks of a; 1 are marked",
+        ),
+        (
+            "print('hearthlog: group 3: 7 marks of a'); print('hearthlog: x: is cut'); sys.exit(3)",
+            "7 marks of a; not all could be read: x: is cut",
+        ),
+        ("print('hearthlog: there is no group 3'); sys.exit(1)", "not done: there is no group 3"),
+        ("sys.exit(4)", "not done: exit status 4"),
+        ("print('x' * 100_000_000); sys.exit(1)", "not done: xxx"),
+        ("import os; os.kill(os.getpid(), 9)", "ended by signal 9"),
+    ],
+)
+def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, says):
+    acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
+    naming = GroupNaming(tmp_path)
+    assert naming.start(3, "kettle").startswith("Being marked: Kettle.")
+    told = patiently(lambda: naming.said[3], lambda text: "Being" not in text)
+    assert says in told
+    assert len(told) < 500
+
+
+def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(
+    tmp_path, monkeypatch
+):
+    acting(monkeypatch, "import time; time.sleep(600)")
+    naming = GroupNaming(tmp_path)
+    naming.start(3, "")
+    with pytest.raises(BridgeError, match="still marks another sound"):
+        naming.start(4, "kettle")
+    assert 4 not in naming.said
+    naming.close()
+    patiently(lambda: naming.said[3], lambda text: "ended by signal 15" in text)
+    acting(monkeypatch, "")
+    naming.start(4, "kettle")
+
+
+def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(group_naming.os, "access", lambda *_: False)
+    with pytest.raises(BridgeError, match="may only read the logs"):
+        GroupNaming(tmp_path).start(3, "kettle")
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "says"),
+    [
+        ("1 of 00000000", "kettle", "grouped anew"),
+        ("2 of 5b4e0d1c", "kettle", "grouped anew"),
+        ("--undo", "", "grouped anew"),
+        ("1 of 5b4e0d1c", "silence", "cannot be named silence"),
+        ("1 of 5b4e0d1c", "; rm -rf /", "letters a to z"),
+        ("1 of 5b4e0d1c", " ", "letters a to z"),
+    ],
+)
+def test_what_cannot_be_a_name_starts_nothing(tmp_path, monkeypatch, key, text, says):
+    monkeypatch.setattr(group_naming, "module_command", pytest.fail)
+    keep(tmp_path, group(1))
+    recurring = Recurring(tmp_path)
+    recurring.describe(MOMENT)
+    with pytest.raises(BridgeError, match=says):
+        recurring.name(key, text)
+
+
+# In a browser, with sounds
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Logs of some minutes in which sounds recur."""
+    folder = tmp_path_factory.mktemp("recorded") / "logs"
+    record_recurring(folder, 1_772_352_000 * NANOSECONDS, seed=0, seconds=300)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
+        yield Phone(browser)
+
+
+def marks_of(folder):
+    return [mark for log in find_logs(folder) for mark in read_marks(log)]
+
+
+def heard_once(home):
+    home.log.heard("coughing", 10)
+    home.log.hears("coughing")
+
+
+def test_one_names_a_sound_on_the_page_and_takes_the_name_back(
+    phone, recorded, tmp_path, hearthlog
+):
+    logs = shutil.copytree(recorded, tmp_path / "logs")
+    assert hearthlog("discover", logs).returncode == 0
+    before = load_summary(logs / SUMMARY)
+    largest = before.groups[0]
+    with serving(tmp_path) as home:
+        heard_once(home)
+        phone.open(home)
+        phone.shows("#recurring li:first-child .what", f"Sound {largest.number}")
+        assert f"{largest.times} times on one day" in phone.text("#recurring li:first-child")
+        phone.of('document.querySelector("#recurring summary").click()')
+        phone.until('document.querySelector("#recurring input[type=text]")')
+        phone.of('document.querySelector("#recurring input[type=text]").focus()')
+        phone.write("Door bell")
+        phone.press("Enter", "\r")
+        phone.shows("#recurring li:last-child .what", "Door bell")
+        phone.shows("#recurring li:last-child .said", f"{largest.times} marks of door_bell")
+        marks = marks_of(logs)
+        reason = f"group {largest.number} of {before.id}"
+        assert {mark[3:5] + mark[7:] for mark in marks} == {("door_bell", REVIEWER, reason)}
+        assert len(marks) == largest.times
+        phone.of('document.querySelector("#recurring li:last-child .back").click()')
+        phone.shows("#recurring li:first-child .what", f"Sound {largest.number}")
+        phone.shows("#recurring li:first-child .said", f"{largest.times} marks taken back")
+        assert marks_of(logs) == []
+        assert load_summary(logs / SUMMARY) == before
+        assert phone.of("seen") == []
+
+
+@pytest.fixture(scope="module")
+def listed(tmp_path_factory):
+    """A home with a list of sounds that recur, of all kinds."""
+    folder = tmp_path_factory.mktemp("listed")
+    hostile = group(3, microphones=(HOSTILE,), labels={HOSTILE: 0.5, "w" * 200: 0.5})
+    keep(folder / "logs", group(1), group(2, "k" * 64), hostile)
+    with serving(folder) as home:
+        heard_once(home)
+        yield home
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(390, 844), (1366, 768)], ids=str)
+def test_the_list_fits_the_screen_and_is_text_whatever_it_has(phone, listed, size, scheme):
+    phone.open(listed, *size, scheme)
+    phone.until('document.querySelectorAll("#recurring li").length === 3')
+    phone.of('document.querySelectorAll("#recurring summary").forEach((e) => e.click())')
+    phone.until('document.querySelectorAll("#recurring fieldset").length === 3')
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    assert phone.of(PALE_TEXTS) == []
+    assert HOSTILE.capitalize()[:20] in phone.text("#recurring")
+    assert phone.of('document.querySelectorAll("img").length') == 0
+    assert phone.of("seen") == []
+
+
+def test_a_screen_reader_is_told_which_sound_each_button_is_of(phone, listed):
+    phone.open(listed)
+    phone.until('document.querySelectorAll("#recurring li").length === 3')
+    tree = phone.tree()
+    assert ("region", "Sounds that recur") in tree
+    buttons = [name for role, name in tree if role in {"button", "DisclosureTriangle"}]
+    assert len({*buttons}) == len(buttons)
+    assert "▸ That was … (Sound 1)" in buttons
+    assert any(name.startswith("Take back the name Kkkk") for name in buttons)
+
+
+def test_the_list_is_not_there_before_sounds_were_grouped_and_a_damaged_one_is_a_line(
+    phone, tmp_path
+):
+    with serving(tmp_path) as home:
+        heard_once(home)
+        phone.open(home)
+        phone.shows("#health", "Bridge: Good")
+        assert phone.of('document.getElementById("recurs").hidden')
+        (tmp_path / "logs" / SUMMARY).write_text("{")
+        phone.shows("#health", "Sounds that recur: Look at this (")
+        assert "is no summary of groups; `hearthlog discover` writes it" in phone.text("#health")
+        assert phone.of('document.getElementById("recurs").hidden')
+        keep(tmp_path / "logs", group(1))
+        phone.shows("#recurring", "Sound 1")
+
+
+def test_a_form_that_somebody_fills_in_stays_when_sounds_are_grouped_anew(phone, tmp_path):
+    keep(tmp_path / "logs", group(1), group(2))
+    with serving(tmp_path) as home:
+        heard_once(home)
+        phone.open(home)
+        phone.until('document.querySelectorAll("#recurring li").length === 2')
+        phone.of('document.querySelector("#recurring summary").click()')
+        phone.until('document.querySelector("#recurring input[type=text]")')
+        phone.of('document.querySelector("#recurring input[type=text]").focus()')
+        phone.write("Kettle")
+        keep(tmp_path / "logs", group(2), group(3), group(1))
+        phone.until('document.querySelectorAll("#recurring li").length === 3')
+        assert phone.focus() == "Kettle"
+
+
+def test_another_page_names_nothing(listed):
+    body = json.dumps({"group": "1 of 5b4e0d1c", "label": "kettle"})
+    json_only = {"Content-Type": "application/json"}
+    assert listed.ask("POST", "/group", body, **json_only)[0] == 403
+    foreign = {**json_only, "Origin": "http://evil.example"}
+    assert listed.ask("POST", "/group", body, **foreign)[0] == 403
+    assert listed.post("/group", {"event": "1", "label": "kettle"})[0] == 400
+    assert listed.post("/group", {"group": "9 of 5b4e0d1c", "label": "kettle"})[0] == 422
