@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from hearthlog.schemas.text import shortened
+from hearthlog.tools.cli.evaluate_paper import paper
 from hearthlog.tools.cli.evaluate_sounds import learned_lines, robustness, scenes
 from hearthlog.tools.cli.options import (
     METHOD,
@@ -284,6 +285,9 @@ def adaptation(
         f"\nlargest loss of a class in a home: {-min(curve.worst):.3f}, of silence "
         f"{-min(curve.worst_of_silence):.3f}"
     )
+
+
+evaluate.command()(paper)
 
 
 @contextmanager

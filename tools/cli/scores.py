@@ -24,13 +24,13 @@ def print_scores(scores: "Scores", detections: "Detections | None" = None, hours
             shortened(name, NAME_WIDTH),
             str(one.support),
             *map(share, (one.precision, one.recall, one.f1)),
-            _between(one.f1_interval),
+            between(one.f1_interval),
             *_events(detections, name, hours),
         )
         for name, one in scores.per_class.items()
     ]
     macro = map(share, (scores.macro_precision, scores.macro_recall, scores.macro_f1))
-    interval = _between(scores.macro_f1_interval)
+    interval = between(scores.macro_f1_interval)
     events = _events(detections, None, hours)
     rows.append(("macro", str(scores.segments), *macro, interval, *events))
     alarms = "false alarms/day" if hours == 24 else "false alarms/h"
@@ -69,7 +69,7 @@ def print_search(tried: "Sequence[GridPoint]") -> None:
         (
             *(f"{value:g}" for value in method.parameters.values()),
             f"{scores.macro_f1:.3f}",
-            _between(scores.macro_f1_interval),
+            between(scores.macro_f1_interval),
         )
         for method, scores in tried
     ]
@@ -106,14 +106,14 @@ def print_coughs(coughs: "SingleCoughs") -> None:
 def print_robustness(found: "Robustness") -> None:
     """Print how good a model is in each condition."""
     scores = found.unchanged
-    rows = [("unchanged", share(scores.macro_f1), _between(scores.macro_f1_interval), "", "")]
+    rows = [("unchanged", share(scores.macro_f1), between(scores.macro_f1_interval), "", "")]
     for name, (scores, difference) in found.changed.items():
         change = difference.interval
         rows.append(
             (
                 name,
                 share(scores.macro_f1),
-                _between(scores.macro_f1_interval),
+                between(scores.macro_f1_interval),
                 f"{difference.macro_f1:+.3f}",
                 "-" if change is None else f"{change[0]:+.3f} to {change[1]:+.3f}",
             )
@@ -133,5 +133,6 @@ def share(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def _between(interval: "Interval | None") -> str:
+def between(interval: "Interval | None") -> str:
+    """Write an interval, or - where there is none."""
     return "-" if interval is None else f"{interval[0]:.3f}-{interval[1]:.3f}"
