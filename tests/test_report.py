@@ -386,7 +386,8 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
     text = text_of(flat_page)
     assert "Sunday, 1 March 2026" in text
     assert "Heard: 23 h 10 min of the day (97 %)" in text
-    assert re.search(r"bouts of coughing in the night more often, 40", text)
+    assert re.search(r"Coughing 1 min under 1 min longer 40 \d+ \(\d+ to \d+\) more often", text)
+    assert "How unusual the day was cannot be told yet: that needs 14 days" in text
     assert "Not heard: 50 min (3 %)" in text
     assert "The microphone went silent: 50 min, once (14:10 to 15:00)" in text
     assert "The microphone bathroom heard nothing for 10 h 00 min" in text

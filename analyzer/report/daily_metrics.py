@@ -8,15 +8,14 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.accuracy.events import MINUTE
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
-from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, one, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, common, lengths, one
 from hearthlog.analyzer.report.home_metrics import HomeMetrics
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
+from hearthlog.analyzer.routine.activity import longest_quiet, stretches
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
 
 _RISING = 4  # of the clock: what is heard before is of the night
 HOUR = 60 * MINUTE
-_STRETCH_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 MOST = 0.75  # of a day and of its night, for its figures to be compared
 _BIN, _BUSY = 10 * MINUTE, MINUTE
 
@@ -158,12 +157,7 @@ class Day:
 
         A stretch has at least half a minute of sound.
         """
-        sound = common(self.home.sound, self.night)
-        stretches = joined(*sound, _STRETCH_PAUSE)
-        if not len(stretches.starts):
-            return exactly(0)
-        edges = np.append(stretches.starts, stretches.ends[-1:])
-        return exactly(int((lengths(sound, edges) >= _STRETCH).sum()))
+        return exactly(stretches(self.home.sound, self.night))
 
     @property
     def hours(self) -> Int64:
@@ -179,12 +173,7 @@ class Day:
     @property
     def longest_quiet(self) -> Spans:
         """The longest quiet span from 07:00 to 22:00; empty if nothing was heard then."""
-        waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
-        quiet = without(common(self.home.coverage, waking), self.home.sound)
-        if not len(quiet.starts):
-            return NONE
-        longest = int((quiet.ends - quiet.starts).argmax())
-        return Spans(*(edge[longest : longest + 1] for edge in quiet))
+        return longest_quiet(self.home.sound, self.home.coverage, self.day, self.zone)
 
     @property
     def quiet(self) -> Minutes | None:

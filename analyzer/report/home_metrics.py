@@ -13,6 +13,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, without
 from hearthlog.analyzer.report.home_minutes import HomeMinutes, checked_rates_of, home_minutes
 from hearthlog.analyzer.report.read_home import HomeData
+from hearthlog.analyzer.routine.day_profile import HomeSound
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 
@@ -106,6 +107,18 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
     minutes = home_minutes(labelled, gone_through, everything, events)
     rates = {} if checks is None else checked_rates_of(minutes, checks)
     return HomeMetrics(classes, everything, listened, sound, spans, events, minutes, rates)
+
+
+def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSound:
+    """Return what routines are learned from: the labels of all microphones.
+
+    Parameters
+    ----------
+    data : HomeData
+    metrics : HomeMetrics
+        Of the same home.
+    """
+    return HomeSound(_together(data.segments.values()), metrics.listened)
 
 
 def _together(parts: Iterable[Labelling]) -> Labelling:

@@ -119,6 +119,7 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
         alerts=[*not_heard(account), *not_well(account)],
         absent=listed([in_words(name).lower() for name in absent], "and"),
         television=_television(account),
+        scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],
         days_before=DAYS,
         interrai=_interrai(account, days),
         interrai_days=interrai.DAYS,
@@ -134,6 +135,23 @@ def _television(account: Account) -> str:
     }
     several = (f"{several_in_words(name).lower()} {n}" for name, n in amounts.items() if n)
     return listed(list(several), "and")
+
+
+def _scenario(account: Account, name: str) -> PageTable:
+    """Tell minutes of each class of a scenario that was heard, a row a class, a column a day."""
+    days = account.scenarios[name]
+    classes = sorted({label for day in days for label in day})
+    rows = [
+        TableRow(
+            [
+                Cell(in_words(label), colour=colour_on_paper(label)),
+                *(Cell(Minutes(day.get(label, 0.0)).text, whole=True) for day in days),
+            ]
+        )
+        for label in classes
+    ]
+    dates = [class_words.short_day(day.day) for day in account.days]
+    return PageTable(["Sound", *(dates if len(days) > 1 else ["How long, as labelled"])], rows)
 
 
 def _sounds(account: Account, day: Day) -> PageTable:

@@ -14,12 +14,15 @@ from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.spans import common, joined, one
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.daily_metrics import HOUR, day_of
-from hearthlog.analyzer.report.home_metrics import whole_home
+from hearthlog.analyzer.report.home_metrics import home_sound, whole_home
 from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.read_home import HomeData, read_home
 from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes, read_scenario_minutes
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
+from hearthlog.analyzer.routine.compare import Routines
+from hearthlog.analyzer.routine.day_profile import Profiles
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.progress import Progress, ignore_progress
@@ -87,6 +90,7 @@ def make_report(
     model = _model(logs, close) if labelling == LIVE else ""
     checks = read_checked_minutes(logs, labelling, since, close[1], data.losses).of_model(model)
     metrics = whole_home(data, checks)
+    routines = Routines(Profiles(home_sound(data, metrics), zone, night_after=False))
     past = [day_of(metrics, day, zone) for day in earlier]
     shown = [day_of(metrics, day, zone) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
@@ -98,11 +102,14 @@ def make_report(
         days=shown,
         before=past[-(ASSESSED - 1) :],
         earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
+        judged={day: routines.judge(day) for day in days},
+        beside={day: len(routines.earlier(day)) for day in days},
         unheard=_unheard(data, *span),
         gaps=_within(data.gaps, span),
         troubles=_within(data.troubles, span),
         checks=checks,
         model=model,
+        scenarios=_scenarios(logs, days, zone, data) if labelling == LIVE else {},
         unread=len(data.losses),
     )
     with new_file(page) as html, new_file(picture) as png:
@@ -120,6 +127,12 @@ def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
     """Return the SHA-256 of the model that labelled the last of the days."""
     records = latest_records(entry.path for entry in logs.between(*close))
     return next(records, {}).get("model_sha256", "")
+
+
+def _scenarios(
+    logs: HomeLogs, days: Sequence[date], zone: tzinfo, data: HomeData
+) -> ScenarioMinutes:
+    return read_scenario_minutes(logs, [day_span(day, zone) for day in days], data.lose)
 
 
 def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:

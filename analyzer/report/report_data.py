@@ -2,15 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import tzinfo
+from datetime import date, tzinfo
 
 from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
 from hearthlog.analyzer.accuracy.count_range import FEWEST as FEWEST_CHECKED
 from hearthlog.analyzer.logs.health import Trouble
 from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
 from hearthlog.analyzer.report.daily_metrics import Day
+from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes
 from hearthlog.analyzer.report.sections import Figure
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
+from hearthlog.analyzer.routine.compare import Judgement
 from hearthlog.schemas.text import listed
 
 _CHANGES = {
@@ -34,11 +36,14 @@ class Account:
     days: Sequence[Day]  # one, or seven
     before: Sequence[Day]  # the days before them that belong to what is asked about three days
     earlier: Sequence[Day]  # those that they are compared with
+    judged: Mapping[date, Judgement | None]  # of `days`: how unusual each was, if that is known
+    beside: Mapping[date, int]  # of `days`: how many days there are to say so by
     unheard: Mapping[str, float]  # by microphone: hours in which it heard nothing
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
     checks: CheckedMinutes  # minutes of these weeks that were drawn at random, and gone through
     model: str  # SHA-256 of the model that labelled the days; empty if it is not known
+    scenarios: ScenarioMinutes  # of `days`; of live labels only
     unread: int  # how many logs could not be read, or only in part
 
     @property

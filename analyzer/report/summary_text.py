@@ -14,12 +14,12 @@ from hearthlog.analyzer.report.class_words import (
 )
 from hearthlog.analyzer.report.daily_metrics import HOUR, Day
 from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.sections import Figure, events_of, sections
+from hearthlog.analyzer.report.routine_text import WEEK, judgement_text, too_few_text
 from hearthlog.analyzer.report.values import Minutes
-from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, TAP_WATER, in_words
+from hearthlog.analyzer.routine.compare import FEWEST
+from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
 from hearthlog.schemas.text import listed
 
-_SHOWN = 4  # changes in one sentence
 _MOST = 6  # kinds of gaps, or of trouble
 _MINUTE = HOUR // 60
 
@@ -66,14 +66,15 @@ def gist_of_week(account: Account) -> Iterator[str]:
     if not account.comparable:
         yield account.too_few
         return
-    changes = {day.day: list(_changed(account, day)) for day in days}
-    if not any(changes.values()):
-        yield f"Nothing was outside of what was heard on the {len(account.earlier)} days before."
+    if max(account.beside.values()) < FEWEST:
+        yield too_few_text(max(account.beside.values()))
         return
-    yield f"Not as on any of the {len(account.earlier)} days before this week:"
-    for day, words in changes.items():
-        if words:
-            yield f"{short_day(day)}: {_few(words)}."
+    told = [(day.day, judged) for day in days if (judged := account.judged[day.day])]
+    unusual = [(day, judged) for day, judged in told if judged.once_in >= WEEK]
+    if not unusual:
+        yield f"None of the {len(told)} days that can be judged was unlike those before it."
+    for day, judged in unusual:
+        yield f"{short_day(day)}: {judgement_text(judged)}"
 
 
 def not_heard(account: Account) -> Iterator[str]:
@@ -184,36 +185,12 @@ def _loudest(day: Day) -> str:
 def _changes(account: Account, day: Day) -> str:
     if not account.comparable:
         return account.too_few
-    if not any(map(day.comparable, account.classes)):
-        return "Too little was heard to compare it with other days."
-    number = len(account.earlier)
-    changes = list(_changed(account, day))
-    if not changes:
-        return f"As usual: nothing was outside of what was heard on the last {number} days."
-    return f"Not as on any of the last {number} days: {_few(changes)}."
-
-
-def _few(changes: Sequence[str]) -> str:
-    more = len(changes) - _SHOWN
-    return "; ".join(changes[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
-
-
-def _changed(account: Account, day: Day) -> Iterator[str]:
-    for figure, where in _figures(day):
-        change, value = account.change(figure, day), figure.value(day)
-        if change and value is not None:
-            usually = account.usually(figure)
-            yield f"{figure.title.lower()}{where} {change}, {value.text}, usually {usually}"
-
-
-def _figures(day: Day) -> Iterator[tuple[Figure, str]]:
-    """Go through the figures, what matters most first; a class is named once."""
-    for section in sorted(sections(day.home.classes), key=lambda section: section.title != "Night"):
-        for figure in section.figures:
-            yield figure, " in the night" if section.title == "Night" else ""
-    for name in day.home.classes:
-        if name not in (SILENCE, FLUSHING_WATER, SHOWER, TAP_WATER):
-            yield events_of(name), ""
+    judged = account.judged[day.day]
+    if judged is not None:
+        return judgement_text(judged)
+    if account.beside[day.day] < FEWEST:
+        return too_few_text(account.beside[day.day])
+    return "Too little was heard to compare it with other days."
 
 
 def _night(day: Day) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from hearthlog.analyzer.bridge.alerts.clock import days_around, wall_times
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.ring import Alarm
-from hearthlog.analyzer.bridge.alerts.rules import NoneBy, UnlikeUsual
+from hearthlog.analyzer.bridge.alerts.rules import DailyRule, NoneBy, UnlikeUsual
 from hearthlog.analyzer.bridge.alerts.sound_events import events_of_rule
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span
 from hearthlog.analyzer.logs.spans import cut
@@ -99,12 +99,12 @@ def unlike_alarms(
     return alarms
 
 
-def judged_days(rule: UnlikeUsual, start: int, end: int, zone: tzinfo) -> list[tuple[date, int]]:
+def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tuple[date, int]]:
     """List the days on which a rule is to be evaluated in a span of time, and when.
 
     Parameters
     ----------
-    rule : UnlikeUsual
+    rule : UnlikeUsual or UnusualDay
     start, end : int
         In nanoseconds of UTC.
     zone : tzinfo

@@ -21,7 +21,9 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     MoreThan,
     NoneBy,
     RecorderSilent,
+    UnusualDay,
 )
+from hearthlog.analyzer.bridge.alerts.unusual_days import unusual_alarms
 from hearthlog.analyzer.logs.local_time import local_time
 
 NEW = RuleState()
@@ -87,6 +89,8 @@ def _alarms(  # noqa: PLR0913, PLR0917
         return silent_alarms(rule, heard, start, end, since)
     if isinstance(rule, NoneBy):
         return none_by_alarms(rule, heard, start, end, zone)
+    if isinstance(rule, UnusualDay):
+        return unusual_alarms(rule, heard, start, end, zone)
     return unlike_alarms(rule, heard, start, end, zone)
 
 

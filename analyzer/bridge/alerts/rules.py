@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_duration
+from hearthlog.analyzer.routine.compare import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError
@@ -173,9 +174,27 @@ class UnlikeUsual(_SoundRule):
         return self
 
 
+class UnusualDay(_Rule):
+    """A day, with the night after it, that is as unlike the four weeks before as few are."""
+
+    rule: Literal["unusual_day"]
+    once_in: float = Field(
+        default=30.0, ge=7.0, le=LONGEST, description="Days in which one such day is expected."
+    )
+    at: TimeOfDay = Field(default="08:00", validate_default=True)
+
+    @model_validator(mode="after")
+    def _check_time(self) -> "UnusualDay":
+        if self.at < _NIGHT_ENDS:
+            raise ValueError("at: a night ends at 07:00")
+        return self
+
+
 SoundRule = MoreThan | NoneBy | LongerThan | UnlikeUsual
+DailyRule = UnlikeUsual | UnusualDay  # by weeks of logs, once a day
 AlertRule = Annotated[
-    MoreThan | NoneBy | LongerThan | RecorderSilent | UnlikeUsual, Field(discriminator="rule")
+    MoreThan | NoneBy | LongerThan | RecorderSilent | UnlikeUsual | UnusualDay,
+    Field(discriminator="rule"),
 ]
 
 
@@ -211,8 +230,8 @@ def history(rule: AlertRule) -> int:
         return rule.window + _MARGIN
     if isinstance(rule, RecorderSilent):
         return rule.silent_for + _MARGIN
-    if isinstance(rule, UnlikeUsual):
-        return 31 * DAY
+    if isinstance(rule, DailyRule):
+        return 34 * DAY
     return _TWO_DAYS if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN
 
 
@@ -245,4 +264,4 @@ def live_history(rule: AlertRule) -> int:
     int
         Nanoseconds. Of weeks, the day that is judged: a silence may have gone on since it began.
     """
-    return _TWO_DAYS if isinstance(rule, UnlikeUsual) else history(rule)
+    return _TWO_DAYS if isinstance(rule, DailyRule) else history(rule)

@@ -11,7 +11,7 @@ from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.memory import Memory, Progress
 from hearthlog.analyzer.bridge.alerts.outbox import Outbox
 from hearthlog.analyzer.bridge.alerts.ring import Ring, RuleState
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule, UnlikeUsual, history, live_history
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule, DailyRule, history, live_history
 
 _OLDEST = DAY  # what rang longer ago is not told any more
 _EVERY = SECOND  # of the log
@@ -118,7 +118,7 @@ class RuleWatch:
             own = self._progress[rule.name]
             if until - own.until < _EVERY:
                 continue
-            if isinstance(rule, UnlikeUsual):
+            if isinstance(rule, DailyRule):
                 if not judged_days(rule, own.until, until, self._zone):
                     own.until = until
                     continue

@@ -1,0 +1,73 @@
+"""When a day, with the night after it, was unlike the four weeks before it."""
+
+from datetime import timedelta, tzinfo
+
+import numpy as np
+
+from hearthlog.analyzer.bridge.alerts.daily import judged_days
+from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
+from hearthlog.analyzer.bridge.alerts.ring import Alarm
+from hearthlog.analyzer.bridge.alerts.rules import ANY_SOUND, UnusualDay
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.report.class_words import short_day
+from hearthlog.analyzer.report.routine_text import differences_text, rarity_text
+from hearthlog.analyzer.routine.compare import Routines
+from hearthlog.analyzer.routine.day_profile import HomeSound, Profiles
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.arrays import Int64
+
+
+def unusual_alarms(
+    rule: UnusualDay, heard: HomeHeard, start: int, end: int, zone: tzinfo
+) -> list[Alarm]:
+    """Find the days that were unlike the four weeks before them, each in the morning after it.
+
+    Parameters
+    ----------
+    rule : UnusualDay
+    heard : HomeHeard
+        From 34 days before the start on.
+    start, end : int
+        In nanoseconds of UTC.
+    zone : tzinfo
+        Of the home.
+    """
+    mornings = judged_days(rule, start, end, zone)
+    if not mornings:
+        return []
+    routines = Routines(Profiles(home_sound(heard), zone, night_after=True))
+    alarms = []
+    for morning, time in mornings:
+        judged = routines.judge(morning - timedelta(days=1))
+        if judged is not None and judged.once_in >= rule.once_in:
+            day = short_day(judged.day)
+            why = differences_text(judged)
+            text = f"{day} and the night after it, {rarity_text(judged)}: {why}"
+            alarms.append(Alarm(time, time + 1, text))
+    return alarms
+
+
+def home_sound(heard: HomeHeard) -> HomeSound:
+    """Return what routines are learned from.
+
+    Parameters
+    ----------
+    heard : HomeHeard
+    """
+    coverage = heard.listened(ANY_SOUND, "")
+    parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
+    parts += [_labelled(name, own.starts, own.ends) for name, own in heard.sounds.items()]
+    starts, ends, labels = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("starts", "ends", "labels")
+    )
+    order = np.argsort(starts, kind="stable")
+    known = dict.fromkeys(sorted(set(heard.sounds).union(*heard.classes.values())))
+    return HomeSound(
+        Labelling(starts[order], ends[order], labels[order]),
+        {name: heard.listened(name, "") for name in known},
+    )
+
+
+def _labelled(name: str, starts: Int64, ends: Int64) -> Labelling:
+    return Labelling(starts, ends, np.full(len(starts), name, object))

@@ -1,0 +1,142 @@
+"""How unusual a day was, in words."""
+
+from dataclasses import replace
+
+from hearthlog.analyzer.report.class_words import several_in_words
+from hearthlog.analyzer.report.values import Clock, Count, Minutes, whole
+from hearthlog.analyzer.routine.compare import FEWEST, LONGEST, Difference, Judgement
+from hearthlog.analyzer.routine.day_profile import (
+    CLOCK,
+    COUNT,
+    FIRST,
+    LAST,
+    QUIET,
+    SOUND,
+    STRETCHES,
+    Figure,
+)
+from hearthlog.models.classes import in_words
+
+WEEK = 7.0  # days: what comes more often is as usual
+_MONTH = 30.0
+_SHOWN = 4
+_SINGLE = 3.0  # widths: what is so far from usual is told though the day as a whole is as usual
+_DAY = 1440.0  # minutes
+_HEARD = 0.05  # minutes
+_BUSY = {FIRST: "first busy half hour from", LAST: "last busy half hour until"}
+_NAMES = {STRETCHES: "times with sound", SOUND: "sound", QUIET: "longest quiet stretch"}
+
+
+def judgement_text(judged: Judgement) -> str:
+    """Say how unusual a day was, and what was unlike other days.
+
+    Parameters
+    ----------
+    judged : Judgement
+    """
+    compared = f"{judged.days} earlier days"
+    if judged.once_in < WEEK:
+        single = [each for each in judged.differences if abs(each.deviation) >= _SINGLE]
+        if not single:
+            return f"As usual, beside {compared}."
+        odd = replace(judged, differences=single)
+        return f"On the whole as usual, beside {compared}, but: {differences_text(odd)}."
+    rare = "Unusual" if judged.once_in >= _MONTH else "Somewhat unusual"
+    return f"{rare} beside {compared}: {rarity_text(judged)}. {_sentence(judged)}".strip()
+
+
+def too_few_text(days: int) -> str:
+    """Say that there are too few days to judge one by.
+
+    Parameters
+    ----------
+    days : int
+        That there are.
+    """
+    return (
+        f"How unusual the day was cannot be told yet: that needs {FEWEST} days of the four weeks "
+        f"before it, heard for the most part, and there are {days}."
+    )
+
+
+def rarity_text(judged: Judgement) -> str:
+    """Say how often a day is expected that is as unlike others: `one such day in 40`.
+
+    Parameters
+    ----------
+    judged : Judgement
+    """
+    if judged.once_in >= LONGEST:
+        return "less than one such day in a year"
+    return f"one such day in {whole(judged.once_in)}"
+
+
+def differences_text(judged: Judgement) -> str:
+    """Say what was unlike other days, what differs most first.
+
+    Parameters
+    ----------
+    judged : Judgement
+    """
+    more = len(judged.differences) - _SHOWN
+    texts = [difference_text(each) for each in judged.differences[:_SHOWN]]
+    text = "; ".join(texts) + (f"; and {more} more" if more > 0 else "")
+    return f"typical of the last {judged.span} days: {text}" if judged.span > 1 else text
+
+
+def difference_text(difference: Difference) -> str:
+    """Say what a figure was, and what it is on eight of ten days.
+
+    Parameters
+    ----------
+    difference : Difference
+    """
+    figure, value = difference.figure, difference.value
+    name = _name(figure)
+    if figure.kind == CLOCK:
+        away = Minutes(abs(value - difference.middle)).text
+        word = "later" if difference.deviation > 0 else "earlier"
+        usual = _range(_clock(difference.low), _clock(difference.high))
+        return f"{name} {_clock(value)}, {away} {word} than usual ({usual})"
+    if figure.kind == COUNT:
+        low, high = (Count.show(each) for each in (difference.low, difference.high))
+        return f"{name} {Count.show(value)}, usually {_range(low, high)}"
+    low, high = (Minutes.show(each) for each in (difference.low, difference.high))
+    return f"{_lasting(figure, value)}, usually {_range(low, high)}"
+
+
+def _sentence(judged: Judgement) -> str:
+    text = differences_text(judged)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def _clock(minutes: float) -> str:
+    return Clock.show(minutes % _DAY)  # it may be past midnight
+
+
+def _range(low: str, high: str) -> str:
+    if low == high:
+        return low
+    if low.endswith(" min") and high.endswith(" min") and " h " not in low + high:
+        low = low.removesuffix(" min")
+    return f"{low} to {high}"
+
+
+def _lasting(figure: Figure, minutes: float) -> str:
+    name, text = _name(figure), Minutes.show(minutes)
+    if figure.what == QUIET:
+        return f"{name} {text}"
+    return f"{name} for {text}" if minutes >= _HEARD else f"no {name}"
+
+
+def _name(figure: Figure) -> str:
+    if figure.kind == CLOCK:
+        return _BUSY[figure.what]
+    name = _NAMES.get(figure.what)
+    if name is None:
+        words = several_in_words if figure.kind == COUNT else in_words
+        name = words(figure.what).lower()
+    if figure.hours is not None:
+        first, last = (Clock.show(30.0 * half) for half in figure.hours)
+        return f"{name} from {first} to {last}"
+    return f"{name} {'in the night' if figure.night else 'by day'}"

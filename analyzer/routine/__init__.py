@@ -1,0 +1,1 @@
+"""The routines of a home, learned from its own weeks, and how unlike them a day was."""
