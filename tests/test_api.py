@@ -12,10 +12,11 @@ from threading import Event as Flag
 import numpy as np
 import pytest
 import soundfile
+from arrays import SQUARE, heard
 
 import hearthlog
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.recorder.config import Settings
+from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import convert_sound, read_audio
@@ -37,6 +38,14 @@ def make_logs(folder, model, sounds, **options):
     return folder
 
 
+def make_array_logs(folder, model):
+    sound = heard(SQUARE, np.deg2rad(45)).reshape(-1, 4)
+    soundfile.write(folder / "array.wav", sound, 16_000, subtype="PCM_16")
+    microphone = MicrophoneSettings(array=SQUARE)
+    settings = Settings(output=folder / "array", model=model, microphone=[microphone])
+    record(settings, FileSource([folder / "array.wav"], START, channels=4), Flag())
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, day, model_file, training_set) -> Path:
     """Where the examples run: logs with a mark, their model and sound, and clips to learn from."""
@@ -45,6 +54,7 @@ def folder(tmp_path_factory, day, model_file, training_set) -> Path:
     (folder / "sound.flac").symlink_to(day)
     (folder / "home.safetensors").symlink_to(model_file)
     (log,) = find_logs(make_logs(folder / "logs", model_file, [day]))
+    make_array_logs(folder, model_file)
     write_marks(log, [Mark("mic", START + SECOND, START + 2 * SECOND, "coughing", "ada")])
     return folder
 

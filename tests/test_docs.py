@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 pytest.importorskip("hearthlog.tools.month", reason="the wheel leaves what developers run out")
 
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.tools.bench.routine import main as judge_routines
 from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.__main__ import home as simulate_home
 from hearthlog.tools.home.simulate import write_day, write_training_set
@@ -44,9 +45,11 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 # What is in a code block and cannot run here: it wants a microphone, a screen, a cluster, a bucket,
 # a second program, or sound of many collections.
 NOT_HERE = re.compile(
-    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch| demo| install-service"
-    r"| evaluate adaptation|.* s3://|.*tcp:|.* --web|.* --microphone USB|.* --folds collection"
-    r"| discover|.* --live|.*octaves|.*--config|.*--queue spans.csv$| review(?!.* --save))"
+    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?( --config \S+)?$| devices| watch| demo"
+    r"| install-service| bridge|.*--start 2026-03-10 | evaluate (adaptation|paper)|.* s3://"
+    r"|.*tcp:|.* --web|.* --microphone USB|.* --folds collection| discover| voices|.* speakers "
+    r"|.* mood.toml|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
+    r"| review(?!.* --save))"
 )
 
 
@@ -71,6 +74,7 @@ def options_of(verb):
 DEVELOPERS = typer.Typer()  # what is no verb
 DEVELOPERS.command()(simulate_home)
 DEVELOPERS.command()(simulate_month)
+DEVELOPERS.command()(judge_routines)
 OPTIONS = {
     name
     for verb in (*VERBS.values(), *typer.main.get_command(DEVELOPERS).commands.values())
@@ -290,7 +294,7 @@ def make_home(folder):
     do("train --data clips --scenario general -o general.safetensors")
     write_day(folder / "day.flac", 2, seed=2, manifest=None)
     cough = next((folder / "clips" / "coughing").iterdir())
-    for name in ("cough.flac", "cough.wav", "a.wav", "b.flac"):
+    for name in ("cough.flac", "cough.wav", "anna.wav", "a.wav", "b.flac"):
         do_copy(cough, folder / name)
     (folder / "models").mkdir()
     for name in ("general-1", "general-2", "new", "home", "home-1"):
@@ -304,6 +308,10 @@ def make_home(folder):
     do("models promote general-1 --to candidate")
     for model in ("general-2", "new"):
         do(f"relabel logs --model {model}.safetensors")
+    (folder / "home.toml").write_text(
+        'node = "home"\n[[bridge.alert]]\nname = "coughs"\nrule = "more_than"\nclass = "coughing"\n'
+        'count = 3\nwindow = "2h"\n'
+    )
     (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
     for name in ("day.txt", "ten.txt"):
         shutil.copy("labels.txt", name)
@@ -316,6 +324,9 @@ def make_home(folder):
     made.write_desed(folder / "DESED")
     made.write_vocalsound(folder / "vocalsound")
     made.write_audioset_strong(folder / "AudioSet")
+    made.write_ravdess(folder / "RAVDESS")
+    made.write_emodb(folder / "EmoDB")
+    made.write_voxceleb(folder / "VoxCeleb")
     for number, clip in enumerate(sorted((folder / "clips").glob("*/*.flac"))):
         place = folder / "mine" / clip.parent.name / f"room {number}" / "1.flac"
         place.parent.mkdir(parents=True)
@@ -328,7 +339,6 @@ def make_home(folder):
     for name in ("a.mcap", "b.mcap"):
         shutil.copy(log, name)
     (folder / "damaged.mcap").write_bytes(log.read_bytes()[:-5000])
-    (folder / "home.toml").write_text('node = "flat"\n')
 
 
 def write_foreign_labels(folder):

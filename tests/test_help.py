@@ -16,7 +16,7 @@ from hearthlog.tools.cli.main import make_app
 
 _WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
 _TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
-_WAYS = ("log", "model", "scenes", "robustness", "method", "search", "adaptation")
+_WAYS = ("log", "model", "scenes", "robustness", "method", "search", "adaptation", "paper")
 _HEAVY = {"numpy", "rosbags", "mcap", "soundfile", "sounddevice"}
 
 

@@ -91,9 +91,9 @@ def divide(data: Dataset, kind: Kind) -> list[Fold]:
     if kind == "source":
         return group_folds(data)
     if kind == "segment":
-        fewest = min(amount.segments for amount in data.amounts.values())
+        fewest, name = min((amount.segments, name) for name, amount in data.amounts.items())
         if fewest < MOST_FOLDS:
-            raise DataError(f"a class has {fewest} segments; {MOST_FOLDS} folds need one each")
+            raise DataError(f"class {name} has {fewest} segments; {MOST_FOLDS} folds need one each")
         divider = StratifiedKFold(MOST_FOLDS, shuffle=True, random_state=0)
         return list(divider.split(data.target, data.target))
     if len(data.collection_names) < 2:

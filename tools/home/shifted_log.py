@@ -30,7 +30,12 @@ from hearthlog.schemas.times import NANOSECONDS
 _TIME = "builtin_interfaces/msg/Time"
 _SPAN = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])  # of a stamp, and of a duration
 _MOST_BYTES = 1 << 30  # of one log, uncompressed
-_FRAMED = {message_types.FEATURES, message_types.STATISTICS, message_types.LABEL}
+_FRAMED = {
+    message_types.FEATURES,
+    message_types.STATISTICS,
+    message_types.LABEL,
+    message_types.DIRECTION,
+}
 
 Edit = Callable[[Metadata], dict[str, str]]  # what a metadata record says in the copy
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hearthlog._version import __version__
 
 if TYPE_CHECKING:
-    from hearthlog._logs import Columns, Labelling, Logs, Mark, follow, open_logs
+    from hearthlog._logs import Bearings, Columns, Labelling, Logs, Mark, follow, open_logs
     from hearthlog._sound import (
         Model,
         SoundFeatures,
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 
 __all__ = [
+    "Bearings",
     "Columns",
     "Comparison",
     "HearthlogError",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.bearings import Bearings, as_vectors, mean_bearings
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-__all__ = ["Columns", "Labelling", "Logs", "Mark", "follow", "open_logs"]
+__all__ = ["Bearings", "Columns", "Labelling", "Logs", "Mark", "follow", "open_logs"]
 
 
 class Logs:
@@ -228,6 +229,40 @@ class Logs:
         for loss in self._labellings.losses:
             warnings.warn(HearthlogWarning(loss, self.path), stacklevel=2)
         return segments
+
+    def directions(self, labelling: str = "live", microphone: str | None = None) -> Bearings:
+        """Compute whence the sound of each segment came, of an array of microphones.
+
+        Parameters
+        ----------
+        labelling, microphone : str, optional
+            As of `segments`.
+
+        Returns
+        -------
+        Bearings
+            Of each segment of `segments`.
+
+        Raises
+        ------
+        DataError
+            As `segments` does.
+        LogError
+            As `segments` does; if there is no topic `/<microphone>/direction`.
+
+        Examples
+        --------
+        >>> import math
+        >>> came = hearthlog.open_logs("array").directions()
+        >>> round(math.degrees(came.azimuths[came.counts > 0][0]))
+        45
+        """
+        segments = self.segments(labelling, microphone)
+        name = self._labellings.microphone(microphone)
+        fields = "header.stamp", "azimuth", "confidence"
+        columns = self.columns(f"/{name}/direction", fields)
+        vectors = as_vectors(columns["azimuth"], columns["confidence"])
+        return mean_bearings(columns["header.stamp"], vectors, segments.starts, segments.ends)
 
     def marks(self) -> list[Mark]:
         """Read the marks of reviewers, which correct labels.

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.bearings import degrees_of
 from hearthlog.analyzer.logs.health import MicrophoneState, lasting
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
+    DirectionRows,
     FeatureRows,
     GapRows,
     LabelRows,
@@ -72,6 +74,7 @@ class _Microphone:
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
     reviewed: list[LabelledSpans] = field(default_factory=list)
     gaps: list[LabelledSpans] = field(default_factory=list)
+    directions: GridMeans | None = None  # ahead and left
     states: list[MicrophoneState] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
@@ -129,6 +132,11 @@ class Collector:
                 self._forget_frames(rows.microphone, rows.labelling)
             case GapRows():
                 self._microphone(rows.microphone).gaps.append(rows.spans)
+            case DirectionRows():
+                microphone = self._microphone(rows.microphone)
+                if microphone.directions is None:
+                    microphone.directions = GridMeans(self._grid, 2)
+                microphone.directions.add(rows.times, rows.directions)
 
     def add_log(self, microphone: str, log: Path) -> None:
         """Note that a log or a layer has topics of a microphone."""
@@ -246,6 +254,7 @@ class Collector:
             gaps=self._join(rows.gaps),
             troubles=_trouble_spans(rows.states, self._grid.end),
             clips=_join_clips(rows.clips),
+            direction=None if rows.directions is None else degrees_of(rows.directions.values),
         )
 
     def _labelling(self, rows: _Microphone, name: str) -> LabellingTimeline:

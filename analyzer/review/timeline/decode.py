@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.logs.bearings import as_vectors
 from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.health import MicrophoneState, microphone_states
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
-from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import REVIEW, TopicName, parse_topic
@@ -19,10 +20,11 @@ FIELDS = {
     message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
     message_types.SEGMENT: ("header.stamp", "duration", "label"),
     message_types.GAP: ("header.stamp", "duration", "reason"),
+    message_types.DIRECTION: ("header.stamp", "azimuth", "confidence"),
     message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
     message_types.LOG: ("stamp", "level", "msg"),
 }
-_KINDS = {"features", "label", "segment", "gap"}
+_KINDS = {"features", "label", "segment", "gap", "direction"}
 _QUIETEST = 1e-10  # of a mean square: -100 dB
 
 
@@ -83,13 +85,30 @@ class GapRows(NamedTuple):
     spans: LabelledSpans
 
 
+class DirectionRows(NamedTuple):
+    """Whence the sound of an array came, in n blocks.
+
+    Attributes
+    ----------
+    microphone : str
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the blocks, in nanoseconds of UTC.
+    directions : np.ndarray [shape=(n, 2)], float64
+        Ahead and left: of a length that is the confidence.
+    """
+
+    microphone: str
+    times: Int64
+    directions: Float64
+
+
 class StateRows(NamedTuple):
     """How microphones were, by the diagnostics."""
 
     states: list[MicrophoneState]
 
 
-Rows = FeatureRows | LabelRows | SegmentRows | GapRows | StateRows | LogLines
+Rows = FeatureRows | LabelRows | SegmentRows | GapRows | DirectionRows | StateRows | LogLines
 
 
 def read_rows(path: Path, columns: Columns) -> Rows | None:
@@ -104,7 +123,7 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
 
     Returns
     -------
-    FeatureRows, LabelRows, SegmentRows, GapRows, StateRows, LogLines or None
+    FeatureRows, LabelRows, SegmentRows, GapRows, DirectionRows, StateRows, LogLines or None
         None if a timeline does not show the topic.
 
     Raises
@@ -130,6 +149,9 @@ def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:
         names = checked_array_names(path, columns, "probabilities")
         values = columns["probabilities"], columns["novelty"]
         return LabelRows(microphone, labelling, names, times, *values)
+    if columns.type == message_types.DIRECTION:
+        towards = as_vectors(columns["azimuth"], columns["confidence"])
+        return DirectionRows(microphone, times, towards)
     ends = times + columns["duration"]
     if columns.type == message_types.SEGMENT:
         return SegmentRows(microphone, labelling, LabelledSpans(times, ends, columns["label"]))

@@ -15,13 +15,14 @@ from hearthlog.analyzer.review.timeline.model import (
     Timeline,
     no_spans,
 )
-from hearthlog.models.classes import SILENCE, class_name, in_words
-from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name, in_words
+from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW, SCENARIO, is_scenario
 
 REVIEWED = "Reviewed"  # the name of the lane, and of its spans without a mark
 NOT_HEARD = "Not heard"
 _TROUBLE = "Trouble"
 _RECURRING = "Recurs"
+_VOICES = "Voices"
 _LOOKED_AT: Colour = (58, 70, 92)
 _TROUBLED: Colour = (240, 140, 40)
 _MOST_LANES = 12  # of classes, where some were not heard at all
@@ -61,8 +62,9 @@ def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
     ------
     Lane
         For each labelling a lane for each class but silence: what was heard for the shortest time
-        comes first, what was not heard last. Then what stands beside all labellings: where others
-        differ from the first one, what is reviewed, what was not heard, and trouble.
+        comes first, what was not heard last. Then what stands beside all labellings: a lane for
+        each scenario, where others differ from the first one, what is reviewed, what was not heard,
+        and trouble.
     """
     for microphone in timeline.microphones.values():
         labellings = labellings_of(microphone)
@@ -75,19 +77,28 @@ def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
 
 
 def labellings_of(microphone: MicrophoneTimeline) -> list[LabellingTimeline]:
-    """Return the labellings of a microphone that are by a model, the recorder's first."""
-    return [one for one in microphone.labellings if one.name != REVIEW]
+    """Return the labellings of a microphone by models of the home, the recorder's first."""
+    models = [one for one in microphone.labellings if one.name != REVIEW]
+    return [one for one in models if not is_scenario(one.name)]
 
 
 def labelling_in_words(name: str) -> str:
-    """Name a labelling: `the recorder`, or the model.
+    """Name a labelling: `the recorder`, the scenario, or the model.
 
     Parameters
     ----------
     name : str
-        As `live`, `candidate` or `relabel/<model>`.
+        As `live`, `candidate`, `scenario/<name>` or `relabel/<model>`.
     """
+    if is_scenario(name):
+        return name.replace("/", " ")
     return "the recorder" if name == LIVE else name.removeprefix(f"{RELABEL}/")
+
+
+def scenario_sounds(spans: LabelledSpans) -> LabelledSpans:
+    """Leave out of the spans of a scenario what it has no name for."""
+    named = np.array([class_name(text) not in OF_EVERY_SCENARIO for text in spans.texts], bool)
+    return LabelledSpans(spans.starts[named], spans.ends[named], spans.texts[named])
 
 
 def reviewed_lane(microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> Lane:
@@ -136,14 +147,17 @@ def _of_class(spans: LabelledSpans, name: str) -> LabelledSpans:
 
 
 def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]) -> Iterator[Lane]:
+    for one in (each for each in microphone.labellings if is_scenario(each.name)):
+        yield _scenario_lane(microphone.name, one)
     for other in labellings[1:]:
         spans = disagreements(labellings[0].spans, other.spans)
         shades = {in_words(text): colour(text) for text in dict.fromkeys(spans.texts)}
         texts = np.array([in_words(text) for text in spans.texts], object)
         name = f"{labelling_in_words(other.name)} differs"
         yield Lane(microphone.name, "", name, LabelledSpans(*spans[:2], texts), shades)
-    if len(microphone.recurring):
-        yield _recurring_lane(microphone)
+    for name, named in ((_RECURRING, microphone.recurring), (_VOICES, microphone.spoken)):
+        if len(named):
+            yield _named_lane(microphone.name, name, named)
     marks = next((one.spans for one in microphone.labellings if one.name == REVIEW), no_spans())
     yield reviewed_lane(microphone.name, marks, microphone.reviewed)
     kinds = (NOT_HEARD, microphone.gaps, GAP), (_TROUBLE, microphone.troubles, _TROUBLED)
@@ -154,9 +168,18 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
             yield Lane(microphone.name, "", name, named, {name: shade})
 
 
-def _recurring_lane(microphone: MicrophoneTimeline) -> Lane:
-    names = {text: in_words(text) for text in dict.fromkeys(microphone.recurring.texts)}
+def _scenario_lane(microphone: str, labelling: LabellingTimeline) -> Lane:
+    """Make one lane of all classes of a scenario, but of what it has no name for."""
+    spans = scenario_sounds(labelling.spans)
+    shades = {in_words(text): colour(text) for text in dict.fromkeys(spans.texts)}
+    words = np.array([in_words(text) for text in spans.texts], object)
+    own = LabelledSpans(*spans[:2], words)
+    name = in_words(labelling.name.removeprefix(f"{SCENARIO}/"))
+    return Lane(microphone, "", name, own, shades)
+
+
+def _named_lane(microphone: str, lane: str, named: LabelledSpans) -> Lane:
+    names = {text: in_words(text) for text in dict.fromkeys(named.texts)}
     shades = {name: colour(text) for text, name in names.items()}
-    texts = np.array([names[text] for text in microphone.recurring.texts], object)
-    spans = LabelledSpans(*microphone.recurring[:2], texts)
-    return Lane(microphone.name, "", _RECURRING, spans, shades)
+    texts = np.array([names[text] for text in named.texts], object)
+    return Lane(microphone, "", lane, LabelledSpans(*named[:2], texts), shades)

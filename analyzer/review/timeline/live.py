@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.bearings import degrees_of
 from hearthlog.analyzer.logs.health import MicrophoneState
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
     FIELDS,
+    DirectionRows,
     FeatureRows,
     GapRows,
     LabelRows,
@@ -22,8 +24,10 @@ from hearthlog.analyzer.review.timeline.decode import (
     decibel,
     read_rows,
 )
+from hearthlog.analyzer.review.timeline.lanes import scenario_sounds
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.analyzer.review.timeline.plots import (
+    DIRECTION,
     FEATURES,
     FLOOR,
     LEVEL,
@@ -40,6 +44,7 @@ from hearthlog.analyzer.review.timeline.state_lanes import (
     Changes,
     StateLane,
     changes,
+    scenario_kind,
 )
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
@@ -47,7 +52,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.statistics import time_span
-from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.messages.topics import LIVE, is_scenario
 from hearthlog.schemas.times import NANOSECONDS
 
 _MEMORY = 600  # seconds that the scale of a feature follows
@@ -141,8 +146,14 @@ class LiveTimeline:
                 yield from self._labels(rows)
             case SegmentRows(labelling="live"):
                 yield from self._segments(rows.microphone, rows.spans)
+            case SegmentRows() if is_scenario(rows.labelling):
+                kind = scenario_kind(rows.labelling)
+                yield StateLane(kind, rows.microphone, changes(scenario_sounds(rows.spans)))
             case GapRows():
                 yield _gaps(rows)
+            case DirectionRows():
+                degrees = degrees_of(rows.directions)[:, np.newaxis]
+                yield Plot(DIRECTION, rows.microphone, "", ("direction",), rows.times, degrees)
 
     def _features(self, rows: FeatureRows) -> Iterator[Plot]:
         microphone, names = rows.microphone, rows.names

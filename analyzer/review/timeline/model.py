@@ -12,6 +12,7 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.home_clock import HomeClock, home_clock
 from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
+from hearthlog.schemas.messages.topics import is_scenario
 from hearthlog.schemas.times import NANOSECONDS
 
 
@@ -157,6 +158,10 @@ class MicrophoneTimeline:
     clips : list of SoundClip
     recurring : LabelledSpans
         Sounds that recur, with what they are called.
+    spoken : LabelledSpans
+        Turns of voices, with whose they are.
+    direction : np.ndarray [shape=(count,)], float64, or None
+        Whence the sound of an array came, in degrees; NaN where nothing was located.
     """
 
     name: str
@@ -170,15 +175,16 @@ class MicrophoneTimeline:
     troubles: LabelledSpans
     clips: list[SoundClip]
     recurring: LabelledSpans = field(default_factory=no_spans)
+    spoken: LabelledSpans = field(default_factory=no_spans)
+    direction: Float64 | None = None
 
     @property
     def classes(self) -> list[str]:
-        """The classes of the models, then other labels that there are."""
-        series = [one.probabilities for one in self.labellings if one.probabilities is not None]
+        """The classes of the models but those of scenarios, then other labels that there are."""
+        labellings = [one for one in self.labellings if not is_scenario(one.name)]
+        series = [one.probabilities for one in labellings if one.probabilities is not None]
         names = [name for each in series for name in each.names]
-        return list(
-            dict.fromkeys([*names, *(t for one in self.labellings for t in one.spans.texts)])
-        )
+        return list(dict.fromkeys([*names, *(t for one in labellings for t in one.spans.texts)]))
 
 
 @dataclass

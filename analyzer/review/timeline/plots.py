@@ -17,17 +17,19 @@ from hearthlog.schemas.times import NANOSECONDS
 _BRIGHT: Colour = (235, 215, 140)
 _GROUND: Colour = (200, 120, 90)
 _NEW: Colour = (160, 200, 255)
+_TOWARDS: Colour = (150, 215, 150)
 _HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
 _TINY = np.finfo(np.float64).tiny
 
 
 class Style(Enum):
-    """How values are drawn: shares of one in bands, 0 to 1 from dark to bright, or a line."""
+    """How values are drawn: shares of one in bands, 0 to 1 from dark to bright, a line, points."""
 
     BANDS = auto()
     HEAT_MAP = auto()
     LINE = auto()
+    POINTS = auto()
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class PlotKind:
     title: str
     height: int  # in relation to other views
     style: Style
-    colour: Colour = _BRIGHT  # of a line
+    colour: Colour = _BRIGHT  # of a line, or of points
     scale: tuple[float, float] | None = None  # None fits the values
     live_scale: tuple[float, float] | None = None  # if another one, where values go on
 
@@ -60,7 +62,15 @@ NOVELTY = PlotKind(
 FEATURES = PlotKind(
     "features", "Features: 0 ({first}) to {end} ({last}), dark is low", 180, Style.HEAT_MAP
 )
-PLOTS = (SHARES, LEVEL, FLOOR, NOVELTY, FEATURES)
+DIRECTION = PlotKind(
+    "direction",
+    "Direction of the sound, in degrees: 0 ahead, 90 left",
+    110,
+    Style.POINTS,
+    _TOWARDS,
+    scale=(-180.0, 180.0),
+)
+PLOTS = (SHARES, LEVEL, FLOOR, DIRECTION, NOVELTY, FEATURES)
 
 
 class Plot(NamedTuple):
@@ -124,6 +134,8 @@ def _values(
         yield LEVEL, "", ("level",), microphone.level[:, np.newaxis]
     if microphone.floor is not None:
         yield FLOOR, "", ("floor",), microphone.floor[:, np.newaxis]
+    if microphone.direction is not None:
+        yield DIRECTION, "", ("direction",), microphone.direction[:, np.newaxis]
     for one in microphone.labellings:
         if one.novelty is not None:
             yield NOVELTY, one.name, (f"novelty, {one.name}",), one.novelty[:, np.newaxis]

@@ -38,6 +38,17 @@ GAPS = LaneKind("Not_heard", lambda states: dict.fromkeys(states, GAP), [NOT_HEA
 TROUBLE = LaneKind("Trouble", _trouble_colours, TROUBLES)
 
 
+def scenario_kind(labelling: str) -> LaneKind:
+    """Return the kind of lane of a scenario, which shows its segments once they are closed.
+
+    Parameters
+    ----------
+    labelling : str
+        `scenario/<name>`.
+    """
+    return LaneKind(labelling.replace("/", "_").capitalize(), _class_colours)
+
+
 class Changes(NamedTuple):
     """When a lane changes, and to which states.
 

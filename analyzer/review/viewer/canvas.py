@@ -20,6 +20,7 @@ _STROKE_WIDTH = 2.0  # pixels
 _LEAST_SHARE = 0.004  # below, a band is less than a pixel high
 _ROWS_AT_ONCE = 72_000  # an hour of frames
 _HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
+_POINT = 2.0  # points of the screen
 _DARK_TO_BRIGHT = np.array(  # through purple and red, as matplotlib's magma
     [(0, 0, 4), (59, 15, 112), (140, 41, 129), (222, 73, 104), (254, 159, 109), (252, 253, 191)]
 )
@@ -175,13 +176,29 @@ class Canvas:
         style = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
         self.recording.log(entity, style, static=True)
 
+    def configure_points(self, entity: str, name: str, colour: Colour) -> None:
+        """Set the name and the colour of points, which `draw_lines` draws.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the points in the recording.
+        name : str
+        colour : Colour
+            Red, green and blue, 0 to 255.
+        """
+        style = rr.SeriesPoints(
+            names=[name], colors=[colour], markers=["circle"], marker_sizes=[_POINT]
+        )
+        self.recording.log(entity, style, static=True)
+
     def draw_lines(self, entity: str, times: Int64, values: NDArray[np.floating]) -> None:
         """Draw a line for each column of values.
 
         Parameters
         ----------
         entity : str
-            Configured by `configure_lines`.
+            Configured by `configure_lines` or `configure_points`.
         times : np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         values : np.ndarray [shape=(n, k)], float

@@ -264,6 +264,8 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
         canvas.configure_bands(entity, words, [colour(name) for name in plot.names])
     elif plot.kind.style is Style.HEAT_MAP:
         canvas.configure_heat_map(entity, plot.names)
+    elif plot.kind.style is Style.POINTS:
+        canvas.configure_points(entity, plot.names[0], plot.kind.colour)
     else:
         canvas.configure_lines(entity, plot.names, [plot.kind.colour])
 
