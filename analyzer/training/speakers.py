@@ -81,7 +81,7 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
             )
         if seconds[name] < _LEAST_SECONDS:
             raise DataError(
-                f"{name} is enrolled for {seconds[name]:.0f} s: {_LEAST_SECONDS:.0f} s are needed"
+                f"{name} is enrolled for {seconds[name]:.1f} s: {_LEAST_SECONDS:.0f} s are needed"
             )
     others = tuple(sorted(LABELS - {SILENCE}))
     names = {name: (name,) for name in sorted(groups)}

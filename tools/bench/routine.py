@@ -247,7 +247,7 @@ def method_lines(homes: Sequence[Home]) -> Iterator[str]:
 
 def main(
     homes: Annotated[int, typer.Option(min=2)] = 20,
-    seed: Annotated[int, typer.Option(help="Of the first home.")] = 100,
+    seed: Annotated[int, typer.Option(help="Of the first home.")] = 200,
     weeks: Annotated[int, typer.Option(min=1, max=4, help="That a day is compared with.")] = 4,
     *,
     methods: Annotated[bool, typer.Option("--methods", help="Compare other methods, too.")] = False,
