@@ -17,7 +17,14 @@ from hearthlog.analyzer.bridge.alerts.evaluate import rings
 from hearthlog.analyzer.bridge.alerts.gathering import Gathered
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
 from hearthlog.analyzer.bridge.alerts.ring import RuleState
-from hearthlog.analyzer.bridge.alerts.rules import LONGEST_PAUSE, AlertRule, AlertRules, history
+from hearthlog.analyzer.bridge.alerts.rules import (
+    LONGEST_PAUSE,
+    AlertRule,
+    AlertRules,
+    history,
+    unknown_class,
+)
+from hearthlog.analyzer.bridge.alerts.unusual_days import home_sound
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.errors import ConfigurationError
@@ -164,6 +171,27 @@ def test_a_microphone_whose_model_does_not_know_a_class_does_not_listen_for_it()
     both, hall = home(*segments, classes=know), home(segments[0], classes=know)
     assert [ring.is_known for ring in rings(one, both, NOON, NOON + DAY, UTC)[0]] == [True]
     assert [ring.is_known for ring in rings(one, hall, NOON, NOON + DAY, UTC)[0]] == [False]
+
+
+def test_a_class_of_a_scenario_is_heard_by_its_microphone_and_is_no_further_sound():
+    know = {"hall": ["silence", "speech"], "hall-speakers": ["silence", "anna", "unknown"]}
+    spoken = [(0, 30, "speech", 1.0, "hall"), (0, 30, "anna", 1.0, "hall-speakers")]
+    nobody = (60, 30, "unknown", 1.0, "hall-speakers")
+    silence = [(18 * HOUR, 4 * HOUR, "silence", 1.0, name) for name in know]
+    heard = home(*spoken, nobody, *silence, classes=know)
+    count = {"count": 0, "window": "1h", "microphone": "hall"}
+    assert rung(rule("more_than", **count, **{"class": "anna"}), heard) == [0]
+    assert rung(rule("more_than", **count, **{"class": "unknown"}), heard) == []
+    assert rung(rule("more_than", **count), heard) == rung(
+        rule("more_than", **count), home(*spoken[:1])
+    )
+    assert len(heard.of("").starts) == 1
+    assert unknown_class(rule("more_than", **count, **{"class": "anna"}), heard.classes) == ""
+    assert "ben" in unknown_class(rule("more_than", **count, **{"class": "ben"}), heard.classes)
+    absent = rule("none_by", since="06:00", by="10:00", microphone="hall", **{"class": "anna"})
+    assert [ring.is_known for ring in rings(absent, heard, NOON, NOON + DAY, UTC)[0]] == [True]
+    assert set(home_sound(heard).listened) == {"silence", "speech"}
+    assert set(home_sound(heard).labels.labels) == {"silence", "speech"}
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.state_folder import state_folder
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
@@ -360,7 +361,9 @@ def news_of_water(time):
         classes=CLASSES,
         heard=SimpleNamespace(time=time),
     )
-    return SimpleNamespace(state=SimpleNamespace(microphones={"mic": microphone}))
+    state = HomeState()
+    state.microphones["mic"] = microphone
+    return SimpleNamespace(state=state)
 
 
 @pytest.mark.parametrize("starts_ahead", [True, False])
@@ -426,7 +429,7 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
     try:
         for minutes in range(0, 60, 4):
             monkeypatch.setattr(time, "time_ns", lambda m=minutes: right() + m * MINUTE)
-            own.update(SimpleNamespace(state=SimpleNamespace(microphones={})))
+            own.update(SimpleNamespace(state=HomeState()))
             if minutes == 4:  # one that rang before those, and is found later
                 own._outbox.put([Ring("coughs", now, "ring 0", is_known=True, due=now)])
     finally:

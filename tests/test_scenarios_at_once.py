@@ -20,10 +20,13 @@ from mcap.records import Channel
 from spliced import run
 from test_swap import MICROPHONE, block, wait_for
 
+from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
+from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
 from hearthlog.analyzer.bridge.follow_home import is_of_bridge
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.discovery import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
+from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
@@ -424,6 +427,22 @@ def test_what_a_bridge_tells_of_a_scenario_is_apart_from_its_microphone(log):
     assert "level" not in told
     assert told["heard"]["state_topic"] == "hearthlog/home/mic-water/heard"
     assert any("tap_water" in key for key in told)
+
+
+def test_alerts_hear_what_a_scenario_labels_from_the_log_and_as_it_is_written(log):
+    start, end = START, START + 60 * 1_000_000_000
+    replayed = read_heard(find_home_logs([log]), "home", start, end, pytest.fail)
+    columns = read_columns([log], None, fields={f for own in FIELDS.values() for f in own})
+    live = LiveHome(start, 0)
+    live.push([part for topic, part in columns.items() if is_of_alerts(topic)])
+    labels = read_columns([log], OF_WATER)[OF_WATER[1]]["label"].tolist()
+    for heard in (replayed, live.heard()):
+        water = heard.of("flushing_water")
+        assert len(water.starts) == labels.count("flushing_water") > 0
+        assert set(water.microphones) == {"mic"}
+        assert {"other", "silence"}.isdisjoint(heard.scenario_sounds)
+        assert "flushing_water" not in heard.sounds
+    assert "flushing_water" in replayed.classes["mic-water"]
 
 
 def test_the_doctor_misses_the_labels_of_a_scenario_that_ran(log, tmp_path, capfd):

@@ -146,7 +146,7 @@ def test_sounds_without_a_voice_enrol_nobody():
 
 
 def test_too_little_of_a_voice_is_told():
-    with pytest.raises(DataError, match="anna is enrolled for 8.0 s: 10 s are needed"):
+    with pytest.raises(DataError, match=r"anna is enrolled for 8\.0 s: 10 s are needed"):
         speakers_scenario([recording("anna", seconds=4), recording("anna", "b", 4)])
 
 

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.bridge.event_record import PAUSE_SECONDS, Event, EventRecord
 from hearthlog.analyzer.bridge.heard_now import HeardNow
+from hearthlog.analyzer.bridge.listeners import is_of_scenario, listener_of
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import SCENARIO, TopicName, is_scenario, parse_topic
+from hearthlog.schemas.messages.topics import TopicName, parse_topic
 from hearthlog.schemas.times import NANOSECONDS
 
 FIELDS = {
@@ -235,11 +236,11 @@ class HomeState:
         return begun
 
     def _state_of(self, topic: TopicName) -> MicrophoneState:
-        if not is_scenario(topic.labelling):
-            name = topic.microphone
-            return self.microphones.setdefault(name, MicrophoneState(name))
-        name = f"{topic.microphone}-{topic.labelling.removeprefix(f'{SCENARIO}/')}"
-        return self.scenarios.setdefault(name, MicrophoneState(name, OF_EVERY_SCENARIO))
+        name = listener_of(topic)
+        assert name is not None
+        if is_of_scenario(name):
+            return self.scenarios.setdefault(name, MicrophoneState(name, OF_EVERY_SCENARIO))
+        return self.microphones.setdefault(name, MicrophoneState(name))
 
     def _time_seen(self, columns: Columns) -> float:
         """Tell when messages were written, by CLOCK_MONOTONIC.

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hearthlog.analyzer.bridge.alerts.home_heard import NO_SOUNDS, HomeHeard, Sounds, sounds_of
+from hearthlog.analyzer.bridge.listeners import is_of_scenario, microphone_of_listener
 from hearthlog.analyzer.logs.spans import NONE, Spans, joined
-from hearthlog.models.classes import SILENCE, class_name
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -81,69 +82,71 @@ class Gathered:
     Attributes
     ----------
     classes : dict of str to set of str
-        By microphone, those that its model knows.
+        By listener, those that its model knows.
     """
 
     def __init__(self) -> None:
         self.classes: dict[str, set[str]] = {}
         self._rows: dict[str, _Rows] = {}
+        self._scenario_rows: dict[str, _Rows] = {}
         self._coverage: dict[str, _GrowingSpans] = {}
         self._written = _GrowingSpans()
 
-    def add_segments(self, microphone: str, columns: Columns) -> None:
+    def add_segments(self, listener: str, columns: Columns) -> None:
         """Add segments, with the fields `SEGMENT_FIELDS`.
 
         Parameters
         ----------
-        microphone : str
+        listener : str
         columns : Columns
             Of one topic, in the order of the log.
         """
         rows = zip(*(columns[name].tolist() for name in SEGMENT_FIELDS), strict=True)
         for start, duration, label, confidence in rows:
             if duration > 0:
-                self.add_segment(microphone, start, start + duration, label, confidence)
+                self.add_segment(listener, start, start + duration, label, confidence)
 
     def add_segment(
-        self, microphone: str, start: int, end: int, label: str, confidence: float
+        self, listener: str, start: int, end: int, label: str, confidence: float
     ) -> None:
         """Add a segment.
 
         Parameters
         ----------
-        microphone : str
+        listener : str
         start, end : int
             In nanoseconds of UTC.
         label : str
         confidence : float
         """
-        covered = self._coverage.setdefault(microphone, _GrowingSpans())
+        covered = self._coverage.setdefault(listener, _GrowingSpans())
         covered.add(start, end, FRAME_NANOSECONDS)
         self._written.add(start, end, _PAUSE)  # a long one has a message at its end alone
         name = class_name(label)
-        if name == SILENCE:
+        if not _is_told(listener, name):
             return
-        rows = self._rows.setdefault(name, _Rows())
+        every = self._scenario_rows if is_of_scenario(listener) else self._rows
+        rows = every.setdefault(name, _Rows())
         rows.starts.append(start)
         rows.ends.append(end)
         rows.confidences.append(confidence)
-        rows.microphones.append(microphone)
+        rows.microphones.append(microphone_of_listener(listener))
         rows.known = None
-        if microphone in self.classes:
-            self.classes[microphone].add(name)
+        if listener in self.classes:
+            self.classes[listener].add(name)
 
-    def add_classes(self, microphone: str, names: Iterable[str]) -> None:
-        """Add the classes that the model of a microphone knows.
+    def add_classes(self, listener: str, names: Iterable[str]) -> None:
+        """Add the classes that the model of a listener knows.
 
         Parameters
         ----------
-        microphone : str
+        listener : str
         names : iterable of str
             None: nothing is known of them.
         """
         own = {class_name(name) for name in names}
         if own:
-            self.classes.setdefault(microphone, set()).update(own)
+            self.classes.setdefault(listener, set()).update(own)
 
     def add_written(self, times: Int64) -> None:
         """Add times at which the recorder wrote.
@@ -181,23 +184,25 @@ class Gathered:
             Segments that go on, as `add_segment` takes them.
         """
         sounds = {label: rows.sounds() for label, rows in self._rows.items()}
+        of_scenarios = {label: rows.sounds() for label, rows in self._scenario_rows.items()}
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
         written = self._written.spans(_PAUSE)
-        for microphone, start, end, label, confidence in others:
+        for listener, start, end, label, confidence in others:
             written = _with(written, start, end, _PAUSE)
-            spans = coverage.get(microphone, NONE)
-            coverage[microphone] = _with(spans, start, end, FRAME_NANOSECONDS)
+            spans = coverage.get(listener, NONE)
+            coverage[listener] = _with(spans, start, end, FRAME_NANOSECONDS)
             name = class_name(label)
-            if name != SILENCE:
+            if _is_told(listener, name):
                 more = Sounds(
                     np.array([start]),
                     np.array([end]),
                     np.array([confidence], np.float32),
-                    np.array([microphone], object),
+                    np.array([microphone_of_listener(listener)], object),
                 )
-                sounds[name] = sounds_of([sounds.get(name, NO_SOUNDS), more])
+                every = of_scenarios if is_of_scenario(listener) else sounds
+                every[name] = sounds_of([every.get(name, NO_SOUNDS), more])
         classes = {name: frozenset(own) for name, own in self.classes.items()}
-        return HomeHeard(sounds, coverage, classes, written)
+        return HomeHeard(sounds, of_scenarios, coverage, classes, written)
 
     def forget_before(self, time: int, pause: int) -> None:
         """Forget the events that were over before a time.
@@ -209,11 +214,16 @@ class Gathered:
         pause : int
             Within an event, at most.
         """
-        for rows in self._rows.values():
+        for rows in (*self._rows.values(), *self._scenario_rows.values()):
             if rows.starts:
                 rows.keep(rows.sounds().between(time, 1 << 62, pause))
         for own in (*self._coverage.values(), self._written):
             own.forget_before(time)
+
+
+def _is_told(listener: str, name: str) -> bool:
+    """Tell whether a class is one that a rule may be about."""
+    return name not in (OF_EVERY_SCENARIO if is_of_scenario(listener) else {SILENCE})
 
 
 def _with(spans: Spans, start: int, end: int, pause: int) -> Spans:

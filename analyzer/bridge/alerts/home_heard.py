@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.bridge.alerts.rules import ANY_SOUND
+from hearthlog.analyzer.bridge.listeners import is_of_scenario, microphone_of_listener
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 
@@ -86,16 +87,19 @@ class HomeHeard:
     Attributes
     ----------
     sounds : mapping of str to Sounds
-        By class; silence is none.
+        By class, of the models of the home; silence is none.
+    scenario_sounds : mapping of str to Sounds
+        By class, of the models of scenarios, which label the same sound.
     coverage : mapping of str to Spans
-        By microphone, when it heard.
+        By listener, when it heard.
     classes : mapping of str to frozenset of str
-        By microphone, the classes that its model knows; one that is missing knows all.
+        By listener, the classes that its model knows; a microphone that is missing knows all.
     written : Spans
         When the recorder wrote; no more than a minute apart is one span.
     """
 
     sounds: Mapping[str, Sounds]
+    scenario_sounds: Mapping[str, Sounds]
     coverage: Mapping[str, Spans]
     classes: Mapping[str, frozenset[str]]
     written: Spans
@@ -110,7 +114,9 @@ class HomeHeard:
         return sounds_of(self.sounds.values()) if label == ANY_SOUND else self._of(label)
 
     def _of(self, label: str) -> Sounds:
-        return self.sounds.get(label, NO_SOUNDS)
+        own = self.sounds.get(label, NO_SOUNDS)
+        others = self.scenario_sounds.get(label)
+        return own if others is None else sounds_of([own, others])
 
     def listened(self, label: str, microphone: str) -> Spans:
         """Return when a class would have been heard.
@@ -122,12 +128,17 @@ class HomeHeard:
         microphone : str
             Empty: any of those whose models know the class.
         """
-        names = [microphone] if microphone else [*self.coverage]
-        knowing = [self.coverage.get(name, NONE) for name in names if self._knows(name, label)]
+        knowing = [
+            spans
+            for name, spans in self.coverage.items()
+            if microphone in {"", microphone_of_listener(name)} and self._knows(name, label)
+        ]
         return reduce(_either, knowing, NONE)
 
-    def _knows(self, microphone: str, label: str) -> bool:
-        known = self.classes.get(microphone)
+    def _knows(self, listener: str, label: str) -> bool:
+        known = self.classes.get(listener)
+        if is_of_scenario(listener):
+            return known is not None and label in known
         return known is None or label == ANY_SOUND or label in known
 
     def between(self, start: int, end: int, pause: int) -> "HomeHeard":
@@ -142,6 +153,10 @@ class HomeHeard:
         """
         return HomeHeard(
             {label: sounds.between(start, end, pause) for label, sounds in self.sounds.items()},
+            {
+                label: sounds.between(start, end, pause)
+                for label, sounds in self.scenario_sounds.items()
+            },
             {name: cut(spans, start, end) for name, spans in self.coverage.items()},
             self.classes,
             cut(self.written, start, end),

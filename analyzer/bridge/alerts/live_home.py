@@ -6,6 +6,7 @@ from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.open_run import Label, OpenRun
 from hearthlog.analyzer.bridge.alerts.rules import LONGEST_PAUSE
+from hearthlog.analyzer.bridge.listeners import listener_of, microphone_of_listener
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
@@ -29,7 +30,9 @@ def is_of_alerts(topic: str) -> bool:
     if topic == DIAGNOSTICS:
         return True
     name = parse_topic(topic)
-    return name is not None and name.labelling == LIVE and name.kind in {"segment", "gap"}
+    if name is None or listener_of(name) is None:
+        return False
+    return name.kind == "segment" or (name.kind == "gap" and name.labelling == LIVE)
 
 
 class LiveHome:
@@ -60,30 +63,30 @@ class LiveHome:
         for part in (each for each in columns if len(each)):
             self._gathered.add_written(part.log_times)
             name = parse_topic(part.topic)
-            if part.type == message_types.SEGMENT and name is not None:
-                self._gathered.add_segments(name.microphone, part)
-                self._run(name.microphone).begin(
-                    int((part["header.stamp"] + part["duration"]).max())
-                )
-            elif part.type == message_types.GAP and name is not None:
+            listener = None if name is None else listener_of(name)
+            if listener is None:
+                continue
+            if part.type == message_types.SEGMENT:
+                self._gathered.add_segments(listener, part)
+                self._run(listener).begin(int((part["header.stamp"] + part["duration"]).max()))
+            elif part.type == message_types.GAP:
                 rows = zip(part["header.stamp"].tolist(), part["duration"].tolist(), strict=True)
                 for start, duration in rows:
-                    self._cut(name.microphone, start)
-                    self._run(name.microphone).begin(start + max(duration, 0))
+                    self._add_gap(listener, start, start + max(duration, 0))
 
-    def add_label(self, microphone: str, label: Label, classes: Sequence[str]) -> None:
-        """Add a label of a microphone.
+    def add_label(self, listener: str, label: Label, classes: Sequence[str]) -> None:
+        """Add a label of a listener.
 
         Parameters
         ----------
-        microphone : str
+        listener : str
         label : Label
         classes : sequence of str
             Those of its model.
         """
-        run = self._run(microphone)
+        run = self._run(listener)
         if label.time > run.last:
-            self._gathered.add_classes(microphone, classes)
+            self._gathered.add_classes(listener, classes)
             self._gathered.add_written_span(label.time, label.time)
             run.add(label)
         if not run.start:
@@ -111,7 +114,7 @@ class LiveHome:
 
     @property
     def classes(self) -> Mapping[str, Collection[str]]:
-        """By microphone, the classes that its model knows."""
+        """By listener, the classes that its model knows."""
         return self._gathered.classes
 
     def open_segments(self) -> list[tuple[str, int, int, str, float]]:
@@ -123,12 +126,20 @@ class LiveHome:
         """Forget what was over before a time, in nanoseconds of UTC."""
         self._gathered.forget_before(time, LONGEST_PAUSE)
 
-    def _run(self, microphone: str) -> OpenRun:
-        return self._runs.setdefault(microphone, OpenRun())
+    def _run(self, listener: str) -> OpenRun:
+        return self._runs.setdefault(listener, OpenRun())
 
-    def _cut(self, microphone: str, start: int) -> None:
+    def _add_gap(self, microphone: str, start: int, end: int) -> None:
+        """Let all that listen by a microphone begin anew after a gap."""
+        self._run(microphone)
+        for listener, run in self._runs.items():
+            if microphone_of_listener(listener) == microphone:
+                self._cut(listener, start)
+                run.begin(end)
+
+    def _cut(self, listener: str, start: int) -> None:
         """Keep what was heard before a gap although its segment was never written."""
-        run = self._run(microphone).run()
+        run = self._run(listener).run()
         if run is not None and start - run.start > _CUT:
             end = min(run.end, start)
-            self._gathered.add_segment(microphone, run.start, end, run.label, run.confidence)
+            self._gathered.add_segment(listener, run.start, end, run.label, run.confidence)

@@ -108,7 +108,7 @@ class AlertsOutput:
 
     def update(self, news: News) -> None:
         """Note what is heard now, and tell the broker of what rang."""
-        for microphone in news.state.microphones.values():
+        for microphone in news.state.every():
             if microphone.label:
                 label = Label(microphone.heard.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))

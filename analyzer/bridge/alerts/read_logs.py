@@ -1,11 +1,12 @@
 """What was heard in a span of time, from the logs of one recorder."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
+from hearthlog.analyzer.bridge.listeners import listener_of
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import Described, select
@@ -14,7 +15,7 @@ from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import LIVE, labelling_topic, microphone_of, parse_topic
+from hearthlog.schemas.messages.topics import labelling_topic, parse_topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -68,23 +69,22 @@ def _add_log(
     selection = select([path])
     if selection.unfinished:
         lose(f"unfinished, read up to the last whole chunk: {path}")
-    topics = [
-        topic
-        for topic in selection.topics_of(message_types.SEGMENT, set(SEGMENT_FIELDS))
-        if (name := parse_topic(topic)) is not None and name.labelling == LIVE
-    ]
-    for topic in topics:
-        _add_classes(gathered, microphone_of(topic), selection.channels)
-    found = read_columns([path], topics, start, end, SEGMENT_FIELDS)
-    for topic, columns in found.items():
-        gathered.add_segments(microphone_of(topic), columns)
+    listeners = {}
+    for topic in selection.topics_of(message_types.SEGMENT, set(SEGMENT_FIELDS)):
+        name = parse_topic(topic)
+        listener = None if name is None else listener_of(name)
+        if name is not None and listener is not None:
+            listeners[topic] = listener
+            labels = labelling_topic(name.microphone, name.labelling, "label")
+            _add_classes(gathered, listener, selection.channels.get(labels, ()))
+    segments = read_columns([path], list(listeners), start, end, SEGMENT_FIELDS)
+    for topic, columns in segments.items():
+        gathered.add_segments(listeners[topic], columns)
 
 
-def _add_classes(
-    gathered: Gathered, microphone: str, channels: Mapping[str, Sequence[Described]]
-) -> None:
-    for channel, _ in channels.get(labelling_topic(microphone, LIVE, "label"), ()):
-        gathered.add_classes(microphone, array_names(channel.metadata, "probabilities"))
+def _add_classes(gathered: Gathered, listener: str, channels: Sequence[Described]) -> None:
+    for channel, _ in channels:
+        gathered.add_classes(listener, array_names(channel.metadata, "probabilities"))
 
 
 def nodes_of(logs: HomeLogs) -> list[str]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_duration
+from hearthlog.analyzer.bridge.listeners import microphone_of_listener
 from hearthlog.analyzer.routine.compare import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
@@ -242,11 +243,15 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
     ----------
     rule : AlertRule
     classes : mapping of str to collection of str
-        By microphone, those that its model knows.
+        By listener, those that its model knows.
     """
     if not isinstance(rule, _SoundRule) or rule.label == ANY_SOUND:
         return ""
-    own = [names for name, names in classes.items() if rule.microphone in {"", name}]
+    own = [
+        names
+        for name, names in classes.items()
+        if rule.microphone in {"", microphone_of_listener(name)}
+    ]
     if not own or any(rule.label in names for names in own):
         return ""
     return f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard"

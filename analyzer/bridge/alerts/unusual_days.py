@@ -8,6 +8,7 @@ from hearthlog.analyzer.bridge.alerts.daily import judged_days
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.ring import Alarm
 from hearthlog.analyzer.bridge.alerts.rules import ANY_SOUND, UnusualDay
+from hearthlog.analyzer.bridge.listeners import is_of_scenario
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.report.class_words import short_day
 from hearthlog.analyzer.report.routine_text import differences_text, rarity_text
@@ -62,7 +63,8 @@ def home_sound(heard: HomeHeard) -> HomeSound:
         for name in ("starts", "ends", "labels")
     )
     order = np.argsort(starts, kind="stable")
-    known = dict.fromkeys(sorted(set(heard.sounds).union(*heard.classes.values())))
+    of_home = [own for name, own in heard.classes.items() if not is_of_scenario(name)]
+    known = dict.fromkeys(sorted(set(heard.sounds).union(*of_home)))
     return HomeSound(
         Labelling(starts[order], ends[order], labels[order]),
         {name: heard.listened(name, "") for name in known},

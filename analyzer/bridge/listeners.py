@@ -1,0 +1,42 @@
+"""Who hears: a microphone by the model of the home, or by that of a scenario.
+
+The second is named `<microphone>-<scenario>`, which is no name of a microphone.
+"""
+
+from hearthlog.schemas.messages.topics import LIVE, SCENARIO, TopicName, is_scenario
+
+_BETWEEN = "-"
+
+
+def listener_of(topic: TopicName) -> str | None:
+    """Name who labels what a topic has; None for what no recorder labels live.
+
+    Parameters
+    ----------
+    topic : TopicName
+    """
+    if topic.labelling == LIVE:
+        return topic.microphone
+    if is_scenario(topic.labelling):
+        return f"{topic.microphone}{_BETWEEN}{topic.labelling.removeprefix(f'{SCENARIO}/')}"
+    return None
+
+
+def microphone_of_listener(listener: str) -> str:
+    """Return the name of the microphone.
+
+    Parameters
+    ----------
+    listener : str
+    """
+    return listener.partition(_BETWEEN)[0]
+
+
+def is_of_scenario(listener: str) -> bool:
+    """Tell whether the model of a scenario hears.
+
+    Parameters
+    ----------
+    listener : str
+    """
+    return _BETWEEN in listener
