@@ -268,6 +268,21 @@ def load_settings(
     return load_with_origins(file, command_line, microphone)[0]
 
 
+def _without_scenarios(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the microphones of a file without scenarios of their own."""
+    microphones = content.get("microphone")
+    if not isinstance(microphones, list):
+        return {}
+    return {
+        "microphone": [
+            {key: value for key, value in each.items() if key != "scenarios"}
+            if isinstance(each, dict)
+            else each
+            for each in microphones
+        ]
+    }
+
+
 def load_with_origins(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> tuple[Settings, Origins]:
@@ -287,8 +302,11 @@ def load_with_origins(
     content.pop(BRIDGE, None)
     lines = {} if file is None else key_lines(file.read_text("utf-8"))
     origins = Origins(command_line, content, file, lines)
+    given = _environment() | command_line
+    if "scenarios" in given:
+        content = content | _without_scenarios(content)
     try:
-        settings = Settings(**(content | _environment() | command_line))
+        settings = Settings(**(content | given))
         _check_microphones(settings.microphone, origins)
         if not microphone:
             return settings, origins

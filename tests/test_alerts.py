@@ -116,6 +116,19 @@ def test_no_more_is_known_than_labels_have_decided():
     assert live.known_until(now + 100 * SECOND) == now + 70 * SECOND  # it is away
 
 
+def test_a_scenario_that_is_taken_away_keeps_nobody_waiting():
+    live, begin = LiveHome(0, 30 * SECOND), 1_000_000 * SECOND
+    for second in range(3 * 3600):
+        time = begin + second * SECOND
+        live.add_label("mic", Label(time, "silence", 0.9), ["silence", "speech"])
+        if second < 3600:
+            live.add_label("mic-water", Label(time, "tap_water", 0.9), ["silence", "tap_water"])
+    assert time - live.known_until(time) < 10 * SECOND
+    assert [name for name, *_ in live.open_segments()] == ["mic"]
+    taps = live.heard().of("tap_water")
+    assert taps.ends.tolist() == [begin + (3599 - 5) * SECOND]
+
+
 def test_what_was_heard_before_a_recorder_was_killed_stays_heard(tmp_path):
     """Its last segment was never written; the next recorder writes the gap that follows."""
     write_day(tmp_path, DAY, hours=range(3), gaps=[(2 * HOUR, 600, "the recorder was not running")])

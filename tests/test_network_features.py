@@ -23,7 +23,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.errors import HearthlogError, HearthlogWarning, LogError
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.feature_record import (
@@ -367,6 +367,52 @@ def test_values_that_are_not_finite_are_refused(own):
     network = _single([helper.make_node("Log", ["waveform"], ["out"])], shape=(1, 800))
     with pytest.raises(ModelError, match="gives values that are not finite as out"):
         extractor(own, network, window_seconds=0.05, hop_seconds=0.05, width=800)
+
+
+def _failing_at_half(measure, lookup):
+    """A network of a row and a measure of the sound, which looks up another row from 0.5 on."""
+    return _single(
+        [
+            helper.make_node("Abs", ["waveform"], ["sizes"]),
+            helper.make_node(measure, ["sizes"], ["size"]),
+            helper.make_node("Mul", ["size", "two"], ["double"]),
+            helper.make_node("Reshape", ["double", "one"], ["flat"]),
+            helper.make_node("Cast", ["flat"], ["step"], to=TensorProto.INT64),
+            lookup,
+            helper.make_node("Add", ["row", "size"], ["out"]),
+        ],
+        {
+            "two": np.array(2.0, np.float32),
+            "one": np.array([1]),
+            "all": np.array([9999]),
+            "rows": np.array([0]),
+            "columns": np.array([1]),
+            "table": np.arange(WIDTH, dtype=np.float32)[np.newaxis],
+        },
+    )
+
+
+_LOOKUPS = {
+    "an error": helper.make_node("Gather", ["table", "step"], ["row"]),
+    "no rows": helper.make_node("Slice", ["table", "step", "all", "rows"], ["row"]),
+    "another width": helper.make_node("Slice", ["table", "step", "all", "columns"], ["row"]),
+}
+
+
+@pytest.mark.parametrize("failure", _LOOKUPS)
+def test_sound_that_a_network_fails_at_is_silence_to_it_and_the_rest_is_heard(own, failure):
+    extract = extractor(own, _failing_at_half("ReduceMean", _LOOKUPS[failure]))
+    quiet, loud = (np.full((40, FRAME_SAMPLES), level, np.float32) for level in (0.25, 0.75))
+    with pytest.warns(HearthlogWarning, match="fails at some sound, which counts as silence"):
+        values = extract(loud)
+    np.testing.assert_array_equal(values[-1, 1:], np.arange(WIDTH))
+    np.testing.assert_array_equal(extract(quiet)[-1, 1:], np.arange(WIDTH) + 0.25)
+
+
+@pytest.mark.parametrize("failure", _LOOKUPS)
+def test_a_network_that_fails_at_loud_noise_is_refused(own, failure):
+    with pytest.raises(ModelError, match=r"one\.onnx: (fails|gives out of shape)"):
+        extractor(own, _failing_at_half("ReduceMax", _LOOKUPS[failure]))
 
 
 def test_a_network_that_was_changed_is_refused(own):

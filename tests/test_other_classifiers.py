@@ -253,6 +253,27 @@ def test_a_home_teaches_and_what_it_taught_goes_with_it(name, tmp_path):
     )
 
 
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"neighbours"}))  # which decides by them
+def test_a_model_without_its_windows_is_not_adapted(name):
+    base = trained(name)
+    others = {one: array for one, array in base.arrays.items() if not one.startswith("learned_")}
+    base = replace(base, arrays=others, name="bare")
+    assert base_classes(base) == base.classes
+    with pytest.raises(DataError, match="bare: has not kept what it learned from; train it anew"):
+        adapt_model(base, of_home(4, [1, 3]))
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"neighbours"}))
+def test_a_model_without_the_windows_of_a_class_is_adapted_only_with_some_of_the_home(name):
+    base = trained(name)
+    kept = base.arrays["learned_target"] != 1
+    windows = {one: base.arrays[one][kept] for one in ("learned_inputs", "learned_target")}
+    base = replace(with_arrays(base, **windows), name="holed")
+    with pytest.raises(DataError, match="holed: has kept nothing of class_1; train it anew"):
+        adapt_model(base, of_home(4, [0, 3]))
+    assert adapt_model(base, of_home(4, [1, 3])).classes[1] == "class_1"
+
+
 def stumps():
     """The arrays of two small trees of two classes."""
     return {
@@ -299,6 +320,11 @@ def test_trees_that_make_no_sense_are_refused(why):
     assert TREES.problem(2, arrays) is None
     arrays[name][place] = value
     assert complaint in (TREES.problem(2, arrays) or "")
+
+
+def test_roots_so_far_apart_that_their_difference_overflows_are_refused():
+    far = {"roots": np.array([0, 2**31 - 1, -2, 5], np.int32)}
+    assert "roots are not" in (TREES.problem(2, stumps() | far) or "")
 
 
 def chain(levels):

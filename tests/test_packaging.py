@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
-DATA = {"py.typed", "page.html", "page.css", "page.js"}
+DATA = {"py.typed", "page.html", "page.css", "page.js", "voice_space.safetensors"}
 APART = {("tools", "bench"), ("tools", "month"), ("tools", "ros")}  # measured, or built, by itself
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"

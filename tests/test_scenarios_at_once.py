@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -30,14 +30,15 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
-from hearthlog.recorder.config import Settings
+from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
-from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
+from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch, ReloadRequests
 from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.recording import RecordingSession, record_files
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -109,6 +110,21 @@ def log(sound, tmp_path_factory) -> Path:
     return record(sound, tmp_path_factory.mktemp("logs"), scenarios={"water": BATHROOM})
 
 
+@pytest.fixture(scope="module")
+def long_log(tmp_path_factory) -> Path:
+    """Ten minutes of knocks, which the live model hears and the scenario does not."""
+    clips = Path(__file__).parents[1] / "tools/home/clips/objects_activity"
+    samples, rate = soundfile.read(min(clips.glob("*.flac")), dtype="float32")
+    loudest = int(np.convolve(samples**2, np.ones(1600), "same").argmax())
+    knock = samples[max(loudest - 4000, 0) : loudest + 4000]
+    whole = np.random.default_rng(3).normal(0, 3e-3, 600 * rate).astype(np.float32)
+    for first in range(10 * rate, 590 * rate, 20 * rate):
+        whole[first : first + len(knock)] += 0.3 * knock / np.abs(knock).max()
+    folder = tmp_path_factory.mktemp("long")
+    soundfile.write(folder / "long.wav", np.clip(whole, -1, 1), rate)
+    return record(folder / "long.wav", folder / "logs", model=BATHROOM, scenarios={"home": GENERAL})
+
+
 def written(log: Path, topics: list[str] | None = None) -> list[tuple[str, int, bytes]]:
     return [(m.topic, m.log_time, m.data) for m in LogReader(log).messages(topics)]
 
@@ -175,6 +191,24 @@ def test_a_replay_gives_the_labels_of_a_scenario_again(log, tmp_path, capfd):
     assert not written(without, OF_WATER)
     assert not [key for key in about if key.startswith("scenario")]
     assert run(capfd, "doctor", without).returncode == 0
+
+
+def test_a_replay_of_a_part_gives_the_labels_of_a_scenario_too(long_log, tmp_path, capfd):
+    out = tmp_path / "part"
+    words = ["--start-offset", "420", "--scenario", f"home={GENERAL}", "-o", out]
+    assert run(capfd, "replay", long_log, *words).returncode == 0
+    (part,) = find_logs(out)
+    for topic in ("/mic/scenario/home/label", "/mic/scenario/home/segment", "/mic/segment"):
+        again = payloads(part, topic)
+        assert again == payloads(long_log, topic)[-len(again) :]
+        assert again
+
+
+def test_a_replay_refuses_what_a_recorder_refuses(log, tmp_path, capfd):
+    words = ["--scenario", f"x={GENERAL}", "-o", tmp_path / "out"]
+    refused = run(capfd, "replay", log, *words)
+    assert refused.returncode == 1
+    assert "and so does the live model, general" in refused.stderr
 
 
 def test_a_relabelling_gives_them_again_in_a_layer(sound, tmp_path, capfd):
@@ -323,6 +357,29 @@ def test_a_class_of_two_scenarios_is_refused_and_both_are_named(tmp_path, sound)
     assert len(labels[0]) == len(labels[1]) > 100, "silence, unknown and other may be of both"
 
 
+def test_what_goes_on_since_another_was_refused_keeps_its_classes(tmp_path):
+    waters = ("flushing_water", "tap_water")
+    of_a, of_b = (dict(zip(waters, names, strict=True)) for names in (("a", "c"), ("b", "d")))
+    files = {
+        name: keep(tmp_path / f"{name}.safetensors", of)
+        for name, of in zip("ab", (of_a, of_b), strict=True)
+    }
+    requests = ReloadRequests()
+    with ExitStack() as stack:
+        live = stack.enter_context(closing(ModelWatch(Path(GENERAL), requests.queue())))
+        watches = {
+            name: stack.enter_context(closing(ModelWatch(file, requests.queue(), name)))
+            for name, file in files.items()
+        }
+        models = LabellingModels(live, None, watches)
+        bathroom = load_model(starter_file(BATHROOM))
+        for name, of in (("a", of_b), ("b", {"tap_water": "speech"})):
+            model = renamed(bathroom, of)
+            watches[name].ready = Loaded(model, Classifier(model))
+        assert len(models.refusals()) == 2
+        assert models.change() == []
+
+
 def test_a_model_for_another_feature_set_is_refused_in_a_line(tmp_path, sound):
     golden = load_model(GOLDEN)
     names = {name: f"my_{name}" for name in golden.classes if name not in {"silence", "unknown"}}
@@ -468,6 +525,15 @@ def test_a_topic_of_a_scenario_says_of_which(microphone, name, kind):
 def test_a_name_that_is_no_topic_is_refused(name):
     with pytest.raises(LogError, match="scenario name"):
         check_scenario_name(name)
+
+
+def test_what_the_command_line_says_of_scenarios_holds_for_every_microphone(tmp_path):
+    file = tmp_path / "home.toml"
+    file.write_text('[[microphone]]\nname = "bath"\nscenarios = {}\n')
+    given = {"scenarios": {"water": Path("bathroom")}}
+    settings, own = load_settings(file, given, {}), load_settings(file, {}, {})
+    assert settings.scenarios_of(settings.microphone[0]) == given["scenarios"]
+    assert own.scenarios_of(own.microphone[0]) == {}
 
 
 def test_the_command_line_and_a_file_name_scenarios(tmp_path, capfd):

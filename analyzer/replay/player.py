@@ -15,6 +15,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
+from hearthlog.recorder.labelling.clashes import clash
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -22,7 +23,7 @@ from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.topics import CANDIDATE, SCENARIO, scenario_labelling, topic
+from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, SCENARIO, scenario_labelling, topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _PACED_FRAMES = 10  # 0.5 s
@@ -175,7 +176,7 @@ class Player:
         classifier = None if model is None else Classifier(model)
         clips = self._options.kind != "features"  # which do not say how often
         every = LOGGED_EVERY if clips else configuration.statistics_every
-        beside = self._scenarios(info, features)
+        beside = self._scenarios(info, features, model)
         self._pipeline = Pipeline(info.microphone, features, classifier, every, beside)
         if self._options.output is not None:
             self._log = RollingLog(
@@ -196,7 +197,9 @@ class Player:
             check_model(info, model)
         return features_of(info)
 
-    def _scenarios(self, info: RecorderInfo, features: FeatureSet) -> dict[str, Classifier]:
+    def _scenarios(
+        self, info: RecorderInfo, features: FeatureSet, live: Model | None
+    ) -> dict[str, Classifier]:
         """Return what labels beside the model, by labelling."""
         beside = {}
         for name, model in self._options.scenarios.items():
@@ -208,7 +211,17 @@ class Player:
                     f"{model.name} of scenario {name} is for {theirs}: {models_for(features.name)}"
                 )
             beside[scenario_labelling(name)] = classifier
+        self._check_clashes(info, live)
         return beside
+
+    def _check_clashes(self, info: RecorderInfo, live: Model | None) -> None:
+        """Refuse a class of two models, as the recorder does."""
+        known = {} if live is None else {LIVE: live}
+        for name, model in self._options.scenarios.items():
+            if reason := clash(model, known):
+                where = f"model {model.name} of scenario {name}"
+                raise LogError(f"{info.path}: cannot be replayed so: {where} {reason}")
+            known[scenario_labelling(name)] = model
 
     def _goes_on(self, info: RecorderInfo) -> bool:
         """Tell whether a log is of the same run of a recorder, but of another model."""
@@ -229,6 +242,7 @@ class Player:
             return
         assert info.first_frame is not None
         self._features(info, model)
+        self._check_clashes(info, model)
         classifier = None if model is None else Classifier(model)
         closing, opening = self._pipeline.change_model(model, classifier, *info.first_frame)
         self._write(closing)
@@ -285,7 +299,7 @@ class Player:
             self._write(messages)
             if end > self._start:
                 self._progress(end)
-        if self._sha256 is None:
+        if self._sha256 is None and not self._options.scenarios:
             self.converged |= len(event.stamps) >= self._pipeline.feature_set.window_frames
         return True
 

@@ -62,9 +62,9 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     Raises
     ------
     DataError
-        If the base model has not kept what it learned from, the home has no segments, the method of
-        the base model is not installed, or that method wants augmented copies and its feature set
-        has none.
+        If the base model has not kept what it learned from, or nothing of one of its classes, the
+        home has no segments, the method of the base model is not installed, or that method wants
+        augmented copies and its feature set has none.
     ModelError
         If the method cannot be imported, or its feature set is not installed.
     """
@@ -80,6 +80,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     else:
         joined, others = _joined(base, home), len(base.training_windows)
         examples = prepare(method, joined)
+    _check_every_class(base, examples, home.classes)
     here = np.arange(others, others + len(home))
     learned = method.fit(examples)
     arrays = learned.arrays()
@@ -119,6 +120,16 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         training_target=base.training_target,
         training_group=base.training_group,
     )
+
+
+def _check_every_class(base: Model, examples: Examples, classes: Sequence[str]) -> None:
+    """Refuse what would leave a class without a window to learn from."""
+    usable = examples.usable.any(axis=(0, 2))
+    learned = np.union1d(examples.target[usable], examples.more_target)
+    missing = np.setdiff1d(np.arange(len(classes)), learned)
+    if len(missing):
+        name = classes[missing[0]]
+        raise DataError(f"{base.name}: has kept nothing of {name}; train it anew to adapt")
 
 
 def _of_classes(description: Description, classes: Sequence[str]) -> Description:

@@ -83,8 +83,11 @@ class WindowMethod(Method):
 
         Returns
         -------
-        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
+        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)]) or None
+            None if it has not kept them.
         """
+        if "learned_inputs" not in base.arrays:
+            return None
         return base.arrays["learned_inputs"], base.arrays["learned_target"]
 
     def memory(

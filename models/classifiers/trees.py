@@ -203,7 +203,8 @@ def levels(arrays: Mapping[str, Array]) -> int:
 
 
 def _are_in_order(roots: Array, nodes: int) -> bool:
-    return bool(len(roots) and roots[0] == 0 and (np.diff(roots) > 0).all() and roots[-1] < nodes)
+    is_first = len(roots) and roots[0] == 0
+    return bool(is_first and (roots[1:] > roots[:-1]).all() and roots[-1] < nodes)
 
 
 def _stays_in_its_tree(arrays: Mapping[str, Array]) -> bool:

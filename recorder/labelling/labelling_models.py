@@ -89,17 +89,25 @@ class LabellingModels:
     def refusals(self) -> Sequence[str]:
         """Return why models were refused since the last call, and look for others."""
         refusals: list[str] = []
-        for labelling, watch in self._watches.items():
+        for watch in self._watches.values():
             refusals += watch.refusals()
-            if watch.ready is None:
-                continue
-            if reason := clash(watch.ready.model, self._others(labelling)):
-                refusals.append(watch.refuse_ready(reason, self.in_use[labelling].model))
+        while refused := self._refuse_clashes():
+            refusals += refused
         if self._candidates is not None:
             for candidate in self._candidates.news():
                 self._offered = candidate
             refusals += self._candidates.refusals()
         return refusals
+
+    def _refuse_clashes(self) -> list[str]:
+        """Refuse what is ready and shares a class with what would label beside it."""
+        refused = []
+        for labelling, watch in self._watches.items():
+            if watch.ready is None:
+                continue
+            if reason := clash(watch.ready.model, self._others(labelling)):
+                refused.append(watch.refuse_ready(reason, self.in_use[labelling].model))
+        return refused
 
     def may_change(self) -> bool:
         """Tell whether another model is ready to label."""

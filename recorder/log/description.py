@@ -54,7 +54,10 @@ def describe_log(
     """
     beside = beside or {}
     microphone = info.header.frame_id
-    elsewhere = {"output", "model", "scenarios"}  # of this machine
+    models = {"model", "scenarios"}
+    # Paths of this machine.
+    elsewhere: Any = dict.fromkeys(["output", *models], True)
+    elsewhere["microphone"] = {"__all__": models}
     configuration = settings.model_dump_json(indent=2, exclude=elsewhere).encode()
     classes = None if model is None else list(model.classes)
     attachments = [Attachment("configuration.json", "application/json", configuration)]

@@ -101,7 +101,8 @@ class Pipeline:
     @property
     def segments_converged(self) -> bool:
         """Whether sound before the first frame would leave no trace in the segments to come."""
-        return self._live is not None and self._live.segments_converged
+        streams = self._streams.values()
+        return bool(streams) and all(stream.segments_converged for stream in streams)
 
     @property
     def last_labels(self) -> FrameLabels | None:

@@ -23,6 +23,7 @@ _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder: itself a folder of parts
 CATALOG_INDEX = "catalog.index"  # of their spans of time, beside it
 ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
+CUT = "_cut"  # ends the name of one that is a span of a log, without its suffix
 
 
 def check_node_name(name: str) -> str:

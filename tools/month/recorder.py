@@ -118,8 +118,10 @@ def main() -> None:
     month = Month(folder.faults(), state, folder, end, stop)
     sound, rng = Sound(folder.sound), np.random.default_rng(seed)
 
-    def capture(_device: str, *, exact: bool = False) -> FastMicrophone:
-        del exact
+    def capture(
+        _device: str, *, exact: bool = False, channels: int | None = None
+    ) -> FastMicrophone:
+        del exact, channels
         return FastMicrophone(state, sound, month, rng)
 
     setattr(microphone, "CaptureProcess", capture)  # noqa: B010  it is imported there

@@ -145,6 +145,8 @@ class Gathered:
             None: nothing is known of them.
         """
         own = {class_name(name) for name in names}
+        if is_of_scenario(listener):
+            own -= OF_EVERY_SCENARIO
         if own:
             self.classes.setdefault(listener, set()).update(own)
 

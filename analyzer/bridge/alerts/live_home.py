@@ -6,7 +6,11 @@ from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.open_run import Label, OpenRun
 from hearthlog.analyzer.bridge.alerts.rules import LONGEST_PAUSE
-from hearthlog.analyzer.bridge.listeners import listener_of, microphone_of_listener
+from hearthlog.analyzer.bridge.listeners import (
+    is_of_scenario,
+    listener_of,
+    microphone_of_listener,
+)
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
@@ -16,6 +20,7 @@ FIELDS = {
     message_types.GAP: ("header.stamp", "duration"),
     message_types.DIAGNOSTICS: (),
 }
+_GONE = 600_000_000_000  # ns without a label of a scenario, which another configuration has not
 _CUT = 1_000_000_000  # ns of a run that no segment has, where a gap follows
 
 
@@ -101,8 +106,12 @@ class LiveHome:
             In nanoseconds of UTC.
         """
         until = now
-        for open_run in self._runs.values():
+        for listener, open_run in self._runs.items():
             run = open_run.run()
+            if is_of_scenario(listener) and 0 < open_run.last < now - _GONE:
+                self._cut(listener, open_run.last)
+                open_run.begin(open_run.last)
+                continue
             known = open_run.start if run is None else run.end
             is_away = open_run.last < now - self._patience
             until = min(until, max(known, now - self._patience) if is_away else known)

@@ -2,6 +2,7 @@
 
 import hashlib
 import threading
+import warnings
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.network.card import MOST_VALUES, NetworkCard, read_network
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.text import printable
 
@@ -60,8 +62,7 @@ class Network:
             raise self._refused(f"is no network that onnxruntime takes ({error})") from error
         self._input, self._shape = self._only_input()
         self._output = self._chosen_output()
-        self._check_run(runtime.RunOptions())
-        self.of_silence = self.embed(np.zeros(card.window, np.float32))
+        self.of_silence = self._tried(runtime.RunOptions())
 
     def embed(self, window: Float32) -> Float32:
         """Compute the embedding of a window of sound.
@@ -75,8 +76,16 @@ class Network:
         -------
         np.ndarray [shape=(width,)], float32
             In half precision; the mean where the network gives several. What is not finite is 0.
+            That of silence where the network fails, with a `HearthlogWarning`.
         """
-        return _in_half_precision(self._run(window, None))
+        try:
+            values = self._run(window, None)
+            self._check_shape(values)
+        except Exception:  # noqa: BLE001  as above; no sound may end a recording
+            text = "the network fails at some sound, which counts as silence"
+            warnings.warn(HearthlogWarning(text, self._card.path), stacklevel=2)
+            return self.of_silence
+        return _in_half_precision(values)
 
     def _run(self, window: Float32, options: Any) -> Any:
         samples = self._resampled(window).reshape(self._shape)
@@ -129,15 +138,17 @@ class Network:
             raise self._refused(f"gives {_listed(outputs)}; its card must say which as output")
         return wanted
 
-    def _check_run(self, options: Any) -> None:
-        """Try it with silence and with noise, for some seconds at most."""
-        noise = np.random.default_rng(_SOUND_SEED).uniform(-0.1, 0.1, self._card.window)
+    def _tried(self, options: Any) -> Float32:
+        """Try it with noise and with silence, for some seconds at most; embed the silence."""
+        noise = np.random.default_rng(_SOUND_SEED).uniform(-1.0, 1.0, self._card.window)
         watch = threading.Timer(_PATIENCE_SECONDS, lambda: setattr(options, "terminate", True))
         watch.daemon = True
         watch.start()
         try:
-            for window in (np.zeros(self._card.window), noise):
-                self._check_values(self._run(window.astype(np.float32), options))
+            for window in (noise, 0.1 * noise, np.zeros_like(noise)):
+                values = self._run(window.astype(np.float32), options)
+                self._check_shape(values)
+                self._check_finite(values)
         except ModelError:
             raise
         except Exception as error:  # as above
@@ -145,8 +156,9 @@ class Network:
             raise self._refused(late if options.terminate else f"fails ({error})") from error
         finally:
             watch.cancel()
+        return _in_half_precision(values)
 
-    def _check_values(self, values: Any) -> None:
+    def _check_shape(self, values: Any) -> None:
         width, output = len(self._card.names), self._output
         if not isinstance(values, np.ndarray) or values.dtype.kind != "f" or not values.ndim:
             raise self._refused(f"gives no numbers as {output}")
@@ -154,8 +166,10 @@ class Network:
             what = f"gives {output} of shape {list(values.shape)}"
             most = f" (and {MOST_VALUES} are the most)" if values.shape[-1] > MOST_VALUES else ""
             raise self._refused(f"{what}; its card says that it has {width} values{most}")
+
+    def _check_finite(self, values: Float32) -> None:
         if not np.isfinite(values).all():
-            raise self._refused(f"gives values that are not finite as {output}")
+            raise self._refused(f"gives values that are not finite as {self._output}")
 
 
 @lru_cache(maxsize=4)
