@@ -142,11 +142,12 @@ def _configured_features(settings: Settings, models: LabellingModels) -> Feature
     features = _features_of_model(settings, models)
     for labelling, (model, classifier) in models.beside().items():
         if classifier.feature_set != features:
-            raise ConfigurationError(
-                f"{labelling.replace('/', ' ')}: model {model.name} is for feature set "
-                f"{classifier.feature_set.name}, and what is recorded is {features.name}; all "
-                f"models must be for the same one: train this one for {features.name}"
+            reason = (
+                f"model {model.name} is for feature set {classifier.feature_set.name}, and what is "
+                f"recorded is {features.name}; all models must be for the same one: train this one "
+                f"for {features.name}"
             )
+            models.leave_out(labelling, reason)
     return features
 
 

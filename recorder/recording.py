@@ -9,6 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from threading import Event as Flag
 
+from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
@@ -247,7 +248,11 @@ def _record(
     lock: FolderLock | None = None,
 ) -> RecordingSummary:
     with ExitStack() as stack:
-        models = _open_models(settings, list(sources), reload_requests, stack)
+        # Who records for years goes on without a scenario that has become impossible.
+        leaves_out = lock is not None
+        models = _open_models(
+            settings, list(sources), reload_requests, stack, leaves_out=leaves_out
+        )
         session = RecordingSession(settings, sources, models, lock)
         manager = ServiceManager(sources)
         try:
@@ -265,8 +270,13 @@ def _open_models(
     microphones: Sequence[str],
     reload_requests: ReloadRequests | None,
     stack: ExitStack,
+    *,
+    leaves_out: bool = False,
 ) -> dict[str, LabellingModels]:
-    """Load the models of microphones, and watch their files; once for those that have the same."""
+    """Load the models of microphones, and watch their files; once for those that have the same.
+
+    Scenarios that cannot label are left out, or an error.
+    """
     reload_requests = reload_requests or ReloadRequests()
     chosen = {
         each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
@@ -276,26 +286,39 @@ def _open_models(
     for name in microphones:
         same = next((other for other in models if chosen[other] == chosen[name]), None)
         models[name] = (
-            _watched_models(*chosen[name], reload_requests, stack) if same is None else models[same]
+            _watched_models(*chosen[name], reload_requests, stack, leaves_out=leaves_out)
+            if same is None
+            else models[same]
         )
     return models
 
 
 def _watched_models(
-    path: Path, scenarios: Mapping[str, Path], reload_requests: ReloadRequests, stack: ExitStack
+    path: Path,
+    scenarios: Mapping[str, Path],
+    reload_requests: ReloadRequests,
+    stack: ExitStack,
+    *,
+    leaves_out: bool,
 ) -> LabellingModels:
-    watches = {
-        name: stack.enter_context(closing(ModelWatch(file, reload_requests.queue(), name)))
-        for name, file in scenarios.items()
-    }
+    watches = {}
+    left_out: list[str] | None = [] if leaves_out else None
+    for name, file in scenarios.items():
+        try:
+            watch = ModelWatch(file, reload_requests.queue(), name)
+            watches[name] = stack.enter_context(closing(watch))
+        except ModelError as error:
+            if left_out is None:
+                raise
+            left_out.append(str(error))
     if path == NO_MODEL:
-        return LabellingModels(scenarios=watches)
+        return LabellingModels(scenarios=watches, left_out=left_out)
     watch = stack.enter_context(closing(ModelWatch(path, reload_requests.queue())))
     is_file = path.suffix == SUFFIX  # else the name of a starter
     folder = path.parent if is_file else DEFAULT_FOLDER
     candidates = CandidateWatch(folder, watch.first.classifier.feature_set)
     stack.enter_context(closing(candidates))
-    return LabellingModels(watch, candidates, watches)
+    return LabellingModels(watch, candidates, watches, left_out)
 
 
 class RecordingSession:

@@ -271,7 +271,8 @@ def test_groups_of_another_file_are_other_groups(home, hearthlog, tmp_path):
     run(hearthlog, home, "--name", f"{first}=dish")
     count = sum(len(read_marks(log)) for log in logs_of(home))
     other = ["--groups", tmp_path / "other.safetensors", "--least", 10]
-    run(hearthlog, home, *other)
+    hint = run(hearthlog, home, *other).stderr
+    assert f"hearthlog discover {home} --groups {other[1]} --name" in hint
     done = run(hearthlog, home, *other, "--undo", first)
     assert f"group {first}: 0 marks taken back" in done.stderr
     assert sum(len(read_marks(log)) for log in logs_of(home)) == count

@@ -35,10 +35,12 @@ from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
+from hearthlog.recorder import recording
 from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch, ReloadRequests
+from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.recording import RecordingSession, record_files
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -355,6 +357,22 @@ def test_a_class_of_two_scenarios_is_refused_and_both_are_named(tmp_path, sound)
     log = record(sound, tmp_path / "logs", scenarios={"water": BATHROOM, "rain": other})
     labels = [payloads(log, f"/mic/scenario/{name}/label") for name in ("water", "rain")]
     assert len(labels[0]) == len(labels[1]) > 100, "silence, unknown and other may be of both"
+
+
+def test_a_recorder_of_microphones_goes_on_without_a_scenario_that_cannot_label(sound, tmp_path):
+    spoken = keep(tmp_path / "spoken.safetensors", {"tap_water": "speech"})
+    scenarios = {"gone": tmp_path / "gone.safetensors", "old": GOLDEN, "spoken": spoken}
+    asked = Settings(
+        output=tmp_path / "logs", model=GENERAL, scenarios={**scenarios, "water": BATHROOM}
+    )
+    with FolderLock(asked.output, asked.node) as lock:
+        summary = recording._record(asked, {"mic": FileSource([sound], START)}, Flag(), None, lock)
+    assert summary.models_refused == 3
+    (log,) = find_logs(asked.output)
+    assert set(OF_WATER) <= set(channels_of(log))
+    told = [line for line in lines(log) if "left out until the next start" in line]
+    assert len(told) == 3
+    assert all(any(line.startswith(f"scenario {name}: ") for line in told) for name in scenarios)
 
 
 def test_what_goes_on_since_another_was_refused_keeps_its_classes(tmp_path):

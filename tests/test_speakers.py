@@ -11,17 +11,18 @@ import soundfile
 from spoken import ALLISON, START, THEO, two_voices
 from typer.testing import CliRunner
 
-from hearthlog.analyzer.discover.enrolled_voices import is_of_two
+from hearthlog.analyzer.discover.enrolled_voices import check_voices, is_of_two
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks.enrol import enrol_file
+from hearthlog.analyzer.marks.enrol import enrol_file, enrol_log
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.installed import method_named
-from hearthlog.analyzer.training.speakers import others_of, speakers_scenario
+from hearthlog.analyzer.training.speakers import others_of, speaker_recordings, speakers_scenario
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.bench.conversations import converse, record_samples
 from hearthlog.tools.cli.main import make_app
 
@@ -126,6 +127,12 @@ def test_two_voices_are_two_and_one_is_one(clips):
     assert not is_of_two(values(ALLISON), DEFAULT)
 
 
+def test_silence_and_a_few_words_are_of_no_two_voices():
+    silence = DEFAULT.extractor()(np.zeros((100, 800), np.float32))
+    check_voices([recording("anna")._replace(features=silence)], DEFAULT)
+    assert not is_of_two(silence[:0], DEFAULT)
+
+
 def test_somebody_enrolled_once_is_asked_again(enrolled, tmp_path):
     once = shutil.copytree(enrolled, tmp_path / "once")
     latest = sorted(once.rglob("theo_*"))[-2:]
@@ -155,7 +162,36 @@ def test_the_speech_of_others_is_unknown():
     assert list(scenario.classes) == ["silence", "anna", "unknown"]
     assert scenario.find("speech", marked=True) == "unknown"
     assert scenario.find("Cough", marked=True) == "unknown"
+    assert scenario.find("other", marked=True) == "unknown"
     assert scenario.find("silence", marked=True) == "silence"
+
+
+@pytest.mark.parametrize("label", ["speech", "unknown"])
+def test_a_guest_may_be_enrolled_once(enrolled, clips, tmp_path, label):
+    home, path = shutil.copytree(enrolled, tmp_path / "home"), tmp_path / "guest.wav"
+    soundfile.write(path, np.concatenate(clips[ALLISON][2:]), RATE)
+    enrol_file(home, label, path)
+    done = train("--home", home, "-o", tmp_path / "speakers.safetensors")
+    assert done.exit_code == 0, done.exception
+    learned = load_model(tmp_path / "speakers.safetensors").description.training_data
+    assert learned.classes["unknown"].sources == 1
+
+
+def test_what_is_cut_out_of_a_log_within_half_an_hour_is_one_source(clips, tmp_path):
+    samples = np.tile(np.concatenate(clips[THEO]), 10)[: 16 * RATE].astype(np.float32)
+    voices = tmp_path / "voices"
+    for minutes in (0, 20, 40, 80):
+        start = START + minutes * 60 * NANOSECONDS
+        logs = record_samples(samples, tmp_path / str(minutes), start, starter_file(GENERAL))
+        for label, first in (("theo", 0), ("theo", 4), ("ben", 8)):
+            begin = start + first * NANOSECONDS
+            enrol_log(voices, label, logs, begin, begin + 3 * NANOSECONDS)
+    sources = {}
+    for one in speaker_recordings([voices], DEFAULT):
+        sources.setdefault(one.label, []).append(one.group)
+    assert [len(sources["theo"]), len(set(sources["theo"]))] == [8, 2]
+    assert [len(sources["ben"]), len(set(sources["ben"]))] == [4, 2]
+    assert not set(sources["theo"]) & set(sources["ben"])
 
 
 def test_what_the_starter_model_learned_is_silence_or_unknown():

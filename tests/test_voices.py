@@ -3,12 +3,14 @@
 import csv
 import json
 import shutil
+from threading import Event
 
 import pytest
 
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
+import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
@@ -31,11 +33,21 @@ from hearthlog.analyzer.discover.voice_summary import spoken_spans
 from hearthlog.analyzer.discover.voices import Evidence, joined, same_voice, summed, tell_apart
 from hearthlog.analyzer.discover.voices_file import VOICES, load_voices, save_voices
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.export.merge import merge_logs
+from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.training.speakers import speaker_recordings
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.starter import GENERAL, starter_file
+from hearthlog.recorder.config import MicrophoneSettings, Settings
+from hearthlog.recorder.recording import record
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.bench.conversations import converse
 
@@ -162,6 +174,61 @@ def test_a_voice_gets_a_name_is_enrolled_and_loses_the_name_again(home, hearthlo
     undone = as_json(hearthlog, home, "--undo", "1")["voices"]
     assert [each["name"] for each in undone] == ["", ""]
     assert not list(home.rglob("*.review.mcap")), "no mark corrects the labels of the home"
+
+
+def enrolled_logs(folder):
+    return sorted(each for each in folder.rglob("*.mcap") if "review" not in each.name)
+
+
+def test_a_voice_is_enrolled_of_both_days_and_a_second_time_without_a_change(
+    home, hearthlog, tmp_path
+):
+    voices = tmp_path / "voices"
+    options = "--name", "1=anna", "--home", voices
+    first = run(hearthlog, home, *options)
+    logs = enrolled_logs(voices)
+    assert {each.parent.name for each in logs} == {"01", "02"}
+    sources = {each.group for each in speaker_recordings([voices], DEFAULT)}
+    assert len(sources) == 2 < len(logs), "turns of one conversation are one source"
+    logs[0].unlink()
+    again = run(hearthlog, home, *options)
+    assert enrolled_logs(voices) == logs
+    assert again.stderr == first.stderr
+
+
+def test_a_voice_in_a_log_of_two_microphones_is_enrolled(clips, hearthlog, tmp_path):
+    samples, _ = converse(clips, 60.0, 1)
+    sources = []
+    for name in ("bath", "kitchen"):
+        path = tmp_path / f"{name}.flac"
+        soundfile.write(path, samples, 16_000)
+        microphone = MicrophoneSettings(name=name)
+        settings = Settings(
+            output=tmp_path / name, model=starter_file(GENERAL), microphone=[microphone]
+        )
+        record(settings, FileSource([path], START), Event())
+        sources += find_logs(settings.output)
+    both = tmp_path / "logs"
+    both.mkdir()
+    merge_logs(select(sources), both / "both.mcap")
+    done = hearthlog("voices", both, "--name", "1=anna", "--home", tmp_path / "voices")
+    assert done.returncode == 0, done.stderr
+    logs = enrolled_logs(tmp_path / "voices")
+    assert logs
+    assert all(len(find_coverage(each)) == 1 for each in logs)
+
+
+def test_a_voice_that_cannot_be_enrolled_gets_no_name(home, hearthlog, tmp_path):
+    (tmp_path / "file").touch()
+    done = hearthlog("voices", home, "--name", "1=anna", "--home", tmp_path / "file")
+    assert done.returncode == 1
+    assert not (home / VOICES).exists()
+
+
+def test_the_hint_names_the_file_of_voices_that_was_given(home, hearthlog, tmp_path):
+    file = tmp_path / "my voices.safetensors"
+    done = run(hearthlog, home, "--voices", file)
+    assert f"hearthlog voices {home} --voices '{file}' --name 1=anna" in done.stderr
 
 
 def test_who_speaks_when_is_a_table(home, hearthlog, tmp_path):
@@ -340,6 +407,34 @@ def test_another_file_is_no_file_of_voices(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(DataError, match="is no file of voices"):
         load_voices(path)
+
+
+@pytest.mark.parametrize("sums", [np.nan, np.inf, 2e9])
+def test_voices_that_could_not_be_read_are_not_written(tmp_path, sums):
+    evidence = Evidence(np.ones(1), np.full((1, len(SPREAD)), sums))
+    path = tmp_path / VOICES
+    with pytest.raises(DataError, match="not written, for some speech has features that no sound"):
+        save_voices(Voices(np.array([1]), evidence, [""], "0" * 8), path)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("energy", -1.0), ("mfcc_2", 3e38), ("mfcc_2", np.nan), ("energy", np.inf)]
+)
+def test_frames_that_no_sound_can_have_are_of_no_voice(two_days, monkeypatch, name, value):
+    spoilt = DEFAULT.feature_names.index(name)
+    whole = read_speech(find_home_logs([two_days[0]])).seconds
+
+    def read_spoilt(*arguments, **options):
+        columns = read_columns(*arguments, **options)
+        columns["/mic/features"]["values"][:400, spoilt] = value
+        return columns
+
+    monkeypatch.setattr("hearthlog.analyzer.discover.read_speech.read_columns", read_spoilt)
+    speech = read_speech(find_home_logs([two_days[0]]))
+    assert 10 < whole - speech.seconds <= 40, "of twenty seconds in each of two logs"
+    assert np.isfinite(speech.voices.sums).all()
+    assert np.abs(speech.voices.sums).max() < 1e5
 
 
 def test_conversations_have_the_turns_that_they_say(clips):

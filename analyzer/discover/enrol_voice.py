@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from hearthlog.analyzer.discover.read_speech import HomeSpeech
 from hearthlog.analyzer.discover.voice_summary import longest, turn_at
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks.enrol import Enrolled, enrol_log
+from hearthlog.analyzer.marks.enrol import Enrolled, cut_path, enrol_log
+from hearthlog.analyzer.training.speakers import APART
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -15,6 +18,8 @@ _ENOUGH = 60 * NANOSECONDS
 
 def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list[Enrolled]:
     """Enrol the longest turns of a voice, a minute of them, in a training set of voices.
+
+    They are of as many times as there are. What is there already counts.
 
     Parameters
     ----------
@@ -26,6 +31,11 @@ def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list
     rows : np.ndarray [shape=(n,)], int64
         Its turns.
 
+    Returns
+    -------
+    list of Enrolled
+        With those that are there already.
+
     Raises
     ------
     DataError
@@ -33,15 +43,36 @@ def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list
     LogError
         If a log is damaged, or nothing can be written.
     """
-    enrolled: list[Enrolled] = []
+    lengths = (speech.turns.ends - speech.turns.starts)[rows]
+    enrolled: dict[Path, Enrolled] = {}
     left = _ENOUGH
-    for row in longest(speech, rows).tolist():
+    for row in _of_all_times(speech, rows[lengths >= _LEAST]).tolist():
         turn = turn_at(speech, row)
-        if left < _LEAST or turn.end - turn.start < _LEAST:
+        path = cut_path(home, label, turn.start)
+        if path in enrolled:  # another microphone heard it, too
+            continue
+        if left < _LEAST:
             break
         end = min(turn.end, turn.start + left)
-        enrolled.append(enrol_log(home, label, turn.log, turn.start, end))
+        if path.exists():
+            enrolled[path] = Enrolled(path, (end - turn.start) / NANOSECONDS)
+        else:
+            enrolled[path] = enrol_log(home, label, turn.log, turn.start, end, turn.microphone)
         left -= end - turn.start
     if not enrolled:
         raise DataError(f"{label} never speaks for two seconds without a pause; enrol a file")
-    return enrolled
+    return list(enrolled.values())
+
+
+def _of_all_times(speech: HomeSpeech, rows: Int64) -> Int64:
+    """Order turns: the longest of each time, the second longest of each, and so on."""
+    rows = longest(speech, rows)
+    starts = speech.turns.starts[rows]
+    order = np.argsort(starts, kind="stable")
+    time = np.empty(len(rows), np.int64)
+    time[order] = np.cumsum(np.diff(starts[order], prepend=starts[order][:1]) >= APART)
+    by_time = np.argsort(time, kind="stable")
+    first = np.searchsorted(time[by_time], time[by_time])
+    place = np.empty(len(rows), np.int64)
+    place[by_time] = np.arange(len(rows)) - first
+    return rows[np.argsort(place, kind="stable")]

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from hearthlog.analyzer.discover.read_speech import voices_of
-from hearthlog.analyzer.discover.voice_space import has_voices, voice_space
+from hearthlog.analyzer.discover.voice_space import WINDOW_FRAMES, has_voices, voice_space
 from hearthlog.analyzer.discover.voices import same_voice, summed
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Recording
@@ -50,7 +50,9 @@ def check_voices(recordings: Iterable[Recording], features: FeatureSet) -> None:
 
 
 def is_of_two(values: Float32, features: FeatureSet) -> bool:
-    """Tell whether two voices are heard in speech."""
+    """Tell whether two voices are heard in speech; in less than a window there is one."""
+    if len(values) < WINDOW_FRAMES:
+        return False
     of, points = voices_of(values[:_MOST_FRAMES], features.feature_names)
     voices = summed(points, of, int(of.max()) + 1)
     for row in range(1, len(voices.counts)):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.discover.voice_space import (
+    ENERGY,
     WINDOW_FRAMES,
     describe_speech,
     has_voices,
@@ -19,7 +20,7 @@ from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
 from hearthlog.models.classes import SPEECH, class_name
-from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -34,6 +35,7 @@ _PAUSE = 30 * NANOSECONDS  # between conversations
 _MOST_FRAMES = 6_000  # of a conversation: five minutes
 _LEAST_FRAMES = 10
 LEAST_WINDOWS = 10  # of a voice in a conversation: five seconds
+_LARGE = 1e6  # for a feature of sound
 _BREATH = FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2  # within a turn; stamps follow a clock
 
 
@@ -151,10 +153,10 @@ class _Reader:
         stamps, values = features["header.stamp"], features["values"]
         order = np.argsort(stamps, kind="stable")  # a clock may have been set back
         order = order[rows_at(speech, stamps[order]) >= 0]
+        order = order[_can_be(values[order], names)]
         stamps, values = stamps[order], values[order]
-        is_finite = np.isfinite(values).all(axis=1)
-        for rows in _conversations(stamps[is_finite]):
-            self._tell_apart(stamps[is_finite][rows], values[is_finite][rows], names, place)
+        for rows in _conversations(stamps):
+            self._tell_apart(stamps[rows], values[rows], names, place)
 
     def _tell_apart(
         self, stamps: Int64, values: Float32, names: Sequence[str], place: tuple[int, int]
@@ -229,6 +231,13 @@ def speech_voices(
     """
     of, _ = voices_of(values, names)
     return _turns(stamps, _of_frames(of, len(stamps)))
+
+
+def _can_be(values: Float32, names: Sequence[str]) -> Bool:
+    """Tell which frames a sound can have; others, in a damaged log, would be of any voice."""
+    energy = values[:, list(names).index(ENERGY)]
+    possible: Bool = (np.abs(values) <= _LARGE).all(axis=1) & (energy >= 0.0)
+    return possible
 
 
 def _conversations(stamps: Int64) -> Iterator[slice]:

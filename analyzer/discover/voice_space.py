@@ -18,7 +18,7 @@ _NAMES = (
     *("spectral_entropy", "spectral_flux", "spectral_rolloff"),
     *(f"mfcc_{number}" for number in range(2, 14)),  # the first one is the level
 )
-_ENERGY = "energy"
+ENERGY = "energy"
 _LOUD_PERCENTILE = 90
 _LOUD = 10 ** (-20 / 10)  # of the energy at that percentile
 _LEAST_DEVIATION = 0.05
@@ -57,7 +57,7 @@ def voice_space() -> VoiceSpace:
 
 def has_voices(names: Sequence[str]) -> bool:
     """Tell whether features of these names can tell voices apart."""
-    return {_ENERGY, *_NAMES} <= set(names)
+    return {ENERGY, *_NAMES} <= set(names)
 
 
 def window_starts(frames: int) -> Int64:
@@ -84,7 +84,7 @@ def describe_speech(values: Float32, names: Sequence[str]) -> Float64:
     length = min(WINDOW_FRAMES, len(values))
     view = np.lib.stride_tricks.sliding_window_view(values, length, axis=0)
     windows = view[window_starts(len(values))].astype(np.float64)
-    energy = windows[:, list(names).index(_ENERGY)]
+    energy = windows[:, list(names).index(ENERGY)]
     loudest = np.percentile(energy, _LOUD_PERCENTILE, axis=1, keepdims=True)
     weights = (energy >= loudest * _LOUD)[:, np.newaxis]
     weights = weights / weights.sum(axis=2, keepdims=True)

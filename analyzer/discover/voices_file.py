@@ -43,12 +43,19 @@ def save_voices(voices: Voices, path: Path) -> None:
 
     Raises
     ------
+    DataError
+        If it could not be read again, for the features of the voices are too large.
     LogError
         If it cannot be written.
     """
     head = _Head(format=_FORMAT, id=voices.id, names=voices.names)
     arrays = {"numbers": voices.numbers, **voices.evidence._asdict()}
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    if not _fits(head, arrays):
+        raise DataError(
+            f"{path}: not written, for some speech has features that no sound has; leave out logs "
+            "that hearthlog did not record"
+        )
     data = save(arrays, {_KEY: head.model_dump_json()})
     with replaced_file(path) as temporary:
         temporary.write_bytes(data)

@@ -31,7 +31,7 @@ from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, find_logs, is_log, log_path
+from hearthlog.schemas.logs.files import CUT, ENROLLED, SUFFIX, find_logs, is_log, log_path
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.storage.new_files import new_file
@@ -140,7 +140,9 @@ def enrol_microphone(
             timer.cancel()
 
 
-def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enrolled:
+def enrol_log(  # noqa: PLR0913, PLR0917
+    home: Path, label: str, log: Path, start: int, end: int, microphone: str | None = None
+) -> Enrolled:
     """Enrol a span of time of a log, or of a folder of logs: its features, message for message.
 
     Parameters
@@ -152,17 +154,38 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
     log : Path
     start, end : int
         Nanoseconds of UTC: the frames from `start` on, before `end`.
+    microphone : str, optional
+        Which one heard it; the only one of the log by default.
 
     Raises
     ------
     DataError
-        If the label cannot be the name of a class, if the log is of several microphones or has no
-        features with an energy, if there is less than a second of sound, or if the sound is only
-        silence and the label is not.
+        If the label cannot be the name of a class, if the log is of several microphones and none is
+        named, if it has no features with an energy, if there is less than a second of sound, or if
+        the sound is only silence and the label is not.
     LogError
         If there is no such log, if one is damaged, or if nothing can be written.
     """
     _check_label(label)
+    microphone = microphone or _only_microphone(log)
+    selection = select([log], start=start, end=end)
+    stamps, energies = _frames(selection.logs, microphone, start, end)
+    _check_sound(label, energies)
+    path = cut_path(home, label, int(stamps[0]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    topics = {topic(microphone, "features"), topic(microphone, "info")}
+    merge_logs(selection.only(topics), path, latched=True)
+    return _marked(path, microphone, label, stamps)
+
+
+def cut_path(home: Path, label: str, start: int) -> Path:
+    """Name the enrolled span of a log that begins at a time, in nanoseconds of UTC."""
+    path = log_path(home / ENROLLED, label, start)
+    # Not a name as of a recorder's log: this one has not all of its topics.
+    return path.with_stem(f"{path.stem}{CUT}")
+
+
+def _only_microphone(log: Path) -> str:
     coverage = find_coverage(log)
     if len(coverage) > 1:
         names = ", ".join(sorted(coverage))
@@ -171,16 +194,7 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
             "`hearthlog cut --topics '/NAME/*'`"
         )
     (microphone,) = coverage
-    selection = select([log], start=start, end=end)
-    stamps, energies = _frames(selection.logs, microphone, start, end)
-    _check_sound(label, energies)
-    path = log_path(home / ENROLLED, label, int(stamps[0]))
-    # Not a name as of a recorder's log: this one has not all of its topics.
-    path = path.with_stem(f"{path.stem}_cut")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    topics = {topic(microphone, "features"), topic(microphone, "info")}
-    merge_logs(selection.only(topics), path, latched=True)
-    return _marked(path, microphone, label, stamps)
+    return microphone
 
 
 class _First:

@@ -12,19 +12,24 @@ from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.scenario import LABELS, Scenario
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, find_class
+from hearthlog.models.classes import OTHER, SILENCE, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.logs.files import CUT
+from hearthlog.schemas.times import NANOSECONDS
 
 SPEAKERS = "speakers"
+APART = 1800 * NANOSECONDS  # of one time from the next
 _LEAST_SECONDS = 10.0  # of a voice
 _LEAST_TIMES = 2
 
 
 def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterator[Recording]:
     """Read the marks of a training set of voices; each log is a source.
+
+    Enrolled spans of logs are one source where they are less than half an hour apart.
 
     Parameters
     ----------
@@ -41,10 +46,31 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
     LogError, DataError
         As of `hearthlog.analyzer.training.home_data.home_recordings`.
     """
+    cut: list[Recording] = []
     for folder in folders:
         for sound in read_reviewed_sound(folder, features):
-            for one in marked_recordings([teaching(sound)], folder, features, 0.0):
-                yield one._replace(group=f"{HOME} {sound.log.stem}", most=None)
+            taught = sound if sound.enrolled else teaching(sound)
+            for one in marked_recordings([taught], folder, features, 0.0):
+                # A reviewer who says unknown cannot tell, who enrols it says that it is nobody.
+                label = OTHER if class_name(one.label) == UNKNOWN else one.label
+                own = one._replace(label=label, group=f"{HOME} {sound.log.stem}", most=None)
+                if sound.log.stem.endswith(CUT):
+                    cut.append(own)
+                else:
+                    yield own
+    yield from _by_time(cut)
+
+
+def _by_time(recordings: Iterable[Recording]) -> Iterator[Recording]:
+    """Give recordings of one label that are less than half an hour apart the group of the first."""
+    latest: dict[str, tuple[int, str]] = {}  # the end and the group of each label
+    for one in sorted(recordings, key=lambda each: each.span or (0, 0)):
+        start, end = one.span or (0, 0)
+        before, group = latest.get(one.label, (start - APART, ""))
+        if start - before >= APART:
+            group = one.group
+        latest[one.label] = max(before, end), group
+        yield one._replace(group=group)
 
 
 def is_voice(label: str) -> bool:
@@ -83,7 +109,7 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
             raise DataError(
                 f"{name} is enrolled for {seconds[name]:.1f} s: {_LEAST_SECONDS:.0f} s are needed"
             )
-    others = tuple(sorted(LABELS - {SILENCE}))
+    others = tuple(sorted(LABELS - {SILENCE} | {OTHER}))
     names = {name: (name,) for name in sorted(groups)}
     return Scenario(SPEAKERS, {SILENCE: (SILENCE,), **names, UNKNOWN: others})
 

@@ -1,6 +1,7 @@
 """Training: a model is learned from segments, and measured on sources it has not learned from."""
 
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
@@ -78,20 +79,20 @@ def train_model(  # noqa: PLR0913, PLR0917
     smoothing : str
         `hmm` or `merge`, as field `method` of `Smoothing` has it.
     others : (np.ndarray [shape=(k, width)], np.ndarray [shape=(k,)]), optional
-        Inputs of further windows that are always learned from, and their classes, which may have no
-        segments.
+        Inputs of further windows that are always learned from, and their classes, which may have
+        segments of one source group, or none.
 
     Raises
     ------
     DataError
-        If a class comes from fewer than two source groups, if no division into folds leaves every
-        class something to learn from, if all segments are alike, or if the method wants augmented
-        copies and its feature set has none.
+        If a class that the others have not comes from fewer than two source groups, if no division
+        into folds leaves every class something to learn from, if all segments are alike, or if the
+        method wants augmented copies and its feature set has none.
     ModelError
         If the feature set of the method is not installed.
     """
     check_varied(data)
-    sources = group_folds(data if others is None else _with_segments(data))
+    sources = group_folds(data, frozenset() if others is None else frozenset(others[1].tolist()))
     collections = collection_folds(data)
     examples, fits = prepare(method, data), len(sources) + len(collections) + 1
     if others is not None:
@@ -145,12 +146,6 @@ def train_model(  # noqa: PLR0913, PLR0917
     )
 
 
-def _with_segments(data: Dataset) -> Dataset:
-    """Return the data without the classes that have no segments."""
-    numbers, target = np.unique(data.target, return_inverse=True)
-    return replace(data, classes=tuple(data.classes[each] for each in numbers), target=target)
-
-
 def check_varied(data: Dataset) -> None:
     """Check that not all segments are alike.
 
@@ -167,37 +162,40 @@ def check_varied(data: Dataset) -> None:
         raise DataError("all segments are alike: their features never change; is this sound?")
 
 
-def group_folds(data: Dataset) -> list[Fold]:
+def group_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
 
     Parameters
     ----------
     data : Dataset
+    taught : set of int
+        Numbers of classes that are always learned from something else, too.
 
     Returns
     -------
     list of Fold
-        Indices of the segments to learn from, among which every class is, and of those to test on.
+        Indices of the segments to learn from, among which every other class is, and of those to
+        test on.
 
     Raises
     ------
     DataError
-        If a class comes from fewer than two groups, or no division leaves every class something
-        to learn from.
+        If another class comes from fewer than two groups, or no division leaves every such class
+        something to learn from.
     """
     sources = [amount.sources for amount in data.amounts.values()]
-    fewest = int(np.argmin(sources))
+    needed = [number for number in range(len(data.classes)) if number not in taught]
+    fewest = min(needed, key=sources.__getitem__)
     if sources[fewest] < 2:
         raise DataError(
             f"class {data.classes[fewest]} has {sources[fewest]} source group; it needs at least "
             f"2, better {MOST_FOLDS}, to be tested on recordings that were not learned from"
         )
     count = min(MOST_FOLDS, sources[fewest])
-    everything = np.arange(len(data.classes))
     for seed in range(_SHUFFLES):
         divider = StratifiedGroupKFold(count, shuffle=True, random_state=seed)
         folds = list(divider.split(data.target, data.target, data.group))
-        if all(np.array_equal(np.unique(data.target[seen]), everything) for seen, _ in folds):
+        if all(np.isin(needed, data.target[seen]).all() for seen, _ in folds):
             return folds
     raise DataError(
         f"class {data.classes[fewest]} has {sources[fewest]} source groups, shared with other "

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
 from hearthlog.recorder.labelling.clashes import clash
 from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch
@@ -41,6 +42,9 @@ class LabellingModels:
         Gives the models that label on trial beside them.
     scenarios : mapping of str to ModelWatch, optional
         Give the models of scenarios, by the name of the scenario.
+    left_out : list of str, optional
+        Why scenarios cannot label; those are added that cannot beside the others. By default it is
+        an error if there are any.
 
     Attributes
     ----------
@@ -50,7 +54,8 @@ class LabellingModels:
     Raises
     ------
     ConfigurationError
-        If two of them, the one on trial aside, label the same class.
+        If one of a scenario is for another feature set, or two of them, the one on trial aside,
+        label the same class.
     """
 
     def __init__(
@@ -58,6 +63,7 @@ class LabellingModels:
         watch: ModelWatch | None = None,
         candidates: CandidateWatch | None = None,
         scenarios: Mapping[str, ModelWatch] | None = None,
+        left_out: list[str] | None = None,
     ) -> None:
         self._watches = {} if watch is None else {LIVE: watch}
         for name, each in (scenarios or {}).items():
@@ -65,11 +71,12 @@ class LabellingModels:
         self._candidates = candidates
         self._offered = None if candidates is None else candidates.first
         self.in_use: dict[str, Loaded] = {}
-        for labelling, each in self._watches.items():
+        self._left_out = left_out
+        for labelling, each in list(self._watches.items()):
             if reason := clash(each.first.model, self._others(labelling)):
-                where = labelling.replace("/", " ")
-                raise ConfigurationError(f"{where}: model {each.first.model.name} {reason}")
-            self.in_use[labelling] = each.first
+                self.leave_out(labelling, f"model {each.first.model.name} {reason}")
+            else:
+                self.in_use[labelling] = each.first
         self._change_trial()
 
     @property
@@ -86,9 +93,34 @@ class LabellingModels:
         """Return what labels beside that model, by labelling."""
         return {name: loaded for name, loaded in self.in_use.items() if name != LIVE}
 
+    def leave_out(self, labelling: str, reason: str) -> None:
+        """Let a scenario not label, and say why at the next call of `refusals`.
+
+        Parameters
+        ----------
+        labelling : str
+            `scenario/<name>`.
+        reason : str
+
+        Raises
+        ------
+        ConfigurationError
+            If none may be left out.
+        """
+        text = f"{labelling.replace('/', ' ')}: {reason}"
+        if self._left_out is None:
+            raise ConfigurationError(text)
+        self._left_out.append(text)
+        del self._watches[labelling]
+        self.in_use.pop(labelling, None)
+
     def refusals(self) -> Sequence[str]:
         """Return why models were refused since the last call, and look for others."""
-        refusals: list[str] = []
+        refusals = [f"{text}; it is left out until the next start" for text in self._left_out or ()]
+        for text in refusals:
+            say(text)
+        if self._left_out:
+            self._left_out = []
         for watch in self._watches.values():
             refusals += watch.refusals()
         while refused := self._refuse_clashes():

@@ -81,7 +81,7 @@ def discover(
         print_json(summary.model_dump())
     else:
         _print(summary, zone)
-        _tell_next(summary, logs)
+        _tell_next(summary, logs, groups)
     end_with_warnings(losses)
 
 
@@ -232,8 +232,9 @@ def _place(group: "GroupSummary", zone: "tzinfo") -> str:
     return f"{start:%Y-%m-%d %H:%M:%S} {example.microphone}"
 
 
-def _tell_next(summary: "HomeSummary", logs: Sequence[Path]) -> None:
+def _tell_next(summary: "HomeSummary", logs: Sequence[Path], file: Path | None) -> None:
     unnamed = [each.number for each in summary.groups if not each.name]
     if unnamed:
         where = " ".join(quote(str(log)) for log in logs)
+        where += f" --groups {quote(str(file))}" if file else ""
         tell(f"next: name one: hearthlog discover {where} --name {unnamed[0]}=doorbell")

@@ -76,25 +76,25 @@ def voices(
     span = parse_span(start, end)
     found = find_home_logs(logs)
     zone = home_zone(timezone, found.records())
-    file = file or _default_file(logs)
-    with locked_groups(file):
-        known = load_voices(file)
+    path = file or _default_file(logs)
+    with locked_groups(path):
+        known = load_voices(path)
         with share_done("reading what was said") as progress:
             speech = read_speech(found, *span, progress)
         heard, of = find_voices(speech, known)
         _check_numbers(heard, [*(undo or []), *names])
         heard = _named(heard, dict.fromkeys(undo or [], "") | names)
-        save_voices(heard, file)
-    if home is not None:
-        _enrol(home, speech, heard, of, names)
+        if home is not None:
+            _enrol(home, speech, heard, of, names)
+        save_voices(heard, path)
     if output is not None:
         _write_turns(output, speech, heard, of)
     summaries = summarise(speech, heard, of, zone)
     if as_json:
-        print_json(_as_json(summaries, speech, file, zone))
+        print_json(_as_json(summaries, speech, path, zone))
     else:
         _print(summaries, speech, zone)
-        _tell_next(summaries, logs)
+        _tell_next(summaries, logs, file)
     end_with_warnings(speech.losses)
 
 
@@ -203,10 +203,13 @@ def _place(summary: "VoiceSummary", zone: "tzinfo") -> str:
     return f"{local_time(turn.start, zone):%Y-%m-%d %H:%M:%S} {turn.microphone}"
 
 
-def _tell_next(summaries: "Sequence[VoiceSummary]", logs: Sequence[Path]) -> None:
+def _tell_next(
+    summaries: "Sequence[VoiceSummary]", logs: Sequence[Path], file: Path | None
+) -> None:
     unnamed = [each.number for each in summaries if not each.name]
     if unnamed:
         where = " ".join(quote(str(log)) for log in logs)
+        where += f" --voices {quote(str(file))}" if file else ""
         tell(f"next: name one: hearthlog voices {where} --name {unnamed[0]}=anna")
 
 
