@@ -2,66 +2,26 @@
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from operator import attrgetter
-from pathlib import Path
 from threading import Event as Flag
 
-from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import SUFFIX
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
-from hearthlog.recorder.clips.clip_recorder import ClipRecorder
-from hearthlog.recorder.config import NO_MODEL, Settings
-from hearthlog.recorder.disk.keeper import DiskKeeper
-from hearthlog.recorder.events import (
-    WARNING,
-    Event,
-    Frames,
-    Gap,
-    Notice,
-    SoundSource,
-    SourceHealth,
-    event_time,
-)
-from hearthlog.recorder.journal import HealthJournal, say
-from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
-from hearthlog.recorder.labelling.labelling_models import LabellingModels
-from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
-from hearthlog.recorder.log.description import LogDescription, join_descriptions
-from hearthlog.recorder.log.finishing import LogFinisher
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
+from hearthlog.recorder.labelling.model_watch import ReloadRequests
+from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock
-from hearthlog.recorder.log.live_log import LiveLog
-from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
-from hearthlog.recorder.log.rolling_log import RollingLog
-from hearthlog.recorder.machine import MachineWatch
+from hearthlog.recorder.log.recovery import end_of_sound, recover_active
 from hearthlog.recorder.memory import keep_one_heap
-from hearthlog.recorder.microphone_stream import MicrophoneStream
+from hearthlog.recorder.recording_session import NOT_RUNNING, RecordingSession, RecordingSummary
 from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.merged import merged_events
 from hearthlog.recorder.sources.microphone import MicrophoneSource, check_device
-from hearthlog.recorder.stream.diagnostics import diagnostics
-from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.gaps import ON_PURPOSE
-
-_NOT_RUNNING = "the recorder was not running"
-_NOT_LOST = (_NOT_RUNNING, *ON_PURPOSE)  # with these the reasons of a gap begin
-
-
-@dataclass
-class RecordingSummary:
-    """What was recorded."""
-
-    logs: list[Path]  # finished ones
-    recovered: Sequence[Recovered] = ()  # logs of an earlier recorder, completed first
-    frames_lost: int = 0
-    gaps: int = 0  # while it was running
-    models_refused: int = 0  # files that could not be used
 
 
 def record_files(
@@ -170,7 +130,7 @@ def check_recording(settings: Settings) -> None:
     for device in (name for each in settings.microphone for name in (each.device, each.fallback)):
         check_device(device)
     with ExitStack() as stack:
-        models = _open_models(settings, list(sources), None, stack)
+        models = open_models(settings, list(sources), None, stack)
         RecordingSession(settings, sources, models)
     folder = settings.output.absolute()
     there = next(path for path in (folder, *folder.parents) if path.exists())
@@ -196,7 +156,7 @@ class _Resumed:
         self._source = source
         self._end = end
         resting = rest.reason()
-        self._reason = f"{_NOT_RUNNING}; {resting}" if resting else _NOT_RUNNING
+        self._reason = f"{NOT_RUNNING}; {resting}" if resting else NOT_RUNNING
 
     @property
     def device(self) -> str:
@@ -250,9 +210,7 @@ def _record(
     with ExitStack() as stack:
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
-        models = _open_models(
-            settings, list(sources), reload_requests, stack, leaves_out=leaves_out
-        )
+        models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
         session = RecordingSession(settings, sources, models, lock)
         manager = ServiceManager(sources)
         try:
@@ -263,239 +221,3 @@ def _record(
             manager.stop(restarts=reload_requests is not None and reload_requests.restart)
             session.finish()
     return session.summary
-
-
-def _open_models(
-    settings: Settings,
-    microphones: Sequence[str],
-    reload_requests: ReloadRequests | None,
-    stack: ExitStack,
-    *,
-    leaves_out: bool = False,
-) -> dict[str, LabellingModels]:
-    """Load the models of microphones, and watch their files; once for those that have the same.
-
-    Scenarios that cannot label are left out, or an error.
-    """
-    reload_requests = reload_requests or ReloadRequests()
-    chosen = {
-        each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
-        for each in settings.microphone
-    }
-    models: dict[str, LabellingModels] = {}
-    for name in microphones:
-        same = next((other for other in models if chosen[other] == chosen[name]), None)
-        models[name] = (
-            _watched_models(*chosen[name], reload_requests, stack, leaves_out=leaves_out)
-            if same is None
-            else models[same]
-        )
-    return models
-
-
-def _watched_models(
-    path: Path,
-    scenarios: Mapping[str, Path],
-    reload_requests: ReloadRequests,
-    stack: ExitStack,
-    *,
-    leaves_out: bool,
-) -> LabellingModels:
-    watches = {}
-    left_out: list[str] | None = [] if leaves_out else None
-    for name, file in scenarios.items():
-        try:
-            watch = ModelWatch(file, reload_requests.queue(), name)
-            watches[name] = stack.enter_context(closing(watch))
-        except ModelError as error:
-            if left_out is None:
-                raise
-            left_out.append(str(error))
-    if path == NO_MODEL:
-        return LabellingModels(scenarios=watches, left_out=left_out)
-    watch = stack.enter_context(closing(ModelWatch(path, reload_requests.queue())))
-    is_file = path.suffix == SUFFIX  # else the name of a starter
-    folder = path.parent if is_file else DEFAULT_FOLDER
-    candidates = CandidateWatch(folder, watch.first.classifier.feature_set)
-    stack.enter_context(closing(candidates))
-    return LabellingModels(watch, candidates, watches, left_out)
-
-
-class RecordingSession:
-    """The recording of some sources: their log, the clips beside it, and what labels them.
-
-    Parameters
-    ----------
-    settings : Settings
-    sources : mapping of str to SoundSource
-        By the name of the microphone; of audio files no log may be there already.
-    models : mapping of str to LabellingModels
-        By the name of the microphone; several may have the same.
-    lock : FolderLock or None
-        Of the folder of the logs, where microphones are recorded into it.
-
-    Attributes
-    ----------
-    summary : RecordingSummary
-
-    Raises
-    ------
-    ModelError
-        If the configured feature set is not installed.
-    ConfigurationError
-        If the model is for another feature set than the configured one, or sound is to be kept
-        and the model cannot tell what must not be.
-    """
-
-    def __init__(
-        self,
-        settings: Settings,
-        sources: Mapping[str, SoundSource],
-        models: Mapping[str, LabellingModels],
-        lock: FolderLock | None = None,
-    ) -> None:
-        self._settings = settings
-        self._streams = {
-            name: MicrophoneStream(settings, name, source, models[name])
-            for name, source in sources.items()
-        }
-        is_live = not any(isinstance(source, FileSource) for source in sources.values())
-        is_read_ahead = any(
-            isinstance(source, FileSource) and not source.realtime for source in sources.values()
-        )
-        self._finisher = None if is_read_ahead else LogFinisher()
-        log = RollingLog(
-            self._describe(),
-            settings.max_bag_duration,
-            settings.flush_seconds,
-            settings.sync_seconds,
-            live=is_live,
-            file_bytes=settings.max_bag_size,
-            finisher=self._finisher,
-        )
-        self._log = LiveLog(log, settings.output, lock) if is_live else log
-        pipelines = [stream.pipeline for stream in self._streams.values()]
-        self._clips = ClipRecorder(settings, pipelines, self._log.file_at)
-        self._keeper = DiskKeeper(settings.keeping_rules()) if is_live else None
-        self._machine = None if lock is None else MachineWatch(settings.output)
-        self._journal = HealthJournal()
-        self._now = 0  # time of the last event
-        self.summary = RecordingSummary(self._log.finished)
-
-    def add(self, microphone: str, event: Event) -> None:
-        """Record one event of a source.
-
-        Parameters
-        ----------
-        microphone : str
-            Name of the one whose event it is.
-        event : Event
-
-        Raises
-        ------
-        LogError
-            As `RollingLog.write`, if audio files are recorded.
-        """
-        stream = self._streams[microphone]
-        if self._log.is_full:
-            self._log.write([])  # unless the disk takes it now
-        for accepted in stream.accepted(event, log_is_full=self._log.is_full):
-            self._record(stream, accepted)
-        if isinstance(event, SourceHealth):
-            self._journal.add(microphone, stream.pipeline.judged(event))
-            self._look_at_the_machine(stream, event.stamp)
-        for notice in self._log.notices():
-            say(notice.text)
-            self._log.write(stream.pipeline.report("disk", self._now, notice))
-
-    def _record(self, stream: MicrophoneStream, event: Event) -> None:
-        if isinstance(event, Gap) and not event.reason.startswith(_NOT_LOST):
-            self.summary.gaps += 1
-            self.summary.frames_lost += event.frames_lost
-        if isinstance(event, Frames):
-            self._look_for_models(stream, event)
-        if stream.device_changes():
-            self._log.begin_anew(self._describe(), stream.pipeline.flush())
-        notices = self._clips.before(stream.pipeline.microphone, event)
-        self._log.write(stream.pipeline.push(event))
-        labels = stream.pipeline.last_labels
-        notices += self._clips.after(stream.pipeline.microphone, event, labels)
-        self._now = event_time(event)
-        self._log.write(self._clip_messages(stream, notices))
-        self._look_after_the_disk(stream)
-
-    def _look_after_the_disk(self, stream: MicrophoneStream) -> None:
-        if self._keeper is not None:
-            messages, problems = self._keeper.tick(self._now)
-            self._log.write(stream.pipeline.hold(messages))
-            for problem in problems:
-                say(problem)
-
-    def _look_at_the_machine(self, stream: MicrophoneStream, stamp: int) -> None:
-        """Tell how the machine is, as often as the first microphone tells how it is."""
-        if self._machine is None:
-            return
-        if (health := self._machine.tick(stamp)) is not None:
-            self._journal.add("machine", health)
-            message = diagnostics(f"{self._settings.node} machine", health)
-            self._log.write(stream.pipeline.hold([message]))
-
-    def finish(self) -> None:
-        """Complete the log and its clips.
-
-        Raises
-        ------
-        LogError
-            If the log cannot be written; what was written stays, for the next start to complete.
-        """
-        last = [message for each in self._streams.values() for message in each.pipeline.finish()]
-        stream = next(iter(self._streams.values()))
-        notices = self._clips.finish()
-        if self._keeper is not None:
-            self._keeper.close()
-        try:
-            self._log.finish([*last, *self._clip_messages(stream, notices)])
-        finally:
-            if self._finisher is not None:
-                self._finisher.close()
-
-    def _clip_messages(
-        self, stream: MicrophoneStream, notices: Sequence[Notice]
-    ) -> list[EncodedMessage]:
-        return [
-            message
-            for notice in notices
-            for message in stream.pipeline.report("clips", self._now, notice)
-        ]
-
-    def _look_for_models(self, stream: MicrophoneStream, frames: Frames) -> None:
-        """Report models that were refused, and let others label from these frames on."""
-        stamp = int(frames.stamps[0])
-        for reason in stream.models.refusals():
-            self.summary.models_refused += 1
-            self._log.write(stream.pipeline.report("model", stamp, Notice(WARNING, reason)))
-        if stream.models.may_change() and self._log.may_begin(stamp):
-            self._change_models(stream, frames)
-
-    def _change_models(self, stream: MicrophoneStream, frames: Frames) -> None:
-        """Let other models label their microphones, one of them from these frames on.
-
-        Their labels begin a log of their own: the names of the classes belong to the channel, and
-        the model card to the file.
-        """
-        changes = stream.models.change()
-        closing: list[EncodedMessage] = []
-        opening: list[EncodedMessage] = []
-        for each in self._streams.values():
-            if each.models is not stream.models:
-                continue
-            last, first = each.change_models(
-                changes, frames if each is stream else None, int(frames.stamps[0])
-            )
-            closing, opening = [*closing, *last], [*opening, *first]
-        by_time = attrgetter("log_time")
-        self._log.begin_anew(self._describe(), sorted(closing, key=by_time))
-        self._log.write(sorted(opening, key=by_time))
-
-    def _describe(self) -> LogDescription:
-        return join_descriptions([stream.describe() for stream in self._streams.values()])

@@ -29,7 +29,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
-from hearthlog.recorder.recording import RecordingSession
+from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS

@@ -23,7 +23,7 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.log import live_log
 from hearthlog.recorder.log.folder_lock import FolderLock
-from hearthlog.recorder.recording import RecordingSession
+from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import nanoseconds

@@ -32,7 +32,7 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
-from hearthlog.recorder.recording import RecordingSession
+from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns

@@ -42,7 +42,8 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch, ReloadRequests
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.recovery import recover_active
-from hearthlog.recorder.recording import RecordingSession, record_files
+from hearthlog.recorder.recording import record_files
+from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.logs.columns import read_columns

@@ -28,7 +28,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
-from hearthlog.recorder.recording import RecordingSession
+from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import LogError

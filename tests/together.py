@@ -12,7 +12,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import SoundSource, event_time
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
-from hearthlog.recorder.recording import RecordingSession
+from hearthlog.recorder.recording_session import RecordingSession
 
 
 def record_together(

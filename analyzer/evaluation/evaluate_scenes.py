@@ -37,7 +37,7 @@ from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
-from hearthlog.recorder.recording import RecordingSession
+from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
 from hearthlog.schemas.arrays import Float32

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from hearthlog.recorder.config import Settings
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
-    from hearthlog.recorder.recording import RecordingSummary
+    from hearthlog.recorder.recording_session import RecordingSummary
 
 _HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # from others, by `readable_by`
 
