@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 pytest.importorskip("hearthlog.tools.month", reason="the wheel leaves what developers run out")
 
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.bench.classifiers import main as compare_classifiers
+from hearthlog.tools.bench.classifiers import classifiers as compare_classifiers
 from hearthlog.tools.bench.routine import main as judge_routines
 from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.__main__ import home as simulate_home
