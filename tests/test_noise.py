@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.rooms import level_of, steady_noise
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
@@ -17,22 +17,19 @@ from hearthlog.analyzer.training.scores import F1Difference
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench import noise as bench
-from hearthlog.tools.bench.noise import (
+from hearthlog.tools.bench.noise import Outcome, compare, outcomes_of, won_back
+from hearthlog.tools.bench.noise_removers import WINDOW, Remover, SpectralSubtraction, Wiener
+from hearthlog.tools.bench.noise_sounds import (
     CONDITIONS,
     NOISES,
     QUIET,
     Condition,
-    Outcome,
     Sounds,
-    compare,
     in_condition,
     is_steady,
     made_noise,
-    outcomes_of,
     read_sounds,
-    won_back,
 )
-from hearthlog.tools.bench.noise_removers import WINDOW, Remover, SpectralSubtraction, Wiener
 from hearthlog.tools.home.simulate import write_training_set
 
 GAINS = pytest.mark.parametrize("gain", [SpectralSubtraction, Wiener])

@@ -1,116 +1,58 @@
 """`python -m hearthlog.tools.bench.noise CLIPS`: whether removing noise before the features helps.
 
-Clips are laid into noise that began four seconds before them: of a fan and of a refrigerator, which
-are made, and of recordings of no class of the scenario whose level hardly changes (rain, the sea,
-engines). The room's floor is what the recorder's tracker knows when the clip begins. Classifiers
-that were learned from other sources, or other collections, label the clips as they are in the
-noise, and after a remover: learned as always, and learned from sound that the remover went over.
+Clips are laid into noise that began four seconds before them (`noise_sounds`). The room's floor is
+what the recorder's tracker knows when the clip begins. Classifiers that were learned from other
+sources, or other collections, label the clips as they are in the noise, and after a remover:
+learned as always, and learned from sound that the remover went over.
 """
 
 import sys
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import typer
 
-from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_method import Kind, divide
-from hearthlog.analyzer.training.dataset import (
-    Dataset,
-    Recording,
-    clip_frames,
-    cut_recordings,
-)
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
+from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
 from hearthlog.analyzer.training.method import Learned, Method, prepare
-from hearthlog.analyzer.training.rooms import RoomCopy, level_of, other_room, steady_noise
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
+from hearthlog.analyzer.training.rooms import RoomCopy
+from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.training.scores import F1Difference, Scores, difference, score
 from hearthlog.analyzer.training.svm_method import PAPER, ROOM
-from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker, low_power
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.bench.noise_removers import Remover, SpectralSubtraction, Wiener
+from hearthlog.tools.bench.noise_sounds import (
+    CONDITIONS,
+    LEAD_FRAMES,
+    QUIET,
+    RATIOS,
+    SEED,
+    Condition,
+    Sounds,
+    in_condition,
+    in_lesson,
+    read_sounds,
+)
 
 METHODS = {method.name: method for method in (ROOM, PAPER)}
 REMOVERS = {
-    f"{name}, {memory:g} s": Remover(gain, memory)
-    for name, gain, memory in (
-        ("spectral", SpectralSubtraction, 8.0),
-        ("wiener", Wiener, 8.0),
-    )
+    "spectral, 8 s": Remover(SpectralSubtraction, 8.0),
+    "wiener, 8 s": Remover(Wiener, 8.0),
 }
-NOISES = ("fan", "refrigerator", "recorded")
-RATIOS = (20.0, 10.0, 5.0)  # dB
-QUIET, ALL = "quiet room", "all"
-_SEED = 20_261_124
-_LEAD_FRAMES = 80  # 4 s: a section of the tracker of the floor
-_LEAD = _LEAD_FRAMES * FRAME_SAMPLES
-_MOST_CLIPS = 1  # of a source and label
-_MOST_FRAMES = 80  # of a clip
+ALL = "all"  # noises of a level, together
 _MOST_SEGMENTS = 4
 _AT_ONCE = 32  # sounds
-_QUIET_DBFS = -75.0  # noise of a microphone in a quiet room
 _FLOOR_ERROR_DB = 1.5  # as of the copies in other rooms
-_OVERTONES = 8
-_MADE, _MADE_SECONDS = 8, 20
-_NOISE_SECONDS, _NOISE_SPREAD_DB = 4.0, 3.0  # least length, most deviation of the level
 
-
-class Machine(NamedTuple):
-    """Noise of a machine: how its spectrum falls, its tone in hertz, and how loud that is."""
-
-    slope: float
-    hertz: float
-    tone: float
-
-
-_MACHINES = {"fan": Machine(0.75, 92.0, 0.5), "refrigerator": Machine(0.5, 100.0, 2.0)}
-
-
-class Condition(NamedTuple):
-    """Noise, and how far it is below the clip in dB; without a noise a quiet room."""
-
-    noise: str | None
-    ratio: float = np.inf
-
-    @property
-    def name(self) -> str:
-        """In a table."""
-        return QUIET if self.noise is None else f"{self.noise} {self.ratio:g} dB"
-
-
-CONDITIONS = (Condition(None), *(Condition(noise, ratio) for noise in NOISES for ratio in RATIOS))
-
-
-@dataclass(frozen=True)
-class Sounds:
-    """What is laid into noise.
-
-    Attributes
-    ----------
-    clips : sequence of LabelledClip
-    frames : sequence of np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Of each clip.
-    noises : mapping of str to sequence of np.ndarray [shape=(n,)], float32
-        By name, those of `NOISES`.
-    level : float
-        Median level of the clips that are not silence, in dBFS: noise in a clip of silence is as
-        far below it as in any other clip.
-    """
-
-    clips: Sequence[LabelledClip]
-    frames: Sequence[Float32]
-    noises: Mapping[str, Sequence[Float32]]
-    level: float
+Way = int | Condition  # a lesson, of which the first is the clip as it is, or what is tried
 
 
 class Outcome(NamedTuple):
@@ -127,184 +69,6 @@ class Outcome(NamedTuple):
     before: Scores
     after: Scores
     change: F1Difference
-
-
-def read_sounds(manifest: Path, scenario: Scenario) -> Sounds:
-    """Read clips of a scenario, and those of no class in it that are noise.
-
-    Raises
-    ------
-    DataError
-        If the manifest cannot be read, or no recording is long and steady enough to be noise.
-    """
-    listed = read_manifest(manifest, LABELS)
-    clips = _some_of_each_source([clip for clip in listed if scenario.find(clip.label)])
-    frames = [clip_frames(clip)[:_MOST_FRAMES] for clip in clips]
-    others = BUILTIN["bathroom"], BUILTIN["general"]
-    rest = (clip for clip in listed if not any(one.find(clip.label) for one in others))
-    recorded = [sound for clip in rest if is_steady(sound := clip_frames(clip).ravel())]
-    if not recorded:
-        raise DataError(
-            f"{manifest}: no recording of another label than those of the scenarios is longer than "
-            f"{_NOISE_SECONDS:g} s and as steady as noise"
-        )
-    levels = [
-        level_of(one.ravel().astype(np.float64))
-        for clip, one in zip(clips, frames, strict=True)
-        if len(one) and class_name(clip.label) != SILENCE
-    ]
-    rng = np.random.default_rng(_SEED)
-    noises = {name: [made_noise(name, rng) for _ in range(_MADE)] for name in _MACHINES}
-    return Sounds(clips, frames, noises | {"recorded": recorded}, float(np.median(levels)))
-
-
-def _some_of_each_source(clips: Sequence[LabelledClip]) -> list[LabelledClip]:
-    """Choose the first clips of each source and label: so many are enough, and take hours else."""
-    counts: Counter[tuple[str, str]] = Counter()
-    chosen = []
-    for clip in clips:
-        counts[clip.source_group, clip.label] += 1
-        if counts[clip.source_group, clip.label] <= _MOST_CLIPS:
-            chosen.append(clip)
-    return chosen
-
-
-def is_steady(sound: Float32) -> bool:
-    """Tell whether a sound is four seconds of a level that stays within some decibels.
-
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float32
-    """
-    if len(sound) < _NOISE_SECONDS * SAMPLE_RATE:
-        return False
-    count = len(sound) * 5 // (2 * SAMPLE_RATE)  # blocks of 0.4 s
-    blocks = np.square(sound[: count * SAMPLE_RATE * 2 // 5]).reshape(count, -1).mean(axis=1)
-    return bool(np.std(10.0 * np.log10(blocks + 1e-12)) < _NOISE_SPREAD_DB and blocks.min() > 1e-7)
-
-
-def made_noise(name: str, rng: np.random.Generator) -> Float32:
-    """Make the steady noise of a machine: that of its air, and a tone with overtones.
-
-    Parameters
-    ----------
-    name : str
-        `fan` or `refrigerator`.
-    rng : np.random.Generator
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float32
-    """
-    machine = _MACHINES[name]
-    time = np.arange(_MADE_SECONDS * SAMPLE_RATE) / SAMPLE_RATE
-    spectrum = np.fft.rfft(rng.standard_normal(len(time)))
-    frequencies = np.maximum(np.fft.rfftfreq(len(time), 1.0 / SAMPLE_RATE), 20.0)
-    noise = np.fft.irfft(spectrum / frequencies**machine.slope, len(time))
-    noise /= noise.std()
-    for number in range(1, _OVERTONES + 1):
-        phase = 2.0 * np.pi * (machine.hertz * number * time + rng.random())
-        noise += machine.tone / number * np.sin(phase)
-    return noise.astype(np.float32)
-
-
-def noise_of(
-    pieces: Sequence[Float32], count: int, level: float, rng: np.random.Generator
-) -> Float64:
-    """Draw a noise, from any place on and as often as it takes.
-
-    Parameters
-    ----------
-    pieces : sequence of np.ndarray [shape=(n,)], float32
-        One of them is drawn.
-    count : int
-        Number of samples.
-    level : float
-        In dBFS.
-    rng : np.random.Generator
-
-    Returns
-    -------
-    np.ndarray [shape=(count,)], float64
-    """
-    piece = pieces[int(rng.integers(len(pieces)))]
-    noise = np.resize(np.roll(piece, rng.integers(len(piece))), count).astype(np.float64)
-    scaled: Float64 = noise * (10.0 ** (level / 20.0) / np.sqrt(np.mean(np.square(noise))))
-    return scaled
-
-
-def in_condition(sounds: Sounds, number: int, condition: Condition, count: int) -> Float32:
-    """Lay a clip into noise that began before it; what is after the clip is noise.
-
-    Parameters
-    ----------
-    sounds : Sounds
-    number : int
-        Of the clip.
-    condition : Condition
-    count : int
-        Number of samples behind the time before the clip.
-
-    Returns
-    -------
-    np.ndarray [shape=(_LEAD + count,)], float32
-        As a microphone of 16 bits captures it.
-    """
-    place = CONDITIONS.index(condition)
-    rng = np.random.default_rng([_SEED, number, place])
-    clip = sounds.frames[number].ravel().astype(np.float64)
-    silence = class_name(sounds.clips[number].label) == SILENCE
-    noise = rng.standard_normal(_LEAD + count) * 10.0 ** (_QUIET_DBFS / 20.0)
-    if condition.noise is not None:
-        level = (sounds.level if silence else level_of(clip)) - condition.ratio
-        noise += noise_of(sounds.noises[condition.noise], len(noise), level, rng)
-    return captured_in(clip, noise, silence=silence)
-
-
-def in_lesson(sounds: Sounds, number: int, place: int, count: int) -> Float32:
-    """Lay a clip into noise as it is learned from: first as it is, then in other rooms.
-
-    Parameters
-    ----------
-    sounds : Sounds
-    number, place : int
-        Of the clip, and of its copy; the first is the clip as it is.
-    count : int
-        Number of samples behind the time before the clip.
-
-    Returns
-    -------
-    np.ndarray [shape=(_LEAD + count,)], float32
-    """
-    rng = np.random.default_rng([_SEED, number, len(CONDITIONS) + place])
-    frames = sounds.frames[number]
-    silence = class_name(sounds.clips[number].label) == SILENCE
-    clip, level = frames.ravel().astype(np.float64), _QUIET_DBFS
-    if place:
-        clip, level = other_room(frames, rng, silence=silence)
-    return captured_in(clip, steady_noise(_LEAD + count, level, rng), silence=silence)
-
-
-def captured_in(clip: Float64, noise: Float64, *, silence: bool) -> Float32:
-    """Add a clip to noise that began before it.
-
-    Parameters
-    ----------
-    clip : np.ndarray [shape=(m,)], float64
-    noise : np.ndarray [shape=(_LEAD + n,)], float64
-        With n >= m.
-    silence : bool
-        Whether the clip is of nothing but a room: then that is heard before it, too.
-
-    Returns
-    -------
-    np.ndarray [shape=(_LEAD + n,)], float32
-    """
-    sound = noise.copy()
-    sound[_LEAD : _LEAD + len(clip)] += clip
-    if silence:
-        sound[:_LEAD] += np.resize(clip[::-1], _LEAD)[::-1]
-    return (np.clip(np.rint(sound * 32767.0), -32768, 32767) / 32768.0).astype(np.float32)
 
 
 def versions(
@@ -335,43 +99,43 @@ def versions(
     for start in range(0, len(order), _AT_ONCE):
         batch = order[start : start + _AT_ONCE].tolist()
         count = int(lengths[batch].max()) * FRAME_SAMPLES
-        for place in range(lessons + len(CONDITIONS)):
-            lesson = place if place < lessons else None
-            if lesson is None:
-                condition = CONDITIONS[place - lessons]
-                laid = np.stack([in_condition(sounds, n, condition, count) for n in batch])
-            else:
-                laid = np.stack([in_lesson(sounds, n, place, count) for n in batch])
+        for way in (*range(lessons), *CONDITIONS):
+            laid = np.stack([_laid(sounds, number, way, count) for number in batch])
             for name, remover in removers.items():
                 kept = laid if remover is None else remover(laid)
                 for number, sound in zip(batch, kept, strict=True):
-                    copy = _version(sounds, number, sound, features, lesson)
-                    copies[name][number].append(copy)
+                    copies[name][number].append(_version(sounds, number, sound, features, way))
     return copies
 
 
+def _laid(sounds: Sounds, number: int, way: Way, count: int) -> Float32:
+    if isinstance(way, Condition):
+        return in_condition(sounds, number, way, count)
+    return in_lesson(sounds, number, way, count)
+
+
 def _version(
-    sounds: Sounds, number: int, sound: Float32, features: FeatureSet, lesson: int | None
+    sounds: Sounds, number: int, sound: Float32, features: FeatureSet, way: Way
 ) -> RoomCopy:
     """Compute the features of a clip, and the floor of a lesson or the one that was tracked."""
-    length = _LEAD_FRAMES + len(sounds.frames[number])
+    length = LEAD_FRAMES + len(sounds.frames[number])
     values = features.extractor()(sound[: length * FRAME_SAMPLES].reshape(length, FRAME_SAMPLES))
     floor = np.zeros(features.bands)
     if features.band_powers is not None:
-        silence = class_name(sounds.clips[number].label) == SILENCE
-        floor = _floor(features.band_powers(values), number, lesson, silence=silence)
-    return RoomCopy(values[_LEAD_FRAMES:], floor)
+        silence = sounds.is_silence(number)
+        floor = _floor(features.band_powers(values), number, way, silence=silence)
+    return RoomCopy(values[LEAD_FRAMES:], floor)
 
 
-def _floor(powers: Float64, number: int, lesson: int | None, *, silence: bool) -> Float64:
+def _floor(powers: Float64, number: int, way: Way, *, silence: bool) -> Float64:
     """Return the floor of the room as a recorder, or as training knows it."""
-    if lesson is None:
-        return FloorTracker()(powers[:_LEAD_FRAMES], 0).powers[-1]
-    before, clip = powers[_LEAD_FRAMES // 4 : _LEAD_FRAMES], powers[_LEAD_FRAMES:]
-    floor = low_power(clip) if silence else before.mean(axis=0)
-    if lesson == 0:
+    before, clip = powers[:LEAD_FRAMES], powers[LEAD_FRAMES:]
+    if isinstance(way, Condition):
+        return FloorTracker()(before, 0).powers[-1]
+    floor = low_power(clip) if silence else before[LEAD_FRAMES // 4 :].mean(axis=0)
+    if way == 0:
         return floor if silence else np.zeros_like(floor)
-    rng = np.random.default_rng([_SEED, number, lesson])
+    rng = np.random.default_rng([SEED, number, way])
     error: Float64 = 10.0 ** (rng.normal(0.0, _FLOOR_ERROR_DB, len(floor)) / 10.0)
     return floor * error
 
@@ -540,8 +304,8 @@ def won_back(outcomes: Mapping[str, Outcome], name: str) -> float:
     name : str
         Of the condition.
     """
-    clean, noisy = outcomes[QUIET].before.macro_f1, outcomes[name].before.macro_f1
-    return outcomes[name].change.macro_f1 / max(clean - noisy, 1e-9)
+    cost = outcomes[QUIET].before.macro_f1 - outcomes[name].before.macro_f1
+    return outcomes[name].change.macro_f1 / cost if cost > 0.0 else np.nan
 
 
 def lines_of(outcomes: Mapping[str, Outcome]) -> Iterator[str]:
@@ -554,7 +318,8 @@ def lines_of(outcomes: Mapping[str, Outcome]) -> Iterator[str]:
     """
     for name, one in outcomes.items():
         low, high = one.change.interval or (np.nan, np.nan)
-        back = "" if name == QUIET else f"{won_back(outcomes, name):6.0%}"
+        share = won_back(outcomes, name)
+        back = "" if np.isnan(share) else f"{share:6.0%}"
         yield (
             f"  {name:20} {one.before.macro_f1:.3f} {one.after.macro_f1:.3f}  "
             f"{one.change.macro_f1:+.3f} ({low:+.3f} to {high:+.3f}) {back}"
