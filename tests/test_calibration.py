@@ -15,7 +15,7 @@ from hearthlog.analyzer.training.calibration import (
     nested_probabilities,
     unknown_bias,
 )
-from hearthlog.analyzer.training.method import softmax
+from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.scores import calibration_error
 
 pytestmark = pytest.mark.fast

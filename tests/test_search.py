@@ -5,6 +5,7 @@ import json
 import os
 import pty
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ import tasks
 from blobs import blobs
 from clusters import running, scheduler_in, worker_of
 from joblib import delayed
+from spliced import run
 
 from hearthlog.analyzer.errors import DataError, WorkerError
 from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
 from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
 from hearthlog.analyzer.evaluation.grid_search import search
-from hearthlog.analyzer.training.method import cross_validate, prepare
+from hearthlog.analyzer.training.cross_validation import cross_validate
+from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.workers.parallel import fits_on, in_parallel
@@ -25,6 +28,12 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli import progress
 from hearthlog.tools.home.simulate import write_training_set
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from hearthlog.analyzer.training.scores import (
     difference,
     score,
 )
+from hearthlog.analyzer.training.sightings import evidence_of
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.window_inputs import of_segments
@@ -100,8 +102,9 @@ def compare_models(
     learned = np.isin(data.group, np.concatenate(sources))
     kept = np.ones(len(data), bool) if learned.all() else ~learned
     target, group = data.target[kept], data.group[kept]
+    sightings = list(compress(data.sightings, kept))
     probabilities = [
-        _probabilities(one, i[kept], data.classes)
+        _probabilities(one, i[kept], evidence_of(one, sightings), data.classes)
         for one, i in zip((first, second), inputs, strict=True)
     ]
     judged = [
@@ -144,6 +147,8 @@ def check_features(a: Model, b: Model) -> None:
         )
 
 
-def _probabilities(classifier: Classifier, inputs: Float32, classes: Sequence[str]) -> Float64:
+def _probabilities(
+    classifier: Classifier, inputs: Float32, evidence: Float64 | None, classes: Sequence[str]
+) -> Float64:
     order = [classifier.classes.index(name) for name in classes]
-    return segment_probabilities(classifier, inputs)[:, order]
+    return segment_probabilities(classifier, inputs, evidence)[:, order]

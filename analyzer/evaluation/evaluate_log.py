@@ -30,7 +30,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import REVIEW, microphone_of
+from hearthlog.schemas.messages.topics import REVIEW, microphone_of, parse_topic, scenario_name
 from hearthlog.schemas.times import NANOSECONDS
 
 _BLOCK = 300 * NANOSECONDS
@@ -180,6 +180,12 @@ class TopicLabelling:
         """Name of the microphone."""
         return microphone_of(self.topic)
 
+    @property
+    def scenario(self) -> str:
+        """Name of the scenario; empty for the sounds of the home."""
+        parts = parse_topic(self.topic)
+        return "" if parts is None else scenario_name(parts.labelling)
+
 
 def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     """Read the segments of a log, or of a folder of logs, and of their layers.
@@ -230,7 +236,7 @@ def _segment_topic(selection: Selection, asked: str | None) -> str:
     return topic
 
 
-def read_reference(source: str, path: Path, microphone: str) -> Labelling:
+def read_reference(source: str, path: Path, microphone: str, scenario: str = "") -> Labelling:
     """Read what a log is to be compared with.
 
     Parameters
@@ -241,6 +247,8 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
         The log, or folder of logs.
     microphone : str
         Labels of other microphones are left out.
+    scenario : str, optional
+        Whose marks in the review layers are meant; empty for those of the sounds of the home.
 
     Returns
     -------
@@ -256,7 +264,7 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
         If there is no log, or a log or a layer is damaged.
     """
     if source == REVIEW:
-        marks = [mark for log in find_logs(path) for mark in read_marks(log)]
+        marks = [mark for log in find_logs(path) for mark in read_marks(log, scenario)]
         where = f"{path}: nothing of {microphone} is reviewed; `hearthlog annotate import` does it"
     else:
         marks = [mark for _, mark in read_lines(Path(source), find_coverage(path), microphone)]

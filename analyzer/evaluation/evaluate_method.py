@@ -7,13 +7,9 @@ from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import nested_probabilities
+from hearthlog.analyzer.training.cross_validation import Fold, cross_validate
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.method import (
-    Fold,
-    Method,
-    cross_validate,
-    prepare,
-)
+from hearthlog.analyzer.training.method import Method, prepare
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
 from hearthlog.schemas.progress import Progress

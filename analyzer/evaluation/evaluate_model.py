@@ -7,10 +7,10 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
+from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip
-from hearthlog.analyzer.training.method import softmax
 from hearthlog.analyzer.training.rooms import captured, steady_noise
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
@@ -135,7 +135,9 @@ def check_classes(model: Model, scenario: Scenario) -> None:
         )
 
 
-def segment_probabilities(classifier: Classifier, inputs: Float32) -> Float64:
+def segment_probabilities(
+    classifier: Classifier, inputs: Float32, evidence: Float64 | None = None
+) -> Float64:
     """Compute the probability of each class in each segment, by all windows in it.
 
     Parameters
@@ -143,13 +145,17 @@ def segment_probabilities(classifier: Classifier, inputs: Float32) -> Float64:
     classifier : Classifier
     inputs : np.ndarray [shape=(n, places, width)], float32
         As of `of_segments`.
+    evidence : np.ndarray [shape=(n, C)], float64, optional
+        As of `Classifier.classify`.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
         Geometric means over the windows, which sum to 1.
     """
-    rows = classifier.probabilities(inputs.reshape(-1, inputs.shape[-1]))
+    if evidence is not None:
+        evidence = evidence.repeat(inputs.shape[1], axis=0)
+    rows, _ = classifier.classify(inputs.reshape(-1, inputs.shape[-1]), evidence)
     logarithms = np.log(np.maximum(rows, _LEAST, dtype=np.float64))
     return softmax(logarithms.reshape(*inputs.shape[:2], -1).mean(axis=1))
 

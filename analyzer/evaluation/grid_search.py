@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 from hearthlog.analyzer.evaluation.evaluate_method import Kind, divide
+from hearthlog.analyzer.training.cross_validation import cross_validate
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.method import Method, cross_validate, prepare
+from hearthlog.analyzer.training.method import Method, prepare
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.analyzer.training.train import check_varied
 from hearthlog.schemas.progress import Progress

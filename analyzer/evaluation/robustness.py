@@ -10,12 +10,8 @@ from joblib import delayed
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_model import fitted, segment_probabilities
-from hearthlog.analyzer.training.dataset import (
-    Recording,
-    clip_frames,
-    clip_recordings,
-    cut_recordings,
-)
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.rooms import (

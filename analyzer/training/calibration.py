@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from hearthlog.analyzer.training.cross_validation import Fold, softmax
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.method import Fold, softmax
 from hearthlog.analyzer.training.scores import calibration_error, score
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.description import Elsewhere

@@ -9,12 +9,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.neural_network import MLPClassifier
 from sklearn.preprocessing import StandardScaler
 
-from hearthlog.analyzer.training.window_method import (
-    WindowMethod,
-    as_room,
-    balanced,
-    kept_windows,
-)
+from hearthlog.analyzer.training.learned_inputs import balanced, fitted_scaler, scaler_arrays
+from hearthlog.analyzer.training.window_method import WindowMethod, as_room, kept_windows
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.layers import LAYERS, LayersMachine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
@@ -39,7 +35,7 @@ class LogisticMethod(WindowMethod):
         self, inputs: Float32, target: Indices, weight: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
         """Learn from windows, as of `WindowMethod.learn`."""
-        scaler = StandardScaler().fit(inputs.astype(np.float64))
+        scaler = fitted_scaler(inputs)
         regression = LogisticRegression(C=self.cost / len(target), max_iter=self.iterations).fit(
             scaler.transform(inputs.astype(np.float64)), target, balanced(target, weight)
         )
@@ -71,7 +67,7 @@ class PerceptronMethod(WindowMethod):
         self, inputs: Float32, target: Indices, weight: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
         """Learn from windows, as of `WindowMethod.learn`."""
-        scaler = StandardScaler().fit(inputs.astype(np.float64))
+        scaler = fitted_scaler(inputs)
         network = MLPClassifier(
             (self.units,),
             alpha=self.decay,
@@ -99,12 +95,7 @@ def layer_arrays(
     *hidden, output = zip(weights, biases, strict=True)
     if output[0].shape[1] == 1:  # one value tells two classes
         output = tuple(values * np.array([0.0, 1.0]) for values in output)
-    arrays = {
-        "scaler_mean": scaler.mean_,
-        "scaler_scale": scaler.scale_,
-        "output_weights": output[0],
-        "output_bias": output[1],
-    }
+    arrays = scaler_arrays(scaler) | {"output_weights": output[0], "output_bias": output[1]}
     for one in hidden:
         arrays["hidden_weights"], arrays["hidden_bias"] = one
     return arrays

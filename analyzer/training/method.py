@@ -1,19 +1,16 @@
-"""Methods: how a classifier is learned from segments, and tested on segments it has not seen."""
+"""Methods: how a classifier is learned from segments."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
-from joblib import delayed
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.rooms import empty_room
-from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
@@ -21,15 +18,12 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.features.window_inputs import Inputs, of_segments, window_places
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
-from hearthlog.schemas.progress import Progress
 
 _SEED = 20_261_121
 _BELOW_SEGMENT = 10 ** (-6 / 10)  # 6 dB
 _ABOVE_FLOOR = 2.0
 _EMPTY_ROOMS = 60
 _PLACES = (10, 50)  # frames at which windows of an empty room begin
-
-Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
 
 
 class Examples(NamedTuple):
@@ -361,66 +355,3 @@ def _empty_rooms(features: FeatureSet, inputs: Inputs, rng: np.random.Generator)
         [room.features[place : place + frames] for place in _PLACES for room in rooms]
     )
     return inputs.of_windows(windows, np.stack([room.floor for room in rooms * len(_PLACES)]))
-
-
-def cross_validate(
-    methods: Sequence[Method],
-    examples: Examples,
-    classes: int,
-    folds: Iterable[Fold],
-    progress: Progress,
-) -> Float64:
-    """Classify segments by classifiers that have not seen them.
-
-    Parameters
-    ----------
-    methods : sequence of Method
-        All with the inputs and the number of copies that the examples have.
-    examples : Examples
-    classes : int
-        C, the number of classes.
-    folds : iterable of Fold
-        Indices of the segments to learn from, and of those to test on.
-    progress : callable
-        Is told the share of the fits that is done, 0 to 1.
-
-    Returns
-    -------
-    np.ndarray [shape=(len(methods), n, C)], float64
-        Decision values; -inf for a class that was not learned, NaN for segments that no fold tests.
-    """
-    folds = list(folds)
-    decisions = np.full((len(methods), len(examples.target), classes), np.nan)
-    tasks = list(product(range(len(methods)), folds))
-    calls = (
-        delayed(_decide_unseen)(methods[number], classes, fold, *examples) for number, fold in tasks
-    )
-    for done, decided in enumerate(in_parallel(calls)):
-        number, (_, unseen) = tasks[done]
-        decisions[number, unseen] = decided
-        progress((done + 1) / len(tasks))
-    return decisions
-
-
-def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Float64:
-    """Classify the test segments of a fold; joblib sends each array, an argument, once."""
-    examples, (seen, unseen) = Examples(*arrays), fold
-    learned = method.fit(examples, seen)
-    return examples.decide(learned, unseen, classes)
-
-
-def softmax(values: Float64) -> Float64:
-    """Turn decision values into probabilities.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n, C)], float64
-        Decision values; -inf is allowed, but not for a whole row.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        Every row sums up to 1; 0 where the decision value is -inf.
-    """
-    grown = np.exp(values - values.max(axis=1, keepdims=True))
-    return grown / grown.sum(axis=1, keepdims=True)

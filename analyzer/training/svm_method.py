@@ -8,22 +8,26 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.learned_inputs import (
+    class_costs,
+    fitted_scaler,
+    in_whole_steps,
+    rounded,
+    scaler_arrays,
+    spread_over_classes,
+)
 from hearthlog.analyzer.training.method import Examples, Learned, Method
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.rbf_distances import in_steps
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
 from hearthlog.models.features.network import INPUTS
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 
-_SEED = 20_261_122
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)
-_ROUNDING = 0.01  # of the standard deviation
 
 
 class Scaling(NamedTuple):
@@ -109,15 +113,14 @@ class SvmMethod(Method):
         return LearnedSvm(learned, inputs[support], remembered, self.steps)
 
     def _scaler(self, inputs: Float32) -> Pipeline:
-        scaler = StandardScaler().fit(inputs.astype(np.float64))
+        scaler = fitted_scaler(inputs)
         if self.scaling is not None:
             scaler.mean_, scaler.scale_ = self.scaling.mean, self.scaling.scale
         return in_whole_steps(scaler, self.steps)
 
     def _costs(self, target: Indices, remembered: Bool) -> Float64:
         """Weigh windows against the number of their class, an earlier machine's as it did."""
-        counts = np.bincount(target)
-        balanced = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
+        balanced = class_costs(target)
         if self.scaling is None:
             return balanced[target]
         kept = balanced.copy()
@@ -256,68 +259,6 @@ class SvmMethod(Method):
         )
 
 
-def spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
-    """Choose windows at random, those of most weight first, but fewer of the large classes.
-
-    Parameters
-    ----------
-    target : np.ndarray [shape=(n,)], intp
-        Their classes.
-    weight : np.ndarray [shape=(n,)], float64
-    most : int
-        How many.
-
-    Returns
-    -------
-    np.ndarray [shape=(most,)], intp
-        Their places.
-    """
-    shuffled = np.random.default_rng(_SEED).permutation(len(target))
-    shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
-    order = np.argsort(target[shuffled], kind="stable")
-    counts = np.bincount(target)
-    rank = np.empty(len(target), np.intp)
-    rank[order] = np.concatenate([np.arange(count) for count in counts])
-    return shuffled[np.sort(np.argsort(rank, kind="stable")[:most])]
-
-
-def in_whole_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
-    """Return a scaler that rounds as the machine does of which it is a part.
-
-    Parameters
-    ----------
-    scaler : StandardScaler
-    steps : int or None
-        Of a standard deviation; None: nothing is rounded.
-    """
-    if steps is None:
-        return make_pipeline(scaler)
-    rounding = FunctionTransformer(_rounded_to_steps, kw_args={"steps": steps})
-    return make_pipeline(scaler, rounding)
-
-
-def _rounded_to_steps(scaled: Float64, steps: int) -> Float64:
-    return in_steps(scaled, steps) / steps
-
-
-def rounded(inputs: Float32) -> Float32:
-    """Round inputs to half precision, so that a model file takes half the room.
-
-    Parameters
-    ----------
-    inputs : np.ndarray [shape=(n, width)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, width)], float32
-        As they are, if the error would be more than a hundredth of the spread of an input.
-    """
-    with np.errstate(over="ignore"):
-        half = inputs.astype(np.float16).astype(np.float32)
-    spread, error = inputs.std(axis=0), np.abs(half - inputs).max(axis=0)
-    return half if ((error <= _ROUNDING * spread) | (spread == 0.0)).all() else inputs
-
-
 class LearnedSvm:
     """A fitted machine.
 
@@ -368,8 +309,7 @@ class LearnedSvm:
         # scikit-learn inverts the sign if there are two classes only; the file does not.
         sign = -1.0 if len(svc.classes_) == 2 else 1.0
         return {
-            "scaler_mean": scaler.mean_,
-            "scaler_scale": scaler.scale_,
+            **scaler_arrays(scaler),
             "support_vectors": self._support,
             "support_counts": svc.n_support_.astype(np.int64),
             "dual_coefficients": sign * svc.dual_coef_,

@@ -12,12 +12,8 @@ from sklearn.ensemble import (
     RandomForestClassifier,
 )
 
-from hearthlog.analyzer.training.window_method import (
-    WindowMethod,
-    as_room,
-    balanced,
-    kept_windows,
-)
+from hearthlog.analyzer.training.learned_inputs import balanced
+from hearthlog.analyzer.training.window_method import WindowMethod, as_room, kept_windows
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.trees import TREES, TreesMachine
 from hearthlog.schemas.arrays import Float32, Float64, Indices

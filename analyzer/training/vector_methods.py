@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.preprocessing import StandardScaler
 from sklearn.svm import OneClassSVM
 
-from hearthlog.analyzer.training.svm_method import in_whole_steps
+from hearthlog.analyzer.training.learned_inputs import (
+    fitted_scaler,
+    in_whole_steps,
+    scaler_arrays,
+)
 from hearthlog.analyzer.training.window_method import WindowMethod, as_room, kept_windows
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.model import Model
@@ -45,11 +48,10 @@ class NeighboursMethod(WindowMethod):
         """Learn from windows, as of `WindowMethod.learn`."""
         times = np.maximum(np.rint(weight), 1).astype(np.intp)
         inputs, target = np.repeat(inputs, times, axis=0), np.repeat(target, times)
-        scaler = StandardScaler().fit(inputs.astype(np.float64))
+        scaler = fitted_scaler(inputs)
         parameters = NeighboursParameters(neighbours=self.neighbours, steps=self.steps)
         arrays = {
-            "scaler_mean": scaler.mean_,
-            "scaler_scale": scaler.scale_,
+            **scaler_arrays(scaler),
             "vectors": inputs,
             "vectors_target": target.astype(np.int64),
         }
@@ -57,16 +59,7 @@ class NeighboursMethod(WindowMethod):
         return machine, arrays, parameters.model_dump()
 
     def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
-        """Return the windows that a model was learned from, before it was ever adapted.
-
-        Parameters
-        ----------
-        base : Model
-
-        Returns
-        -------
-        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
-        """
+        """Return the windows that vote, as of `WindowMethod.remembered`."""
         if "learned_inputs" in base.arrays:
             return super().remembered(base)
         return base.arrays["vectors"], base.arrays["vectors_target"]
@@ -94,7 +87,7 @@ class OneClassMethod(WindowMethod):
         self, inputs: Float32, target: Indices, weight: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
         """Learn from windows, as of `WindowMethod.learn`."""
-        scaler = StandardScaler().fit(inputs.astype(np.float64))
+        scaler = fitted_scaler(inputs)
         scaled = in_whole_steps(scaler, self.steps).transform(inputs.astype(np.float64))
         gamma = self.gamma / inputs.shape[1]
         places, coefficients, offsets = [], [], []
@@ -109,8 +102,7 @@ class OneClassMethod(WindowMethod):
         support = np.concatenate(places)
         parameters = OneClassParameters(gamma=gamma, steps=self.steps)
         arrays = {
-            "scaler_mean": scaler.mean_,
-            "scaler_scale": scaler.scale_,
+            **scaler_arrays(scaler),
             "support_vectors": inputs[support],
             "support_target": target[support].astype(np.int64),
             "coefficients": np.concatenate(coefficients),

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.training.learned_inputs import rounded, spread_over_classes
 from hearthlog.analyzer.training.method import Examples, Learned, Method
-from hearthlog.analyzer.training.svm_method import ROOM, rounded, spread_over_classes
+from hearthlog.analyzer.training.svm_method import ROOM
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64, Indices
@@ -75,17 +76,7 @@ class WindowMethod(Method):
         """
 
     def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
-        """Return the windows that a model was learned from, before it was ever adapted.
-
-        Parameters
-        ----------
-        base : Model
-
-        Returns
-        -------
-        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)]) or None
-            None if it has not kept them.
-        """
+        """Return the windows of a model before it was ever adapted, as of `Method.remembered`."""
         if "learned_inputs" not in base.arrays:
             return None
         return base.arrays["learned_inputs"], base.arrays["learned_target"]
@@ -93,18 +84,7 @@ class WindowMethod(Method):
     def memory(
         self, remembered: tuple[Float32, Indices], learned: Learned
     ) -> dict[str, NDArray[Any]]:
-        """Return arrays by which a model that was learned from `remembered` gives it again.
-
-        Parameters
-        ----------
-        remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
-        learned : Learned
-
-        Returns
-        -------
-        dict of str to np.ndarray
-            By name of the array.
-        """
+        """Return the windows themselves, as of `Method.memory`."""
         del learned
         return kept_windows(*remembered)
 
@@ -119,25 +99,6 @@ def kept_windows(inputs: Float32, target: Indices) -> dict[str, NDArray[Any]]:
         Numbers of their classes.
     """
     return {"learned_inputs": inputs, "learned_target": target.astype(np.int64)}
-
-
-def balanced(target: Indices, weight: Float64) -> Float64:
-    """Weigh windows against the number of their class, as scikit-learn's `balanced`.
-
-    Parameters
-    ----------
-    target : np.ndarray [shape=(n,)], intp
-        Numbers of their classes.
-    weight : np.ndarray [shape=(n,)], float64
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-    """
-    counts = np.bincount(target)
-    share = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
-    weighted: Float64 = weight * share[target]
-    return weighted
 
 
 def as_room(kind: ClassifierKind) -> dict[str, Any]:
@@ -187,19 +148,7 @@ class LearnedMachine:
         self._parameters = parameters
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Return decision values.
-
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-        classes : int
-            C, the number of all classes.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, C)], float64
-            -inf for a class that was not learned.
-        """
+        """Return decision values, as of `Learned.decide`."""
         decision = np.full((len(inputs), classes), -np.inf)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.schemas.arrays import Float32, Float64
@@ -33,6 +33,12 @@ class Machine(Protocol):
         novelty : np.ndarray [shape=(n,)], float64
             From 0 to 1, where 1 is unlike anything learned; NaN if there is none.
         """
+
+
+class NoParameters(BaseModel):
+    """Parameters of a kind that has none: all is in its arrays."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
 class ClassifierKind(ABC):

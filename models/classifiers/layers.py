@@ -5,23 +5,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind, NoParameters
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.scaler import Scaler, scaler_problem
+from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
 MOST_UNITS = 1024
 _WEIGHTS_AT_ONCE = 4096  # a product this small no BLAS divides among threads
-
-
-class LayersParameters(BaseModel):
-    """Parameters of layers: none, all is in their arrays."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
 class LayersKind(ClassifierKind):
@@ -40,10 +33,9 @@ class LayersKind(ClassifierKind):
     """
 
     name = "layers"
-    parameters = LayersParameters
+    parameters = NoParameters
     arrays: Mapping[str, np.dtype[Any]] = {
-        "scaler_mean": np.dtype(np.float64),
-        "scaler_scale": np.dtype(np.float64),
+        **SCALER,
         "output_weights": np.dtype(np.float64),
         "output_bias": np.dtype(np.float64),
     }
@@ -56,23 +48,9 @@ class LayersKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that the arrays of a model must have.
-
-        Parameters
-        ----------
-        classes, width : int
-            Number of classes, and of inputs.
-        arrays : mapping of str to np.ndarray
-            Those of the model, by name; they may be of any type and shape.
-
-        Returns
-        -------
-        dict of str to tuple of int
-            By name of the array; hidden units and learned windows only if there are any.
-        """
+        """Return shapes, as of `ClassifierKind.shapes`."""
         shapes: dict[str, tuple[int, ...]] = {
-            "scaler_mean": (width,),
-            "scaler_scale": (width,),
+            **scaler_shapes(width),
             "output_weights": (width, classes),
             "output_bias": (classes,),
         }
@@ -83,23 +61,10 @@ class LayersKind(ClassifierKind):
         return shapes | learned_shapes(width, arrays)
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays of a model; None if nothing is.
-
-        Parameters
-        ----------
-        classes : int
-            Number of classes.
-        arrays : mapping of str to np.ndarray
-            By name; of the right types and shapes, and finite.
-
-        Returns
-        -------
-        str or None
-            The rest of a sentence that begins with the file.
-        """
+        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
         if not 1 <= len(arrays.get("hidden_bias", arrays["output_bias"])) <= MOST_UNITS:
             return f"hidden_bias has no unit, or more than {MOST_UNITS}"
-        return scaler_problem(arrays) or target_problem("learned_target", classes, arrays)
+        return scaler_problem(arrays) or target_problem(classes, arrays, "learned_target")
 
     def machine(self, model: Model) -> "LayersMachine":
         """Prepare a model for inference."""
@@ -132,19 +97,7 @@ class LayersMachine:
             self._hidden = _Layer(arrays["hidden_weights"], arrays["hidden_bias"])
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decision values of windows.
-
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C)], float64
-        novelty : np.ndarray [shape=(n,)], float64
-            NaN.
-        """
+        """Return the values of the last layer, and NaN as novelty."""
         values = self._scaled(inputs)
         if self._hidden is not None:
             values = np.maximum(self._hidden(values), 0.0)

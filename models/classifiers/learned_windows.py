@@ -29,23 +29,25 @@ def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[i
     return {"learned_inputs": (len(inputs), width), "learned_target": (len(inputs),)}
 
 
-def target_problem(name: str, classes: int, arrays: Mapping[str, Array]) -> str | None:
-    """Return what is wrong with an array of classes; None if nothing is, or it is absent.
+def target_problem(classes: int, arrays: Mapping[str, Array], *names: str) -> str | None:
+    """Return what is wrong with arrays of classes; None if nothing is, or they are absent.
 
     Parameters
     ----------
-    name : str
     classes : int
         Number of classes.
     arrays : mapping of str to np.ndarray
         By name; of the right types and shapes, and finite.
+    *names : str
+        Of those that hold numbers of classes.
 
     Returns
     -------
     str or None
         The rest of a sentence that begins with the file.
     """
-    target = arrays.get(name, np.empty(0, np.int64))
-    if ((target < 0) | (target >= classes)).any():
-        return f"{name} has classes that the model has not"
+    for name in names:
+        target = arrays.get(name, np.empty(0, np.int64))
+        if ((target < 0) | (target >= classes)).any():
+            return f"{name} has classes that the model has not"
     return None

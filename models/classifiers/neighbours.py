@@ -10,7 +10,7 @@ from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import RoundedDistances
-from hearthlog.models.classifiers.scaler import Scaler, scaler_problem
+from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.models.classifiers.shares import log_shares
 from hearthlog.schemas.arrays import Float32, Float64
 
@@ -52,8 +52,7 @@ class NeighboursKind(ClassifierKind):
     name = "neighbours"
     parameters = NeighboursParameters
     arrays: Mapping[str, np.dtype[Any]] = {
-        "scaler_mean": np.dtype(np.float64),
-        "scaler_scale": np.dtype(np.float64),
+        **SCALER,
         "vectors": np.dtype(np.float32),
         "vectors_target": np.dtype(np.int64),
     }
@@ -62,51 +61,22 @@ class NeighboursKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that the arrays of a model must have.
-
-        Parameters
-        ----------
-        classes, width : int
-            Number of classes, and of inputs.
-        arrays : mapping of str to np.ndarray
-            Those of the model, by name; they may be of any type and shape.
-
-        Returns
-        -------
-        dict of str to tuple of int
-            By name of the array; learned windows only if there are any.
-        """
+        """Return shapes, as of `ClassifierKind.shapes`."""
         del classes
         count = arrays["vectors_target"].size
         shapes: dict[str, tuple[int, ...]] = {
-            "scaler_mean": (width,),
-            "scaler_scale": (width,),
+            **scaler_shapes(width),
             "vectors": (count, width),
             "vectors_target": (count,),
         }
         return shapes | learned_shapes(width, arrays)
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays of a model; None if nothing is.
-
-        Parameters
-        ----------
-        classes : int
-            Number of classes.
-        arrays : mapping of str to np.ndarray
-            By name; of the right types and shapes, and finite.
-
-        Returns
-        -------
-        str or None
-            The rest of a sentence that begins with the file.
-        """
+        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
         if not len(arrays["vectors"]):
             return "has no vectors"
-        return (
-            scaler_problem(arrays)
-            or target_problem("vectors_target", classes, arrays)
-            or target_problem("learned_target", classes, arrays)
+        return scaler_problem(arrays) or target_problem(
+            classes, arrays, "vectors_target", "learned_target"
         )
 
     def machine(self, model: Model) -> "NeighboursMachine":
@@ -149,20 +119,7 @@ class NeighboursMachine:
         self._one_hot = np.eye(classes)[arrays["vectors_target"]]
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decision values of windows.
-
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C)], float64
-            Logarithms of the shares of votes, as of `log_shares`.
-        novelty : np.ndarray [shape=(n,)], float64
-            NaN.
-        """
+        """Return the logarithms of the shares of votes (`log_shares`), and NaN as novelty."""
         votes = np.empty((len(inputs), self._one_hot.shape[1]))
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)

@@ -11,7 +11,7 @@ from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import RoundedDistances
-from hearthlog.models.classifiers.scaler import Scaler, scaler_problem
+from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
 _VECTORS_AT_ONCE = 128  # times the classes, a product this small no BLAS divides among threads
@@ -54,8 +54,7 @@ class OneClassKind(ClassifierKind):
     name = "one-class"
     parameters = OneClassParameters
     arrays: Mapping[str, np.dtype[Any]] = {
-        "scaler_mean": np.dtype(np.float64),
-        "scaler_scale": np.dtype(np.float64),
+        **SCALER,
         "support_vectors": np.dtype(np.float32),
         "support_target": np.dtype(np.int64),
         "coefficients": np.dtype(np.float64),
@@ -66,24 +65,10 @@ class OneClassKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that the arrays of a model must have.
-
-        Parameters
-        ----------
-        classes, width : int
-            Number of classes, and of inputs.
-        arrays : mapping of str to np.ndarray
-            Those of the model, by name; they may be of any type and shape.
-
-        Returns
-        -------
-        dict of str to tuple of int
-            By name of the array; learned windows only if there are any.
-        """
+        """Return shapes, as of `ClassifierKind.shapes`."""
         count = arrays["support_target"].size
         shapes: dict[str, tuple[int, ...]] = {
-            "scaler_mean": (width,),
-            "scaler_scale": (width,),
+            **scaler_shapes(width),
             "support_vectors": (count, width),
             "support_target": (count,),
             "coefficients": (count,),
@@ -92,24 +77,9 @@ class OneClassKind(ClassifierKind):
         return shapes | learned_shapes(width, arrays)
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays of a model; None if nothing is.
-
-        Parameters
-        ----------
-        classes : int
-            Number of classes.
-        arrays : mapping of str to np.ndarray
-            By name; of the right types and shapes, and finite.
-
-        Returns
-        -------
-        str or None
-            The rest of a sentence that begins with the file.
-        """
-        return (
-            scaler_problem(arrays)
-            or target_problem("support_target", classes, arrays)
-            or target_problem("learned_target", classes, arrays)
+        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
+        return scaler_problem(arrays) or target_problem(
+            classes, arrays, "support_target", "learned_target"
         )
 
     def machine(self, model: Model) -> "OneClassMachine":
@@ -151,19 +121,7 @@ class OneClassMachine:
         ]
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decision values of windows.
-
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C)], float64
-        novelty : np.ndarray [shape=(n,)], float64
-            NaN.
-        """
+        """Return the decision values of the machines, and NaN as novelty."""
         rows = self._distances.rows(self._scaled(inputs))
         decisions = np.tile(-self._offsets, (len(inputs), 1))
         for vectors, weights in self._blocks:

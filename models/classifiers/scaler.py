@@ -1,10 +1,17 @@
 """Inputs in standard deviations from the mean, for the kinds of classifiers that need it."""
 
 from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 from hearthlog.models.classifiers.model import Array
 from hearthlog.schemas.arrays import Float32, Float64
 
+SCALER: Mapping[str, np.dtype[Any]] = {
+    "scaler_mean": np.dtype(np.float64),
+    "scaler_scale": np.dtype(np.float64),
+}
 _SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
 
 
@@ -14,7 +21,7 @@ class Scaler:
     Parameters
     ----------
     arrays : mapping of str to np.ndarray
-        Among them scaler_mean and scaler_scale, both [shape=(width,)], float64.
+        Among them `SCALER`, mean and standard deviation of the inputs.
     """
 
     def __init__(self, arrays: Mapping[str, Array]) -> None:
@@ -24,6 +31,11 @@ class Scaler:
     def __call__(self, inputs: Float32) -> Float64:
         """Scale inputs, of shape (n, width)."""
         return (inputs - self._mean) / self._scale
+
+
+def scaler_shapes(width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays `SCALER` for a number of inputs."""
+    return dict.fromkeys(SCALER, (width,))
 
 
 def scaler_problem(arrays: Mapping[str, Array]) -> str | None:

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.learned_windows import target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import (
     Distances,
@@ -16,6 +17,7 @@ from hearthlog.models.classifiers.rbf_distances import (
     RoundedDistances,
     UnroundedDistances,
 )
+from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
@@ -23,7 +25,6 @@ HOME_SHARE = 100.0  # weight of a home vector; a support vector has 1
 HOME_SHARPNESS = 10.0
 _TINY = 1e-200
 _SUPPORT_AT_ONCE = 256  # a product this small no BLAS divides among threads
-_SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
 
 _Part = tuple[int, slice, Float64]  # a class, its columns, and their coefficients
 _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -81,8 +82,7 @@ class SvmKind(ClassifierKind):
     name = "svm-rbf"
     parameters = SvmParameters
     arrays: Mapping[str, np.dtype[Any]] = {
-        "scaler_mean": np.dtype(np.float64),
-        "scaler_scale": np.dtype(np.float64),
+        **SCALER,
         "support_vectors": np.dtype(np.float32),
         "support_counts": np.dtype(np.int64),
         "dual_coefficients": np.dtype(np.float64),
@@ -100,27 +100,13 @@ class SvmKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that the arrays of a model must have.
-
-        Parameters
-        ----------
-        classes, width : int
-            Number of classes, and of inputs.
-        arrays : mapping of str to np.ndarray
-            Those of the model, by name; they may be of any type and shape.
-
-        Returns
-        -------
-        dict of str to tuple of int
-            By name of the array; home and base vectors only if there are any.
-        """
+        """Return shapes, as of `ClassifierKind.shapes`."""
         total, home, base = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
             for name in ("support_vectors", "home_vectors", "base_target")
         )
         shapes: dict[str, tuple[int, ...]] = {
-            "scaler_mean": (width,),
-            "scaler_scale": (width,),
+            **scaler_shapes(width),
             "support_vectors": (total, width),
             "support_counts": (classes,),
             "dual_coefficients": (classes - 1, total),
@@ -137,36 +123,19 @@ class SvmKind(ClassifierKind):
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays of a model; None if nothing is.
-
-        Parameters
-        ----------
-        classes : int
-            Number of classes.
-        arrays : mapping of str to np.ndarray
-            By name; of the right types and shapes, and finite.
-
-        Returns
-        -------
-        str or None
-            The rest of a sentence that begins with the file.
-        """
-        if not (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
-            return "scaler_scale has values that are not positive"
+        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
         counts, total = arrays["support_counts"], len(arrays["support_vectors"])
         if (counts < 0).any() or counts.sum() != total:
             return f"support_counts do not add up to the {total} support vectors"
         if not (arrays.get("base_costs", np.ones(1)) > 0.0).all():
             return "base_costs has values that are not positive"
-        for name in ("home_target", "base_target"):
-            target = arrays.get(name, counts[:0])
-            if ((target < 0) | (target >= classes)).any():
-                return f"{name} has classes that the model has not"
         rows = arrays.get("support_base", counts[:0])
         kept = rows[rows >= 0]
         if (kept >= len(arrays.get("base_target", kept))).any() or len(np.unique(kept)) < len(kept):
             return "support_base has numbers that no vector of the base has, or one twice"
-        return None
+        return scaler_problem(arrays) or target_problem(
+            classes, arrays, "home_target", "base_target"
+        )
 
     def machine(self, model: Model) -> "SvmMachine":
         """Prepare a model for inference."""
@@ -192,8 +161,7 @@ class SvmMachine:
     """
 
     def __init__(self, model: Model) -> None:
-        self._mean = model.arrays["scaler_mean"]
-        self._scale = model.arrays["scaler_scale"]
+        self._scaled = Scaler(model.arrays)
         self._intercepts = model.arrays["intercepts"]
         self._count = len(model.classes)
         self._tells_novelty = model.description.novelty == "machine"
@@ -223,9 +191,6 @@ class SvmMachine:
         if self._home_blocks:
             decision += home_votes(self._home(rows), others)
         return decision, -np.expm1(nearest)
-
-    def _scaled(self, inputs: Float32) -> Float64:
-        return (inputs - self._mean) / self._scale
 
     def _pairs(self, rows: Prepared) -> tuple[Float64, Float64, Float64]:
         """Return the decision values of every pair of classes.

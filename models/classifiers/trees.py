@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind, NoParameters
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.shares import log_shares
@@ -15,12 +14,6 @@ from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
 MOST_LEVELS = 64
 _TREES_AT_ONCE = 64  # bounds memory
 _SUM_ERROR = 1e-3  # of probabilities in single precision
-
-
-class TreesParameters(BaseModel):
-    """Parameters of trees: none, all is in their arrays."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
 class TreesKind(ClassifierKind):
@@ -46,7 +39,7 @@ class TreesKind(ClassifierKind):
     """
 
     name = "trees"
-    parameters = TreesParameters
+    parameters = NoParameters
     arrays: Mapping[str, np.dtype[Any]] = {
         "roots": np.dtype(np.int32),
         "feature": np.dtype(np.int16),
@@ -60,20 +53,7 @@ class TreesKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that the arrays of a model must have.
-
-        Parameters
-        ----------
-        classes, width : int
-            Number of classes, and of inputs.
-        arrays : mapping of str to np.ndarray
-            Those of the model, by name; they may be of any type and shape.
-
-        Returns
-        -------
-        dict of str to tuple of int
-            By name of the array; intercepts and learned windows only if there are any.
-        """
+        """Return shapes, as of `ClassifierKind.shapes`."""
         nodes = arrays["feature"].size
         shapes: dict[str, tuple[int, ...]] = {
             "roots": (arrays["roots"].size,),
@@ -88,20 +68,7 @@ class TreesKind(ClassifierKind):
         return shapes | learned_shapes(width, arrays)
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays of a model; None if nothing is.
-
-        Parameters
-        ----------
-        classes : int
-            Number of classes.
-        arrays : mapping of str to np.ndarray
-            By name; of the right types and shapes, and finite.
-
-        Returns
-        -------
-        str or None
-            The rest of a sentence that begins with the file.
-        """
+        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
         if not _are_in_order(arrays["roots"], len(arrays["feature"])):
             return "roots are not the first nodes of trees, in order"
         if (arrays["feature"] >= len(arrays["importances"])).any():
@@ -112,7 +79,7 @@ class TreesKind(ClassifierKind):
             return f"has a tree of more than {MOST_LEVELS} levels"
         if "intercepts" not in arrays and not _are_probabilities(arrays["values"]):
             return "the rows of values are no probabilities"
-        return target_problem("learned_target", classes, arrays)
+        return target_problem(classes, arrays, "learned_target")
 
     def machine(self, model: Model) -> "TreesMachine":
         """Prepare a model for inference."""
@@ -148,19 +115,9 @@ class TreesMachine:
         self._levels = levels(arrays)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decision values of windows.
+        """Return decision values, and NaN as novelty.
 
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C)], float64
-            Of a forest the logarithms of the mean probabilities, as of `log_shares`.
-        novelty : np.ndarray [shape=(n,)], float64
-            NaN.
+        Those of a forest are the logarithms of its mean probabilities (`log_shares`).
         """
         total = np.zeros((len(inputs), self._values.shape[1]))
         for start in range(0, len(self._roots), _TREES_AT_ONCE):

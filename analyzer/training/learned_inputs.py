@@ -1,0 +1,120 @@
+"""Windows that a classifier is learned from: chosen, weighted, rounded and scaled."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+
+from hearthlog.models.classifiers.rbf_distances import in_steps
+from hearthlog.schemas.arrays import Float32, Float64, Indices
+
+_SEED = 20_261_122
+_ROUNDING = 0.01  # of the standard deviation
+
+
+def spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
+    """Choose windows at random, those of most weight first, but fewer of the large classes.
+
+    Parameters
+    ----------
+    target : np.ndarray [shape=(n,)], intp
+        Their classes.
+    weight : np.ndarray [shape=(n,)], float64
+    most : int
+        How many.
+
+    Returns
+    -------
+    np.ndarray [shape=(most,)], intp
+        Their places.
+    """
+    shuffled = np.random.default_rng(_SEED).permutation(len(target))
+    shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
+    order = np.argsort(target[shuffled], kind="stable")
+    counts = np.bincount(target)
+    rank = np.empty(len(target), np.intp)
+    rank[order] = np.concatenate([np.arange(count) for count in counts])
+    return shuffled[np.sort(np.argsort(rank, kind="stable")[:most])]
+
+
+def class_costs(target: Indices) -> Float64:
+    """Weigh classes against their numbers of windows, as scikit-learn's `balanced`.
+
+    Parameters
+    ----------
+    target : np.ndarray [shape=(n,)], intp
+        Numbers of the classes of windows.
+
+    Returns
+    -------
+    np.ndarray [shape=(C,)], float64
+    """
+    counts = np.bincount(target)
+    costs: Float64 = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
+    return costs
+
+
+def balanced(target: Indices, weight: Float64) -> Float64:
+    """Weigh windows, of some weight each, against the number of their class.
+
+    Parameters
+    ----------
+    target : np.ndarray [shape=(n,)], intp
+        Numbers of their classes.
+    weight : np.ndarray [shape=(n,)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+    """
+    weighted: Float64 = weight * class_costs(target)[target]
+    return weighted
+
+
+def fitted_scaler(inputs: Float32) -> StandardScaler:
+    """Return a scaler to the mean and the standard deviation of inputs, shape (n, width)."""
+    return StandardScaler().fit(inputs.astype(np.float64))
+
+
+def scaler_arrays(scaler: StandardScaler) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `hearthlog.models.classifiers.scaler`."""
+    return {"scaler_mean": scaler.mean_, "scaler_scale": scaler.scale_}
+
+
+def in_whole_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
+    """Return a scaler that rounds as the machine does of which it is a part.
+
+    Parameters
+    ----------
+    scaler : StandardScaler
+    steps : int or None
+        Of a standard deviation; None: nothing is rounded.
+    """
+    if steps is None:
+        return make_pipeline(scaler)
+    rounding = FunctionTransformer(_rounded_to_steps, kw_args={"steps": steps})
+    return make_pipeline(scaler, rounding)
+
+
+def _rounded_to_steps(scaled: Float64, steps: int) -> Float64:
+    return in_steps(scaled, steps) / steps
+
+
+def rounded(inputs: Float32) -> Float32:
+    """Round inputs to half precision, so that a model file takes half the room.
+
+    Parameters
+    ----------
+    inputs : np.ndarray [shape=(n, width)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, width)], float32
+        As they are, if the error would be more than a hundredth of the spread of an input.
+    """
+    with np.errstate(over="ignore"):
+        half = inputs.astype(np.float16).astype(np.float32)
+    spread, error = inputs.std(axis=0), np.abs(half - inputs).max(axis=0)
+    return half if ((error <= _ROUNDING * spread) | (spread == 0.0)).all() else inputs
