@@ -3,7 +3,7 @@
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event as Flag
@@ -34,11 +34,15 @@ class Result(NamedTuple):
     stderr: str
 
 
-def run(capfd: pytest.CaptureFixture[str], *arguments: object) -> Result:
+def run(
+    capfd: pytest.CaptureFixture[str], *arguments: object, env: Mapping[str, str] | None = None
+) -> Result:
     """Run the command in this process, which is faster than in one of its own."""
     capfd.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["hearthlog", *map(str, arguments)])
+        for name, value in (env or {}).items():
+            patch.setenv(name, value)
         try:
             main()
             status = 0

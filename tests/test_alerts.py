@@ -5,6 +5,7 @@ import shutil
 import time
 from contextlib import contextmanager
 from datetime import UTC, date
+from functools import partial
 from itertools import chain, repeat
 from threading import Event, Lock, Thread
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from homelife import HOUR, midnight, write_day
 from livehome import LiveHome as WrittenHome
 from livehome import following
 from pydantic import TypeAdapter
+from spliced import run
 
 from hearthlog.analyzer.bridge.alerts.evaluate import rings
 from hearthlog.analyzer.bridge.alerts.gathering import Gathered
@@ -40,6 +42,13 @@ from hearthlog.schemas.logs.files import find_logs, log_path
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import topics_of
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND

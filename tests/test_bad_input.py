@@ -3,16 +3,23 @@
 import os
 import shutil
 import subprocess
+from functools import partial
 
 import numpy as np
 import pytest
 import soundfile
 from logreader import LogReader
 from logs import features
-from spliced import small_disk
+from spliced import run, small_disk
 
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
 
 
 @pytest.fixture

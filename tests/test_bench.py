@@ -2,12 +2,17 @@
 
 import json
 import math
+import os
 import re
 import subprocess
 import sys
+from importlib import import_module
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
@@ -35,13 +40,30 @@ from hearthlog.tools.home.simulate import write_training_set
 
 
 def bench(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "hearthlog.tools.bench", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-    )
+    with patch.dict(os.environ):  # which the command sets for processes of one core
+        module = import_module("hearthlog.tools.bench.__main__")
+        app = typer.Typer()
+        app.command()(module.bench)
+        return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+@pytest.fixture(autouse=True)
+def short_turns(monkeypatch):
+    """Everything is measured once: how fast it is, is not asked."""
+    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+    monkeypatch.setattr(check, "_TURN_SECONDS", 1e-6)
+    monkeypatch.setattr(check, "_TURNS", 1)
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """Half a minute of sound, a model of few clips, and two minutes that stand for a day."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(workload, "_DAY", 120)
+        small = Workload(tmp_path_factory.mktemp("work"), minutes=0.5, clips_per_class=3)
+        assert small.day
+        assert small.completed_day
+    return small
 
 
 def figures(output):
@@ -51,13 +73,23 @@ def figures(output):
     return {row[0]: float(row[1].replace(",", "")) for row in cells if row[0] != "measured"}
 
 
-def test_recordings_of_a_folder_are_recorded_and_the_log_is_accounted_for_byte_by_byte(tmp_path):
-    write_training_set(tmp_path, 3, seed=1)
+@pytest.fixture(scope="module")
+def run_of_folder(tmp_path_factory):
+    """What is printed of a folder of recordings, and the file that the run is appended to."""
+    folder = tmp_path_factory.mktemp("run")
+    write_training_set(folder / "sound", 3, seed=1)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(check, "measure_ratios", lambda work: {"minutes": work.minutes})
+        sound, runs = folder / "sound", folder / "runs.jsonl"
+        done = bench("size", "recording", "--audio", sound, "--record", runs)
+    assert done.exit_code == 0, done.output
+    return done.stdout, runs
 
-    done = bench("size", "recording", "--audio", tmp_path)
 
-    assert done.returncode == 0, done.stderr
-    found = figures(done.stdout)
+def test_recordings_of_a_folder_are_recorded_and_the_log_is_accounted_for_byte_by_byte(
+    run_of_folder,
+):
+    found = figures(run_of_folder[0])
     assert all(math.isfinite(value) and value > 0 for value in found.values())
     parts = sum(value for name, value in found.items() if name.startswith("/"))
     parts += found["index of messages"] + found["the rest"]
@@ -65,8 +97,7 @@ def test_recordings_of_a_folder_are_recorded_and_the_log_is_accounted_for_byte_b
     assert {"/mic/features", "/mic/statistics", "/mic/label", "hearthlog record"} <= set(found)
 
 
-def test_every_peer_that_is_installed_gets_a_speed_and_a_ratio(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+def test_every_peer_that_is_installed_gets_a_speed_and_a_ratio(tmp_path):
     rows = features.measure(Workload(tmp_path, minutes=0.1)).rows
     assert len(rows) == 8
     assert all(math.isfinite(row.value) and row.value > 0 for row in rows)
@@ -74,7 +105,6 @@ def test_every_peer_that_is_installed_gets_a_speed_and_a_ratio(tmp_path, monkeyp
 
 
 def test_a_peer_that_is_missing_is_named_and_the_others_are_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
     monkeypatch.setitem(sys.modules, "opensmile", None)
     rows = {
         row.what.split()[0]: row for row in features.measure(Workload(tmp_path, minutes=0.1)).rows
@@ -114,7 +144,7 @@ def test_a_missed_target_is_said(row, verdict):
 
 def test_an_unknown_measurement_is_refused_and_the_known_ones_are_listed():
     done = bench("speed")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "features, recording, live, bridge" in " ".join(done.stderr.split())
 
 
@@ -126,7 +156,7 @@ def test_where_no_viewer_runs_the_others_are_measured_and_the_end_says_what_is_m
     for name, value in (nothing_to_draw_with | {"VK_ICD_FILENAMES": "/none"}).items():
         monkeypatch.setenv(name, value)
     done = bench("review", "size", "--audio", tmp_path)
-    assert done.returncode == 3, done.stderr
+    assert done.exit_code == 3, done.output
     tables = done.stdout.split("\n\n")
     day = next(line for line in tables[0].splitlines() if line.startswith("  a day "))
     assert re.search(r" - .*Rerun's viewer does not run here", day)
@@ -137,7 +167,8 @@ def test_where_no_viewer_runs_the_others_are_measured_and_the_end_says_what_is_m
 
 
 def test_a_folder_without_sound_is_one_clear_line(tmp_path):
-    done = bench("features", "--audio", tmp_path)
+    command = [sys.executable, "-m", "hearthlog.tools.bench", "features", "--audio", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith(
         "holds no second of sound in files *.flac or *.wav"
@@ -145,19 +176,16 @@ def test_a_folder_without_sound_is_one_clear_line(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_the_readers_agree_and_each_gets_a_time_and_a_ratio(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
-    monkeypatch.setattr(workload, "_DAY", 120)
-    rows = reading.measure(Workload(tmp_path, minutes=1.0)).rows
+def test_the_readers_agree_and_each_gets_a_time_and_a_ratio(work):
+    rows = reading.measure(work).rows
     assert all(math.isfinite(row.value) and row.value >= 0 for row in rows)
     assert sum(row.ratio is not None for row in rows) == 6
     assert all(row.elapsed > 0 for row in rows if row.unit in {"s", "ms"})
 
 
-def test_logs_are_measured_in_the_states_in_which_the_live_recorder_leaves_them(tmp_path):
-    live = Workload(tmp_path, minutes=0.5, clips_per_class=3).live
+def test_logs_are_measured_in_the_states_in_which_the_live_recorder_leaves_them(work):
     read = {}
-    for state, log in live._asdict().items():
+    for state, log in work.live._asdict().items():
         with LogFile(log) as file:
             assert file.complete == (state != "unfinished")
             spans = (file.chunks["end"] - file.chunks["start"]) / NANOSECONDS
@@ -169,9 +197,8 @@ def test_logs_are_measured_in_the_states_in_which_the_live_recorder_leaves_them(
     assert np.array_equal(read["finished"], read["unfinished"])
 
 
-def test_columns_and_messages_are_written_at_a_speed(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
-    columns, single = writing.measure(Workload(tmp_path, minutes=0.2)).rows
+def test_columns_and_messages_are_written_at_a_speed(work):
+    columns, single = writing.measure(work).rows
     assert single.ratio == pytest.approx(columns.value / single.value)
     assert columns.elapsed > 0
 
@@ -215,14 +242,11 @@ def test_a_history_without_a_run_is_drawn_too(tmp_path):
     assert (tmp_path / "runs.svg").exists()
 
 
-def test_a_run_is_recorded_where_it_is_asked_for(tmp_path):
-    write_training_set(tmp_path / "sound", 3, seed=1)
-    runs = tmp_path / "runs.jsonl"
-    done = bench("recording", "--audio", tmp_path / "sound", "--record", runs)
-    assert done.returncode == 0, done.stderr
-    (run,) = map(json.loads, runs.read_text("utf-8").splitlines())
+def test_a_run_is_recorded_where_it_is_asked_for(run_of_folder):
+    (run,) = map(json.loads, run_of_folder[1].read_text("utf-8").splitlines())
     assert run["sound"] == "sound"
     assert run["figures"]["recording: hearthlog record"]["value"] > 0
+    assert run["ratios"] == {"minutes": check.MINUTES}
 
 
 def recorded_ratios(path, *runs):
@@ -231,9 +255,8 @@ def recorded_ratios(path, *runs):
     return path
 
 
-def test_every_contest_gives_a_ratio_of_cpu_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
-    ratios = check.measure_ratios(Workload(tmp_path, minutes=0.5, clips_per_class=3))
+def test_every_contest_gives_a_ratio_of_cpu_time(work):
+    ratios = check.measure_ratios(work)
     assert [name.partition(":")[0] for name in ratios] == [
         *("features", "inference", "reading, finished", "reading, chunks of 0.5 s", "writing")
     ]
@@ -260,9 +283,8 @@ def test_a_ratio_that_fell_is_told_from_one_that_noise_moved(tmp_path):
 def test_without_a_recorded_run_the_check_says_so_before_it_measures(tmp_path, text):
     (tmp_path / "runs.jsonl").write_text(text)
     done = bench("--check", tmp_path / "runs.jsonl")
-    assert done.returncode == 1
-    assert done.stderr.startswith(f"hearthlog bench: {tmp_path / 'runs.jsonl'}: ")
-    assert done.stderr.count("\n") == 1
+    assert isinstance(done.exception, timing.BenchError)
+    assert re.fullmatch(f"{tmp_path / 'runs.jsonl'}: .*", str(done.exception))
 
 
 def test_the_queue_is_compared_with_chance_run_by_run():

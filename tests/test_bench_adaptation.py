@@ -6,7 +6,6 @@ pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchm
 
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.marks.marks import read_marks
-from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.bench.adaptation import Outcome, adaptation, line_of, wrong_sounds
@@ -22,10 +21,10 @@ START = 1_772_323_200  # midnight
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory):
-    """Four logs of three minutes, an hour apart, as the starter labels them."""
+def home(tmp_path_factory, model_file):
+    """Four logs of three minutes, an hour apart, labelled by a model."""
     folder, library, lines = tmp_path_factory.mktemp("home"), ClipLibrary(), []
-    settings = Settings(output=folder / "logs", model=starter_file(GENERAL), timezone="UTC")
+    settings = Settings(output=folder / "logs", model=model_file, timezone="UTC")
     for hour in range(4):
         room = Rooms("living_room", 3)
         composition = Composition(plan_short_day(3, library, hour), library, room)
@@ -36,8 +35,8 @@ def home(tmp_path_factory):
     return folder
 
 
-def test_a_home_is_corrected_learned_and_scored_before_and_after(home):
-    [few, wrong] = adaptation(home, starter_file(GENERAL), ((4, 0.0), (4, 1.0)))
+def test_a_home_is_corrected_learned_and_scored_before_and_after(home, model_file):
+    [few, wrong] = adaptation(home, model_file, ((4, 0.0), (4, 1.0)))
     assert few.marks == wrong.marks == 4
     assert few.before == wrong.before
     assert few.before.keys() == few.after.keys() >= {"silence", "speech"}

@@ -2,15 +2,24 @@
 
 import json
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from spliced import run
 
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.config_origins import key_lines
 from hearthlog.tools.reference import configuration_page
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
 
 FILE = """\
 # my home

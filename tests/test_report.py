@@ -2,6 +2,7 @@
 
 import re
 from datetime import date, timedelta
+from functools import partial
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from logs import read
 from PIL import Image
+from spliced import run
 
 from hearthlog.analyzer.accuracy.count_range import Strata, checked_rates
 from hearthlog.analyzer.colours import colour
@@ -33,6 +35,13 @@ from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
 
 DAY = date(2026, 3, 1)
 UTC = ZoneInfo("UTC")

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
@@ -23,6 +24,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
+from spliced import run
 
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
@@ -31,6 +33,13 @@ from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.salvage.recover import NothingWholeError, recover_log
 from hearthlog.schemas.storage.byte_ranges import LocalFile
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
 
 HEADER, MESSAGE, CHUNK, INDEX, ATTACHMENT, METADATA, DATA_END = 1, 5, 6, 7, 9, 12, 15
 GAPS = "/mic/gap"

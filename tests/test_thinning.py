@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import pytest
 from logreader import LogReader
 from logs import read
+from spliced import run
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.marks.marks import Mark, write_marks
@@ -23,6 +25,13 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.salvage.thin import STEPS, thin_log, thinned_step
 from hearthlog.schemas.times import NANOSECONDS
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
 
 DAY = 86_400 * NANOSECONDS
 DROPPED = (

@@ -1,11 +1,9 @@
 """What one log consists of, from its index, or by walking from record to record."""
 
-import io
 import struct
 import warnings
 import zlib
 from array import array
-from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Self
@@ -27,9 +25,9 @@ from hearthlog.schemas.mcap.chunk_table import (
     read_chunk_row,
 )
 from hearthlog.schemas.mcap.formats import FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
-from hearthlog.schemas.mcap.record_walk import walk_records
+from hearthlog.schemas.mcap.record_walk import read_records, walk_records
 from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
-from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile, open_file
+from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
@@ -257,7 +255,7 @@ class LogFile:
         rows = array("q")
         crc = 0
         try:
-            for location, raw in self._records(start, end):
+            for location, raw in read_records(self._file, start, end):
                 crc = zlib.crc32(raw, crc)
                 content = raw[HEAD.size :]
                 if location.opcode == Opcode.CHUNK_INDEX:
@@ -273,17 +271,6 @@ class LogFile:
         self._note(RecordLocation(opcode, len(MAGIC), HEAD.size + length))
         self.chunks = by_start(np.frombuffer(rows, CHUNKS))
         return True
-
-    def _records(self, start: int, end: int) -> Iterator[tuple[RecordLocation, bytes]]:
-        """Read the records of a section one by one, heads included."""
-        with io.BufferedReader(Section(self._file, start), 1 << 20) as stream:
-            while start < end:
-                head = stream.read(HEAD.size)
-                opcode, length = HEAD.unpack(head)
-                if length > min(LIMIT, end - start - HEAD.size):
-                    raise McapError("a record claims to be too large")
-                yield RecordLocation(opcode, start, HEAD.size + length), head + stream.read(length)
-                start += HEAD.size + length
 
     def scan_new(self) -> NDArray[np.void]:
         """Walk through the records that were written since the last scan.

@@ -1,8 +1,14 @@
 """From record to record through a file that may be written still."""
 
+import io
 from collections.abc import Callable, Iterator
 
+from mcap.exceptions import McapError
+
+from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.formats import CHUNK, HEAD
+from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile
 
 _RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
 _WINDOW = 1 << 14  # bytes that are read at once: an hour has half a million records
@@ -39,3 +45,35 @@ def walk_records(
         length += HEAD.size
         yield opcode, start, length, head[:length]
         start += length
+
+
+def read_records(
+    file: LocalFile | StoredFile, start: int, end: int
+) -> Iterator[tuple[RecordLocation, bytes]]:
+    """Read the records of a section one by one.
+
+    Parameters
+    ----------
+    file : LocalFile or StoredFile
+    start, end : int
+        Of the section, in bytes.
+
+    Yields
+    ------
+    location : RecordLocation
+    record : bytes
+        Opcode and length included.
+
+    Raises
+    ------
+    McapError
+        If a record is longer than the section, or than `LIMIT`.
+    """
+    with io.BufferedReader(Section(file, start), 1 << 20) as stream:
+        while start < end:
+            head = stream.read(HEAD.size)
+            opcode, length = HEAD.unpack(head)
+            if length > min(LIMIT, end - start - HEAD.size):
+                raise McapError("a record claims to be too large")
+            yield RecordLocation(opcode, start, HEAD.size + length), head + stream.read(length)
+            start += HEAD.size + length

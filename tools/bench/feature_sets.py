@@ -18,7 +18,8 @@ import soundfile
 import typer
 
 from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation, evaluate_method
-from hearthlog.analyzer.training.dataset import build_dataset, clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import Scenario, load_scenario
 from hearthlog.analyzer.training.svm_method import SvmMethod
@@ -35,6 +36,7 @@ from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.cli.table import print_table
 
 _STATISTICS = "statistics"
 _START = 1_772_352_000 * NANOSECONDS
@@ -81,18 +83,13 @@ def feature_sets(
     clips = [clip for clip in every if _seconds(clip) >= shortest]
     classes = classes.with_unknown((clip.label, clip.source_group) for clip in clips)
     frames = _some_sound(clips, minutes)
-    print(
-        f"{len(clips)} of {len(every)} clips have {shortest:g} s; {len(frames) / 1200:.0f} minutes"
-    )
-    rows: list[tuple[str, ...]] = [_HEAD]
+    sound = len(frames) * FRAME_SECONDS / 60
+    print(f"{len(clips)} of {len(every)} clips have {shortest:g} s; {sound:.0f} minutes")
+    rows = []
     for one in sets:
         rows.append(_measure(one, clips, classes, frames).cells())
         print("  ".join(rows[-1]), file=sys.stderr, flush=True)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print(
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        )
+    print_table(_HEAD, rows)
 
 
 def _measure(

@@ -1,6 +1,6 @@
 """Features of sound: ours, and those of the libraries of the field."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 
 import numpy as np
@@ -10,7 +10,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench.table import Row, Table, Target
-from hearthlog.tools.bench.timing import best_of
+from hearthlog.tools.bench.timing import Seconds, best_of
 from hearthlog.tools.bench.workload import Workload
 
 _SECONDS = 120.0
@@ -19,8 +19,10 @@ _SINGLE_FRAMES = 2000
 _FAST = Target(10_000)
 _DEFAULT_FAST = Target(5_000)
 _FASTER_THAN_THE_PAPERS_LIBRARY = Target(50)
+_UNIT = "x real time"
 
 Peer = Callable[[Float32], Callable[[], object]]
+Speed = tuple[float, float]  # times real time, of CPU and by the clock
 
 
 def measure(work: Workload) -> Table:
@@ -42,44 +44,34 @@ def measure(work: Workload) -> Table:
         except ImportError as error:
             missing[name] = f"not installed ({error})"
     best = best_of(runs)
-    speed = {name: seconds / best[name].cpu for name in best if name != "1"}
-    quick = {name: seconds / best[name].elapsed for name in best if name != "1"}
-    single_frame = best["1"] / (len(single) / 1e6)
-    unit = "x real time"
-    rows = [
-        Row(
-            "hearthlog, 21 values, in one call",
-            speed["all"],
-            unit,
-            target=_FAST,
-            elapsed=quick["all"],
-        ),
-        Row(
-            f"hearthlog, {DEFAULT.width} values",
-            speed["default"],
-            unit,
-            target=_DEFAULT_FAST,
-            elapsed=quick["default"],
-        ),
-        *(
-            Row(f"hearthlog, {n} frames a call", speed[n], unit, note=note, elapsed=quick[n])
-            for n, note in (("200", "as from a file"), ("10", "as from a microphone"))
-        ),
-        Row(
-            "hearthlog, frame by frame",
-            single_frame.cpu,
-            "µs a frame",
-            elapsed=single_frame.elapsed,
-        ),
-    ]
+    speeds = {name: (seconds / one.cpu, seconds / one.elapsed) for name, one in best.items()}
+    rows = [*_own_rows(speeds, best["1"] / (len(single) / 1e6)), *_peer_rows(speeds, missing)]
+    return Table(f"features: {seconds:.0f} s of sound, CPU time", rows)
+
+
+def _own_rows(speeds: Mapping[str, Speed], frame: Seconds) -> Iterator[Row]:
+    """Return our speeds, and the time of a single frame in microseconds."""
+    for name, what, target in (
+        ("all", "21 values, in one call", _FAST),
+        ("default", f"{DEFAULT.width} values", _DEFAULT_FAST),
+    ):
+        value, elapsed = speeds[name]
+        yield Row(f"hearthlog, {what}", value, _UNIT, target=target, elapsed=elapsed)
+    for name, note in (("200", "as from a file"), ("10", "as from a microphone")):
+        value, elapsed = speeds[name]
+        yield Row(f"hearthlog, {name} frames a call", value, _UNIT, note=note, elapsed=elapsed)
+    yield Row("hearthlog, frame by frame", frame.cpu, "µs a frame", elapsed=frame.elapsed)
+
+
+def _peer_rows(speeds: Mapping[str, Speed], missing: Mapping[str, str]) -> Iterator[Row]:
+    ours, _ = speeds["all"]
     for name, (what, target, _) in _PEERS.items():
         if name in missing:
-            rows.append(Row(name, None, target=target, note=missing[name]))
+            yield Row(name, None, target=target, note=missing[name])
         else:
+            value, elapsed = speeds[name]
             title = f"{name} {version(name)}"
-            ratio = speed["all"] / speed[name]
-            rows.append(Row(title, speed[name], unit, ratio, target, what, quick[name]))
-    return Table(f"features: {seconds:.0f} s of sound, CPU time", rows)
+            yield Row(title, value, _UNIT, ours / value, target, what, elapsed)
 
 
 def contests(work: Workload) -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:

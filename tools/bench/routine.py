@@ -44,6 +44,7 @@ _ONCE_IN = (14.0, 30.0, 60.0)
 _DRAWS = 2000
 _TREES = 50
 _LARGEST = 6.0
+_WORDS = 42  # characters of a line before its figures
 
 Method = Callable[[Compared], float]
 
@@ -206,17 +207,19 @@ def alarm_lines(homes: Sequence[Home]) -> Iterator[str]:
     str
         A line of a table.
     """
-    yield f"{'once_in':34}" + "".join(f"{limit:>24g}" for limit in _ONCE_IN)
+    yield f"{'once_in':{_WORDS}}" + "".join(f"{limit:>24g}" for limit in _ONCE_IN)
     months = [
         np.array([_MONTH * (home.normal[:, 0] >= limit).mean() for home in homes])
         for limit in _ONCE_IN
     ]
-    yield f"{'false alarms a month':34}" + "".join(f"{_text(each, '.2f'):>24}" for each in months)
+    yield f"{'false alarms a month':{_WORDS}}" + "".join(
+        f"{_text(each, '.2f'):>24}" for each in months
+    )
     for name in CHANGES:
         for days, words in ((1, "on its first day"), (SPAN, f"within {SPAN} days")):
             shares = [_detected(homes, name, limit, 0, days) for limit in _ONCE_IN]
             cells = (f"{_text(100 * share, '.0f'):>24}" for share in shares)
-            yield f"{name if days == 1 else '':>24}{words:>18}"[-42:].ljust(42) + "".join(cells)
+            yield f"{name if days == 1 else '':24}{words:>18}" + "".join(cells)
 
 
 def method_lines(homes: Sequence[Home]) -> Iterator[str]:

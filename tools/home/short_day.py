@@ -16,6 +16,7 @@ from hearthlog.models.classes import (
     YELLING,
 )
 from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.tools.home.cast import Cast, Voices
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.plan import (
     BATHROOM,
@@ -31,7 +32,6 @@ from hearthlog.tools.home.plan import (
     Plan,
     SteadyNoise,
 )
-from hearthlog.tools.home.routine import Cast, Voices
 from hearthlog.tools.home.sounds import SimulationError, generator
 
 _MAX_MINUTES = 1440.0

@@ -1,0 +1,156 @@
+"""Who sounds how in a simulated home, and courses of sounds that do not overlap."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    FLUSHING_WATER,
+    LAUGHING,
+    MUSIC,
+    OBJECTS_ACTIVITY,
+    OTHER_NEGATIVE,
+    PHONE_RING,
+    SHOWER,
+    SPEECH,
+    TAP_WATER,
+    YELLING,
+)
+from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.tools.home.clips import Clip, ClipLibrary
+from hearthlog.tools.home.plan import (
+    LONGEST_FRAMES,
+    RADIO,
+    RESIDENT,
+    TELEVISION,
+    VISITOR,
+    PlannedSound,
+)
+
+Range = tuple[float, float]
+
+# In dBFS, for a microphone in the same room.
+LEVELS: dict[str, Range] = {
+    SPEECH: (-34.0, -26.0),
+    MUSIC: (-36.0, -28.0),
+    PHONE_RING: (-30.0, -22.0),
+    COUGHING: (-30.0, -20.0),
+    CRYING: (-30.0, -22.0),
+    YELLING: (-22.0, -14.0),
+    LAUGHING: (-30.0, -22.0),
+    OBJECTS_ACTIVITY: (-38.0, -28.0),
+    FLUSHING_WATER: (-28.0, -20.0),
+    SHOWER: (-30.0, -24.0),
+    TAP_WATER: (-36.0, -28.0),
+    OTHER_NEGATIVE: (-26.0, -16.0),
+}
+_QUIETER_DB = {TELEVISION: 6.0, RADIO: 4.0}
+_SUSTAINED = {MUSIC, SHOWER, TAP_WATER, PHONE_RING}  # may go on for longer than their clips
+
+
+class Cast:
+    """Who sounds how: which clips are whose.
+
+    Parameters
+    ----------
+    library : ClipLibrary
+    rng : np.random.Generator
+    """
+
+    def __init__(self, library: ClipLibrary, rng: np.random.Generator) -> None:
+        self._library = library
+        self._clips: dict[tuple[str, str], Sequence[Clip]] = {}
+        for label in (SPEECH, LAUGHING, YELLING, CRYING):
+            own = library.of_groups(label, 1, rng)
+            others = [clip for clip in library.of(label) if clip not in own]
+            self._clips[RESIDENT, label] = own
+            self._clips[VISITOR, label] = self._clips[TELEVISION, label] = others or own
+
+    def of(self, origin: str, label: str) -> Sequence[Clip]:
+        """Return the clips of a label that may sound from an origin.
+
+        Parameters
+        ----------
+        origin, label : str
+
+        Returns
+        -------
+        sequence of Clip
+            Empty if there are none.
+        """
+        return self._clips.get((origin, label)) or self._library.of(label)
+
+
+class Voices:
+    """One course of sounds of which none overlaps another.
+
+    Parameters
+    ----------
+    cast : Cast
+    rng : np.random.Generator
+    end : int
+        The frame at which no sound goes on.
+    """
+
+    def __init__(self, cast: Cast, rng: np.random.Generator, end: int) -> None:
+        self.now = 0
+        self.sounds: list[PlannedSound] = []
+        self._cast = cast
+        self._rng = rng
+        self._end = end
+
+    def wait(self, seconds: Range) -> None:
+        """Let a random time pass.
+
+        Parameters
+        ----------
+        seconds : (float, float)
+            Its limits.
+        """
+        self.now += round(self._rng.uniform(*seconds) / FRAME_SECONDS)
+
+    def wait_until(self, frame: int) -> None:
+        """Let time pass, if it is not that late already.
+
+        Parameters
+        ----------
+        frame : int
+        """
+        self.now = max(self.now, frame)
+
+    def sound(
+        self,
+        label: str,
+        room: str,
+        activity: str,
+        seconds: float | None = None,
+        origin: str = RESIDENT,
+    ) -> None:
+        """Add a clip, or as many as last for some seconds.
+
+        Parameters
+        ----------
+        label : str
+            Nothing is added where there are no clips of it.
+        room, activity : str
+        seconds : float, optional
+        origin : str, optional
+            Whose sound it is.
+        """
+        clips = self._cast.of(origin, label)
+        if not clips:
+            return
+        level = self._rng.uniform(*LEVELS[label]) - _QUIETER_DB.get(origin, 0.0)
+        until = self.now + 1 if seconds is None else self.now + round(seconds / FRAME_SECONDS)
+        while self.now < until and self.now < self._end:
+            clip = clips[int(self._rng.integers(len(clips)))]
+            frames = clip.frames
+            if seconds is not None and label in _SUSTAINED:
+                frames = until - self.now
+            frames = min(frames, LONGEST_FRAMES, self._end - self.now)
+            self.sounds.append(PlannedSound(self.now, frames, clip, origin, room, level, activity))
+            self.now += frames
+            if label not in _SUSTAINED:
+                self.wait((0.1, 0.8))
