@@ -6,6 +6,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
+import spliced
 from conftest import HEARTHLOG
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -43,6 +45,12 @@ from hearthlog.tools.bench.recurring_scene import OTHER
 
 START = 1_772_352_000 * NANOSECONDS
 DAY = 86_400 * NANOSECONDS
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(spliced.run, capfd)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 from spoken import ALLISON, DAY, START, THEO, record_conversation, two_voices
 
+from hearthlog.analyzer.discover.heard_twice import HeardSpeech, heard_louder
 from hearthlog.analyzer.discover.home_voices import NO_VOICE, Voices, find_voices
 from hearthlog.analyzer.discover.read_speech import (
     HomeSpeech,
@@ -23,6 +24,7 @@ from hearthlog.analyzer.discover.read_speech import (
     read_speech,
     speech_voices,
 )
+from hearthlog.analyzer.discover.speech_spans import is_doubtful, speech_spans
 from hearthlog.analyzer.discover.voice_space import (
     describe_speech,
     has_voices,
@@ -46,7 +48,7 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.bench.conversations import converse
@@ -155,6 +157,38 @@ def test_turns_lie_where_the_labels_say_speech(two_days):
     assert 60 < speech.seconds < 110, "of two minutes with pauses"
 
 
+def columns_of(kind, names, **fields):
+    stamps = fields["header.stamp"]
+    metadata = {"probabilities_names": json.dumps(names)}
+    return Columns(f"/mic/{kind}", "", metadata, stamps, stamps, stamps, fields)
+
+
+def test_what_may_well_be_speech_is_speech_whatever_its_label():
+    seconds = np.arange(4) * NANOSECONDS
+    names = ["coughing", "silence", "speech"]
+    segments = columns_of(
+        "segment",
+        names,
+        **{
+            "header.stamp": seconds,
+            "duration": np.full(4, NANOSECONDS),
+            "label": np.array(["coughing", "silence", "coughing", "speech"], object),
+        },
+    )
+    likely = np.repeat([0.4, 0.9, 0.2, 0.1], 20)
+    stamps = np.arange(80) * NANOSECONDS // 20
+    probabilities = np.stack([1 - likely, 0 * likely, likely], axis=1)
+    order = np.roll(np.arange(80), 30)  # as of a clock that was set back
+    fields = {"header.stamp": stamps[order], "probabilities": probabilities[order]}
+    labels = columns_of("label", names, **fields)
+    assert is_doubtful(segments).tolist() == [True, False, True, False]
+    assert speech_spans(segments, labels).starts.tolist() == [0, 3 * NANOSECONDS]
+    assert speech_spans(segments).starts.tolist() == [3 * NANOSECONDS]
+    for others in (names[:2], ["a", "b", "c"]):
+        labels = columns_of("label", others, **fields)
+        assert speech_spans(segments, labels).starts.tolist() == [3 * NANOSECONDS]
+
+
 def test_the_same_logs_give_the_same_voices_again_and_again(home, hearthlog):
     first = run(hearthlog, home)
     content = (home / VOICES).read_bytes()
@@ -196,20 +230,68 @@ def test_a_voice_is_enrolled_of_both_days_and_a_second_time_without_a_change(
     assert again.stderr == first.stderr
 
 
-def test_a_voice_in_a_log_of_two_microphones_is_enrolled(clips, hearthlog, tmp_path):
-    samples, _ = converse(clips, 60.0, 1)
-    sources = []
-    for name in ("bath", "kitchen"):
-        path = tmp_path / f"{name}.flac"
+@pytest.fixture(scope="module")
+def rooms(clips, tmp_path_factory):
+    """Logs of one time: people in the kitchen, whom the hall hears as well, and in the bath."""
+    folder = tmp_path_factory.mktemp("rooms")
+    kitchen, _ = converse(clips, 40.0, 1)
+    bath, _ = converse(clips, 40.0, 9)
+    noise = np.random.default_rng(0).normal(0.0, 1e-3, len(kitchen))
+    hall = (0.4 * np.roll(kitchen, 1200) + noise).astype(np.float32)
+    for name, samples in (("kitchen", kitchen), ("hall", hall), ("bath", bath)):
+        path = folder / f"{name}.flac"
         soundfile.write(path, samples, 16_000)
         microphone = MicrophoneSettings(name=name)
         settings = Settings(
-            output=tmp_path / name, model=starter_file(GENERAL), microphone=[microphone]
+            output=folder / name, model=starter_file(GENERAL), microphone=[microphone], node=name
         )
         record(settings, FileSource([path], START), Event())
-        sources += find_logs(settings.output)
+    return folder
+
+
+def speech_of(*logs):
+    return read_speech(find_home_logs(logs))
+
+
+def test_what_two_microphones_hear_is_of_the_louder_one_alone(rooms):
+    alone = speech_of(rooms / "kitchen")
+    for logs in ((rooms / "kitchen", rooms / "hall"), (rooms / "hall", rooms / "kitchen")):
+        both = speech_of(*logs)
+        names = np.array(both.microphones)[both.turns.microphone]
+        seconds = (both.turns.ends - both.turns.starts)[names == "kitchen"].sum() / NANOSECONDS
+        assert seconds > 0.95 * alone.seconds > 15
+        assert both.seconds < 1.05 * alone.seconds
+        assert len(both.voices.counts) == len(np.unique(both.turns.voice))
+    assert speech_of(rooms / "hall").seconds > 0.8 * alone.seconds
+
+
+def test_people_who_speak_at_once_in_two_rooms_are_both_heard(rooms):
+    kitchen, bath = (speech_of(rooms / name).seconds for name in ("kitchen", "bath"))
+    assert speech_of(rooms / "kitchen", rooms / "bath").seconds > 0.95 * (kitchen + bath)
+
+
+@pytest.mark.parametrize("late", [-3, 0, 3])
+def test_what_was_left_out_leaves_nothing_out(late):
+    frames, turn = np.arange(200), np.zeros(200, np.int64)
+    loudness = np.random.default_rng(1).normal(-40.0, 10.0, 200)
+    moved = (np.arange(200) >= 140).astype(np.int64)  # away from the other microphone
+    one = HeardSpeech(frames, loudness, turn)
+    other = HeardSpeech(frames + late, loudness + np.where(moved, -3.0, 6.0), moved)
+    assert [each.tolist() for each in heard_louder([one, other])] == [[True], [False, False]]
+
+
+def test_a_log_that_is_there_twice_counts_once(rooms, tmp_path):
+    alone = speech_of(rooms / "kitchen")
+    shutil.copytree(rooms / "kitchen", tmp_path / "again")
+    both = speech_of(rooms / "kitchen", tmp_path / "again")
+    assert both.seconds == alone.seconds
+    assert np.array_equal(both.voices.sums, alone.voices.sums)
+
+
+def test_a_voice_in_a_log_of_two_microphones_is_enrolled(rooms, hearthlog, tmp_path):
     both = tmp_path / "logs"
     both.mkdir()
+    sources = find_logs(rooms / "kitchen") + find_logs(rooms / "bath")
     merge_logs(select(sources), both / "both.mcap")
     done = hearthlog("voices", both, "--name", "1=anna", "--home", tmp_path / "voices")
     assert done.returncode == 0, done.stderr
@@ -427,7 +509,8 @@ def test_frames_that_no_sound_can_have_are_of_no_voice(two_days, monkeypatch, na
 
     def read_spoilt(*arguments, **options):
         columns = read_columns(*arguments, **options)
-        columns["/mic/features"]["values"][:400, spoilt] = value
+        if "/mic/features" in columns:
+            columns["/mic/features"]["values"][:400, spoilt] = value
         return columns
 
     monkeypatch.setattr("hearthlog.analyzer.discover.read_speech.read_columns", read_spoilt)

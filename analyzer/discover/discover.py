@@ -53,13 +53,11 @@ def discover(
             f"the groups are of {len(groups.features)} features, the logs have "
             f"{len(sounds.features)} others; name another file with --groups"
         )
-    is_new = groups is None
+    is_new, drawn = groups is None, _drawn(sounds)
     if groups is None:
         if count < 2 * least:
             raise DataError(f"{count} sounds are too few to group: it takes {2 * least}")
-        groups = make_space(
-            sounds.features, sounds.descriptors[_drawn(sounds, np.arange(count), _MOST)]
-        )
+        groups = make_space(sounds.features, sounds.descriptors[drawn])
     points = np.concatenate(
         [
             groups.points(sounds.descriptors[first : first + _AT_ONCE])
@@ -67,7 +65,6 @@ def discover(
         ]
     )
     of = groups.find(points)
-    drawn = _drawn(sounds, np.arange(count), _MOST)
     groups = add_groups(groups, points[drawn], of[drawn], least)
     groups = identified(groups) if is_new else groups
     rest = of == NO_GROUP
@@ -75,14 +72,13 @@ def discover(
     return groups, of, points
 
 
-def _drawn(sounds: HomeSounds, rows: Int64, most: int) -> Int64:
+def _drawn(sounds: HomeSounds) -> Int64:
     """Draw sounds by a hash of their times, and order them by these."""
-    starts = sounds.spans.starts[rows]
-    if len(rows) > most:
-        keys = _hashed(starts.astype(np.uint64))
-        rows = rows[np.argsort(keys, kind="stable")[:most]]
-        starts = sounds.spans.starts[rows]
-    return rows[np.lexsort((sounds.microphone[rows], starts))]
+    starts = sounds.spans.starts
+    rows = np.arange(len(starts))
+    if len(rows) > _MOST:
+        rows = np.argsort(_hashed(starts.astype(np.uint64)), kind="stable")[:_MOST]
+    return rows[np.lexsort((sounds.microphone[rows], starts[rows]))]
 
 
 def _hashed(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:

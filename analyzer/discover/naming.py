@@ -20,8 +20,6 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.progress import Progress, ignore_progress
 
-_NEVER = 1 << 62
-
 
 class Looked(NamedTuple):
     """In which sounds names are looked for.
@@ -91,8 +89,8 @@ def name_groups(  # noqa: PLR0913, PLR0917
         If a review layer cannot be read or written.
     """
     marked, losses = dict.fromkeys(names, Marked()), list(home.losses)
-    logs = home.between(0, _NEVER)
-    inside = {entry.path for entry in home.between(looked.start or 0, looked.end or _NEVER)}
+    logs = home.between()
+    inside = {entry.path for entry in home.between(looked.start, looked.end)}
     for count, (log, *_) in enumerate(logs, 1):
         spans: dict[int, list[MarkedSpan]] = {}
         if log in inside:

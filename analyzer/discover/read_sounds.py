@@ -22,7 +22,6 @@ from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 _FIELDS = {"header.stamp", "values", "label", "confidence"}
-_NEVER = 1 << 62
 
 
 class LogSounds(NamedTuple):
@@ -109,7 +108,7 @@ def read_sounds(
     DataError
         If no log has features and labels.
     """
-    entries = home.between(start or 0, end or _NEVER)
+    entries = home.between(start, end)
     reader = _Reader(choice, start, end)
     with tempfile.TemporaryFile(prefix="hearthlog-sounds") as store:
         # The last log first: what it has been described by, the others have to be, too.

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.discover.heard_twice import HeardSpeech, heard_louder, heard_speech
+from hearthlog.analyzer.discover.speech_spans import is_doubtful, speech_spans
 from hearthlog.analyzer.discover.voice_space import (
     ENERGY,
     WINDOW_FRAMES,
@@ -17,19 +19,19 @@ from hearthlog.analyzer.discover.voice_space import (
 )
 from hearthlog.analyzer.discover.voices import Evidence, summed, tell_apart
 from hearthlog.analyzer.logs.channel_names import checked_array_names
-from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
-from hearthlog.models.classes import SPEECH, class_name
+from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
+from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.messages.topics import LIVE, microphone_of, parse_topic, topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
-_FIELDS = {"header.stamp", "values", "duration", "label"}
+_FIELDS = {"header.stamp", "values", "duration", "label", "probabilities"}
 _NEVER = 1 << 62
 _PAUSE = 30 * NANOSECONDS  # between conversations
 _MOST_FRAMES = 6_000  # of a conversation: five minutes
@@ -41,6 +43,8 @@ _BREATH = FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2  # within a turn; stamps fo
 
 class Turns(NamedTuple):
     """When somebody speaks without a pause, in the order of logs, and in each of time.
+
+    What several microphones hear at once is of the one that hears it loudest.
 
     Attributes
     ----------
@@ -74,7 +78,7 @@ class HomeSpeech:
     losses : list of str
         What cannot be read, a log in a line.
     without : int
-        Logs that have no features by which voices are told apart, or no segments.
+        Logs that have no segments, or speech without features by which voices are told apart.
     """
 
     logs: list[Path]
@@ -110,7 +114,7 @@ def read_speech(
     entries = home.between(start or 0, end or _NEVER)
     for number, entry in enumerate(entries, 1):
         try:
-            reader.read(entry.path)
+            reader.read(entry)
         except LogError as error:
             reader.losses.append(str(error))
         progress(number / len(entries))
@@ -124,23 +128,42 @@ class _Reader:
         self._logs: list[Path] = []
         self._microphones: list[str] = []
         self._turns = [Turns(*(np.empty(0, np.int64) for _ in Turns._fields))]
+        self._recent: list[tuple[Turns, HeardSpeech]] = []  # of logs of one time
+        self._recent_end = 0
         dimensions = len(voice_space().spread)
         self._voices = [Evidence(np.empty(0), np.empty((0, dimensions)))]
         self._count = self._without = 0
 
-    def read(self, log: Path) -> None:
-        columns = read_columns([log], None, *self._span, fields=_FIELDS)
-        is_used = False
-        for features in columns.values():
-            microphone = features.topic.split("/")[1]
-            segments = columns.get(topic(microphone, "segment"))
-            if features.type != message_types.FEATURES or segments is None:
+    def read(self, entry: HomeLog) -> None:
+        if entry.start >= self._recent_end:
+            self._settle()
+        log = entry.path
+        segments = self._columns(log, _is_segments)
+        spoken = self._spoken(log, segments)
+        is_used = bool(segments) and not spoken
+        for features in self._columns(log, [topic(name, "features") for name in spoken]).values():
+            if features.type != message_types.FEATURES:
                 continue
             names = checked_array_names(log, features, "values")
             if has_voices(names):
                 is_used = True
-                self._add(log, microphone, features, names, speech_spans(segments))
+                microphone = microphone_of(features.topic)
+                self._add(log, microphone, features, names, spoken[microphone])
         self._without += not is_used
+
+    def _columns(self, log: Path, topics: TopicChoice) -> dict[str, Columns]:
+        return read_columns([log], topics, *self._span, fields=_FIELDS) if topics else {}
+
+    def _spoken(self, log: Path, segments: dict[str, Columns]) -> dict[str, Spans]:
+        """Return when somebody speaks, for each microphone that hears it."""
+        named = {microphone_of(name): each for name, each in segments.items()}
+        doubtful = [topic(name, "label") for name, each in named.items() if is_doubtful(each).any()]
+        labels = self._columns(log, doubtful)
+        spans = {
+            name: speech_spans(each, labels.get(topic(name, "label")))
+            for name, each in named.items()
+        }
+        return {name: each for name, each in spans.items() if len(each.starts)}
 
     def _add(
         self, log: Path, microphone: str, features: Columns, names: Sequence[str], speech: Spans
@@ -155,43 +178,54 @@ class _Reader:
         order = order[rows_at(speech, stamps[order]) >= 0]
         order = order[_can_be(values[order], names)]
         stamps, values = stamps[order], values[order]
-        for rows in _conversations(stamps):
-            self._tell_apart(stamps[rows], values[rows], names, place)
+        conversations = [*_conversations(stamps)]
+        if not conversations:
+            return
+        said = [self._tell_apart(stamps[rows], values[rows], names) for rows in conversations]
+        starts, ends, voice = (np.concatenate(each) for each in zip(*said, strict=True))
+        in_log, of_microphone = (np.full(len(starts), each) for each in place)
+        kept = np.concatenate([np.arange(rows.start, rows.stop) for rows in conversations])
+        energy = values[kept, list(names).index(ENERGY)]
+        turns = Turns(starts, ends, in_log, of_microphone, voice)
+        self._recent.append((turns, heard_speech(stamps[kept], energy, starts)))
+        self._recent_end = max(self._recent_end, int(starts[-1]))
 
     def _tell_apart(
-        self, stamps: Int64, values: Float32, names: Sequence[str], place: tuple[int, int]
-    ) -> None:
+        self, stamps: Int64, values: Float32, names: Sequence[str]
+    ) -> tuple[Int64, Int64, Int64]:
         of, points = voices_of(values, names)
         count = int(of.max()) + 1
         starts, ends, voice = _turns(stamps, _of_frames(of, len(stamps)))
-        log, microphone = (np.full(len(starts), each) for each in place)
-        self._turns.append(Turns(starts, ends, log, microphone, voice + self._count))
         self._voices.append(summed(points, of, count))
         self._count += count
+        return starts, ends, voice + self._count - count
+
+    def _settle(self) -> None:
+        """Leave out the turns that another microphone hears louder, as far as logs were read."""
+        if self._recent:
+            turns, heard = zip(*self._recent, strict=True)
+            for own, louder in zip(turns, heard_louder(heard), strict=True):
+                self._turns.append(Turns(*(each[~louder] for each in own)))
+        self._recent = []
 
     def speech(self, losses: Sequence[str]) -> HomeSpeech:
+        self._settle()
+        turns = Turns(*(np.concatenate(each) for each in zip(*self._turns, strict=True)))
+        voices = Evidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True)))
+        heard, voice = np.unique(turns.voice, return_inverse=True)
         return HomeSpeech(
             self._logs,
             self._microphones,
-            Turns(*(np.concatenate(each) for each in zip(*self._turns, strict=True))),
-            Evidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True))),
+            turns._replace(voice=voice),
+            voices.rows(heard),
             [*losses, *self.losses],
             self._without,
         )
 
 
-def speech_spans(segments: Columns) -> Spans:
-    """Return when a labelling says that somebody speaks.
-
-    Parameters
-    ----------
-    segments : Columns
-    """
-    labels = segments["label"]
-    names = {label for label in set(labels.tolist()) if class_name(label) == SPEECH}
-    rows = np.isin(labels.astype(str), sorted(names))
-    starts = segments["header.stamp"][rows]
-    return joined(starts, starts + segments["duration"][rows])
+def _is_segments(name: str) -> bool:
+    parts = parse_topic(name)
+    return parts is not None and (parts.labelling, parts.kind) == (LIVE, "segment")
 
 
 def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:

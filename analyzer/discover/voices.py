@@ -63,24 +63,40 @@ def same_voice(one: Evidence, others: Evidence, spread: Float64) -> Float64:
     -------
     np.ndarray [shape=(n,)], float64
     """
-    a, b = _as_independent(one), _as_independent(others)
-    both = Evidence(a.counts + b.counts, a.sums + b.sums)
-    ratio: Float64 = _likelihood(both, spread) - _likelihood(a, spread) - _likelihood(b, spread)
-    return ratio
+    return _ratio(_weighed(one, spread), _weighed(others, spread), spread)
 
 
-def _as_independent(evidence: Evidence) -> Evidence:
+class _Weighed(NamedTuple):
+    """Evidence as independent points, and how likely each is of one voice, as a logarithm."""
+
+    counts: Float64  # shape (n,)
+    sums: Float64  # shape (d, n)
+    likelihood: Float64
+
+    def rows(self, rows: Int64 | slice) -> "_Weighed":
+        return _Weighed(self.counts[rows], self.sums[:, rows], self.likelihood[rows])
+
+
+def _weighed(evidence: Evidence, spread: Float64) -> _Weighed:
     """Return evidence of the same means by as many independent points as it is worth."""
     counts = _INDEPENDENT * evidence.counts
     counts = counts / (1.0 + counts / _MOST_CERTAIN)
-    return Evidence(counts, evidence.sums * (counts / evidence.counts)[:, np.newaxis])
+    sums = np.ascontiguousarray(evidence.sums.T) * (counts / evidence.counts)
+    return _Weighed(counts, sums, _likelihood(counts, sums, spread))
 
 
-def _likelihood(evidence: Evidence, spread: Float64) -> Float64:
+def _ratio(one: _Weighed, others: _Weighed, spread: Float64) -> Float64:
+    both = _likelihood(one.counts + others.counts, one.sums + others.sums, spread)
+    return both - one.likelihood - others.likelihood
+
+
+def _likelihood(counts: Float64, sums: Float64, spread: Float64) -> Float64:
     """Return the logarithm of how likely one voice is, beside the mean of all voices."""
-    scale = 1.0 + evidence.counts[:, np.newaxis] * spread
-    terms: Float64 = evidence.sums**2 * spread / scale - np.log(scale)
-    return 0.5 * terms.sum(axis=1)
+    variance = spread[:, np.newaxis]
+    scale = 1.0 + counts * variance
+    terms = (sums**2 * (variance / scale)).sum(axis=0)
+    likelihood: Float64 = 0.5 * (terms - np.log(scale.prod(axis=0)))
+    return likelihood
 
 
 def joined(evidence: Evidence, spread: Float64) -> Int64:
@@ -100,11 +116,12 @@ def joined(evidence: Evidence, spread: Float64) -> Int64:
     counts, sums = evidence.counts.copy(), evidence.sums.copy()
     size = len(counts)
     of = np.arange(size)
+    weighed = _weighed(evidence, spread)
     ratios = np.full((size, size), -np.inf)
     for row in range(size - 1):
-        later = np.arange(row + 1, size)
-        one, others = evidence.rows(np.array([row])), evidence.rows(later)
-        ratios[row, later] = ratios[later, row] = same_voice(one, others, spread)
+        later = slice(row + 1, size)
+        one = weighed.rows(slice(row, row + 1))
+        ratios[row, later] = ratios[later, row] = _ratio(one, weighed.rows(later), spread)
     best = ratios.max(axis=1, initial=-np.inf)
     while size and best.max() > 0.0:
         row = int(best.argmax())
@@ -112,14 +129,16 @@ def joined(evidence: Evidence, spread: Float64) -> Int64:
         counts[row] += counts[other]
         sums[row] += sums[other]
         of[of == other] = row
+        stale = np.isfinite(best) & ((ratios[row] == best) | (ratios[other] == best))
         ratios[other] = ratios[:, other] = -np.inf
         there = np.flatnonzero(np.isfinite(ratios[row]))
-        now = Evidence(counts[[row]], sums[[row]])
-        ratios[row, there] = ratios[there, row] = same_voice(
-            now, Evidence(counts[there], sums[there]), spread
-        )
-        changed = [row, other, *there]
-        best[changed] = ratios[changed].max(axis=1)
+        now = _weighed(Evidence(counts[[row]], sums[[row]]), spread)
+        for kept, value in zip(weighed, now, strict=True):
+            kept[..., row] = value[..., 0]
+        ratios[row, there] = ratios[there, row] = _ratio(now, weighed.rows(there), spread)
+        stale[[row, other]] = True
+        np.maximum(best, ratios[row], out=best)
+        best[stale] = ratios[stale].max(axis=1)
     _, of = np.unique(of, return_inverse=True)
     return of.astype(np.int64)
 

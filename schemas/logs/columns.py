@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
+from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
 from hearthlog.schemas.mcap.statistics import topic_counts
 from hearthlog.schemas.messages.cdr_codec import Fields, decode_rows, ragged
@@ -104,7 +105,7 @@ class Columns:
 
 def read_columns(
     logs: Iterable[Path],
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
     start: int | None = None,
     end: int | None = None,
     fields: Collection[str] | None = None,
@@ -114,8 +115,8 @@ def read_columns(
     Parameters
     ----------
     logs : iterable of Path
-    topics : collection of str, optional
-        Names of the topics; all by default.
+    topics : collection of str or callable, optional
+        Names of the topics, or what tells whether one is read; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     fields : collection of str, optional
@@ -146,7 +147,7 @@ def read_columns(
 
 def iterate_columns(
     logs: Iterable[Path],
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
     start: int | None = None,
     end: int | None = None,
     fields: Collection[str] | None = None,
@@ -156,8 +157,8 @@ def iterate_columns(
     Parameters
     ----------
     logs : iterable of Path
-    topics : collection of str, optional
-        Names of the topics; all by default.
+    topics : collection of str or callable, optional
+        Names of the topics, or what tells whether one is read; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     fields : collection of str, optional

@@ -157,9 +157,7 @@ def _name(
     groups = _known(load_groups(file), [*undo, *names])
     summary = load_summary(summary_path(file))
     for each in undo:
-        count = unmark_group(
-            [log.path for log in home.between(0, 1 << 62)], reason_of(groups, each)
-        )
+        count = unmark_group([log.path for log in home.between()], reason_of(groups, each))
         tell(f"group {each}: {number(count, 'mark')} taken back")
         groups, summary = _renamed(groups, summary, {each: ""}, file)
     losses: list[str] = []
