@@ -15,8 +15,8 @@ from hearthlog.analyzer.doctor.topic_types import (
     SEGMENT,
     STATISTICS,
 )
+from hearthlog.models.classifiers.directions import BLOCK_FRAMES
 from hearthlog.models.classifiers.timing import LabelTiming
-from hearthlog.recorder.direction.srp_phat import BLOCK_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 

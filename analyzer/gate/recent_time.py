@@ -22,7 +22,6 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _DAY = 86_400 * NANOSECONDS
 _RECENT = 14 * _DAY
-_NEVER = 1 << 62
 _LOUD = 36, 75 * NANOSECONDS  # number of spans that are labelled, and their length
 _QUIET = 16, 120 * NANOSECONDS
 _AROUND = 10 * NANOSECONDS  # a sound
@@ -63,7 +62,7 @@ def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
         Logs, or folders of logs. What cannot be read is left out.
     """
     try:
-        entries = find_home_logs(folders).between(0, _NEVER)
+        entries = find_home_logs(folders).between()
     except LogError:  # no log at all
         return []
     newest = max((entry.start for entry in entries), default=0)

@@ -111,7 +111,12 @@ class TwoModels:
             for event in batch.events
             if isinstance(event, Features | Gap)
         ]
-        first, second = (_labelled(sound, part, classifier) for classifier in self._classifiers)
+        first, second = (
+            _labelled(
+                sound, part, StreamLabeller(one, part.start - _LABELS_WARM_UP, info.microphone)
+            )
+            for one in self._classifiers
+        )
         stamps, a, b = np.intersect1d(first.stamps, second.stamps, return_indices=True)
         after, weights = self._numbers[second.labels[b]], np.full(len(stamps), weight)
         return LabelledFrames(stamps, first.labels[a], after, first.confidence[a], weights)
@@ -123,8 +128,7 @@ class _Labelled(NamedTuple):
     confidence: Float32
 
 
-def _labelled(sound: Sequence[Features | Gap], part: Part, classifier: Classifier) -> _Labelled:
-    labeller = StreamLabeller(classifier, part.start - _LABELS_WARM_UP)
+def _labelled(sound: Sequence[Features | Gap], part: Part, labeller: StreamLabeller) -> _Labelled:
     pieces = [piece for event in sound if (piece := labeller.push(event)) is not None]
     labeller.close()
     segments = labeller.segments

@@ -78,7 +78,9 @@ def infos_for_model(
     return suited, left_out
 
 
-def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
+def read_sound(
+    info: RecorderInfo, start: int, *, directions: bool = False
+) -> Iterator[Features | Gap]:
     """Read the features and gaps of a log from a time on.
 
     Parameters
@@ -87,6 +89,8 @@ def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
         Of the log.
     start : int
         Log time, in nanoseconds of UTC.
+    directions : bool
+        Whether to read the directions of an array, too.
 
     Yields
     ------
@@ -99,7 +103,8 @@ def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
         If it is damaged, or not of a recorder, or its feature set is not installed.
     """
     try:
-        for batch in read_recorded(info, start, _NEVER, sound_only=True):
+        sound = read_recorded(info, start, _NEVER, sound_only=True, directions=directions)
+        for batch in sound:
             yield from (event for event in batch.events if isinstance(event, Features | Gap))
     except LogError as error:
         raise UnreadableError(info.path, error) from error
@@ -174,7 +179,7 @@ def warm_up(
             labels_back *= 4
         else:
             floor_back *= 4
-    return StreamLabeller(classifier)
+    return StreamLabeller(classifier, microphone=info.microphone)
 
 
 def _label_earlier(
@@ -216,9 +221,9 @@ def _label_readable(
         if other.first_frame[1] < start:
             from_start = False
             break
-    labeller = StreamLabeller(classifier, label_from, from_start=from_start)
+    labeller = StreamLabeller(classifier, label_from, info.microphone, from_start=from_start)
     for other in chosen:
-        for event in read_sound(other, start):
+        for event in read_sound(other, start, directions=labeller.takes_directions):
             labeller.push(event)
         labeller.segments.clear()
     return labeller, from_start

@@ -21,6 +21,8 @@ class StreamLabeller:
     label_from : int
         Time before which frames are not labelled, in nanoseconds of UTC; of these only the floor of
         the room is tracked, which is much quicker.
+    microphone : str
+        Its name; the directions of an array that the model knows count.
     from_start : bool
         Whether nothing is known of the sound before the first frame.
 
@@ -33,12 +35,17 @@ class StreamLabeller:
     """
 
     def __init__(
-        self, classifier: Classifier, label_from: int = 0, *, from_start: bool = False
+        self,
+        classifier: Classifier,
+        label_from: int = 0,
+        microphone: str = "",
+        *,
+        from_start: bool = False,
     ) -> None:
         self.segments: list[Segment] = []
         self.floor_converged = from_start or not classifier.timing.needs_floor
         self._label_from = label_from
-        self._labeller = Labeller(classifier)
+        self._labeller = Labeller(classifier, microphone)
         self._powers = classifier.feature_set.band_powers
         self._floor = None if self._powers is None else FloorTracker()
         self._next: int | None = None  # number of the next frame
@@ -54,6 +61,11 @@ class StreamLabeller:
     def segments_converged(self) -> bool:
         """Whether sound before the first frame would leave no trace in the segments to come."""
         return self._from_start or self._labeller.segments_converged
+
+    @property
+    def takes_directions(self) -> bool:
+        """Whether directions change its labels."""
+        return self._labeller.takes_directions
 
     @property
     def open_run(self) -> Run | None:
@@ -102,7 +114,8 @@ class StreamLabeller:
         if self._end <= self._label_from:
             self._from_start = False
             return None
-        labels, segments = self._labeller.push(event.values, floors, event.first, event.stamps)
+        sound = event.values, floors, event.first, event.stamps, event.directions
+        labels, segments = self._labeller.push(*sound)
         self.segments += segments
         return labels
 

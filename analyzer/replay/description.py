@@ -61,7 +61,13 @@ def describe(  # noqa: PLR0913, PLR0917
     description = LogDescription(
         root=output,
         node=recorded.node,
-        topics=topics_of(recorded.microphone, features.feature_names, classes, named),
+        topics=topics_of(
+            recorded.microphone,
+            features.feature_names,
+            classes,
+            named,
+            directions=recorded.has_directions,
+        ),
         infos=[info],
         metadata={
             **{k: v for k, v in recorded.metadata.items() if not k.startswith(_OF_RECORDER)},

@@ -291,7 +291,8 @@ class Player:
                 self._result.interrupted = True
                 return False
             if isinstance(event, Features):
-                messages = self._pipeline.push_features(event.values[block], first, stamps)
+                part = event.part(block)
+                messages = self._pipeline.push_features(part.values, first, stamps, part.directions)
             else:
                 messages = self._pipeline.push(Frames(first, event.samples[block], stamps))
             self._next, self._end = first + len(stamps), end

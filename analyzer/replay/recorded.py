@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.logs.typed_columns import is_compatible
+from hearthlog.models.classifiers.directions import BLOCK_FRAMES, NOWHERE, Directions
 from hearthlog.recorder.events import Gap, SourceHealth
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
@@ -19,10 +20,12 @@ from hearthlog.schemas.messages.cdr_codec import Fields
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, topic
 
 _SOUND_TYPES = {"features": message_types.FEATURES, "gap": message_types.GAP}
+_DIRECTION_TYPES = {"direction": message_types.DIRECTION}
 _TYPES = _SOUND_TYPES | {"label": message_types.LABEL, "segment": message_types.SEGMENT}
 _FIELDS = {
     message_types.FEATURES: ("header.stamp", "frame", "values"),
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
+    message_types.DIRECTION: ("header.stamp", "frame", "azimuth", "confidence"),
     message_types.DIAGNOSTICS: ("status",),
     message_types.LABEL: ("label",),
     message_types.SEGMENT: ("label",),
@@ -44,11 +47,20 @@ class Features(NamedTuple):
     values : np.ndarray [shape=(n, d)], float32
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
+    directions : Directions
+        That became known with these frames.
     """
 
     first: int
     values: Float32
     stamps: Int64
+    directions: Directions = NOWHERE
+
+    def part(self, frames: slice) -> "Features":
+        """Return some of the frames."""
+        first, stamps = self.first + (frames.start or 0), self.stamps[frames]
+        directions = self.directions.known_at(first, len(stamps))
+        return Features(first, self.values[frames], stamps, directions)
 
 
 class RecordedBatch(NamedTuple):
@@ -60,7 +72,12 @@ class RecordedBatch(NamedTuple):
 
 
 def read_recorded(
-    info: RecorderInfo, start: int, end: int, *, sound_only: bool = False
+    info: RecorderInfo,
+    start: int,
+    end: int,
+    *,
+    sound_only: bool = False,
+    directions: bool = True,
 ) -> Iterator[RecordedBatch]:
     """Read a log, one span of time after the other.
 
@@ -72,6 +89,8 @@ def read_recorded(
         Log times, in nanoseconds of UTC: from `start` on, before `end`.
     sound_only : bool
         Read only features and gaps, and compare the checksums of what is read.
+    directions : bool
+        Read those of an array, too.
 
     Yields
     ------
@@ -86,11 +105,13 @@ def read_recorded(
     """
     width = features_of(info).width
     kinds = _SOUND_TYPES if sound_only else _TYPES
+    if directions:
+        kinds = kinds | _DIRECTION_TYPES
     topics = {topic(info.microphone, kind): type_ for kind, type_ in kinds.items()}
     if not sound_only:
         topics[DIAGNOSTICS] = message_types.DIAGNOSTICS
     for batch in iterate_messages([info.path], topics, start, end):
-        by_type: _RawByType = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
+        by_type: _RawByType = {type_: [] for type_ in _FIELDS}
         for raw in batch:
             type_ = topics[raw.channel.topic]
             if is_compatible(raw.channel, raw.schema, type_, _FIELDS[type_]):
@@ -127,12 +148,13 @@ def _events(
         path: np.concatenate([fields[path] for fields in features])
         for path in (features[0] if features else ())
     }
+    known = [_directions(raw) for raw in by_type[message_types.DIRECTION]]
     count = len(times) - len(others)
     events: list[Features | Gap | SourceHealth] = []
     begin = 0
     for position in [*np.flatnonzero(order >= count).tolist(), len(order)]:
         if position > begin:
-            events += _runs(frames, order[begin:position])
+            events += (_located(run, known) for run in _runs(frames, order[begin:position]))
         if position < len(order) and (event := others[order[position] - count]) is not None:
             events.append(event)
         begin = position + 1
@@ -158,6 +180,33 @@ def _features(raw: RawMessages, width: int) -> Fields:
         raise LogError(f"{columns.topic}: holds a frame of number {numbers.max()}")
     _check_times(columns, columns["header.stamp"])
     return columns.fields | {"frame": numbers.astype(np.int64)}
+
+
+def _directions(raw: RawMessages) -> tuple[Int64, Directions]:
+    """Return directions, and when they were known."""
+    (columns,) = decode([raw], _FIELDS[message_types.DIRECTION])
+    numbers, azimuths, confidences = (columns[k] for k in ("frame", "azimuth", "confidence"))
+    possible = (numbers <= _LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)
+    possible &= (np.abs(azimuths) <= np.float32(np.pi)) & (confidences >= 0) & (confidences <= 1)
+    if not possible.all():
+        raise LogError(f"{columns.topic}: holds directions that no array has")
+    frames = numbers.astype(np.int64)
+    return columns.log_times, Directions(frames, columns["header.stamp"], azimuths, confidences)
+
+
+def _located(run: Features, known: Sequence[tuple[Int64, Directions]]) -> Features:
+    """Add the directions that became known with some frames; others are of sound that is not here.
+
+    Frames of another run of a recorder may have the same numbers, but not the same times.
+    """
+    found = NOWHERE
+    for times, directions in known:
+        places = directions.last_frames - run.first
+        inside = np.flatnonzero((places >= 0) & (places < len(run.stamps)))
+        same = inside[run.stamps[places[inside]] == times[inside]]
+        found = found.followed_by(directions.rows(same))
+    _, once = np.unique(found.frames, return_index=True)
+    return run._replace(directions=found.rows(once))
 
 
 def _gaps(raw: RawMessages) -> list[Gap]:

@@ -7,13 +7,21 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import home_temperature
+from hearthlog.analyzer.training.cross_validation import cross_validate
 from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset
 from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.learned_segments import learned_digests, segment_digests
-from hearthlog.analyzer.training.method import Examples, Method, cross_validate, prepare
+from hearthlog.analyzer.training.method import Examples, Method, prepare
+from hearthlog.analyzer.training.sightings import with_directions
 from hearthlog.analyzer.training.transitions import default_transitions
-from hearthlog.models.classifiers.description import MOST_WEIGHT, Amount, ClassMetrics, Description
+from hearthlog.models.classifiers.description import (
+    FORMAT,
+    MOST_WEIGHT,
+    Amount,
+    ClassMetrics,
+    Description,
+)
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Bool, Indices
 from hearthlog.schemas.progress import ignore_progress
@@ -110,8 +118,8 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     was_learned = base.description.training_data.home_frames > 0  # by an earlier version
     if len(transitions) and (was_learned or home.classes != base.classes):
         transitions = default_transitions(home.classes)
-    return Model(
-        description.model_copy(update=update),
+    adapted = Model(
+        description.model_copy(update=update | {"format": FORMAT, "direction_microphones": []}),
         arrays,
         transitions=transitions,
         training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
@@ -120,6 +128,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         training_target=base.training_target,
         training_group=base.training_group,
     )
+    return with_directions(adapted, home.target, home.sightings)
 
 
 def _check_every_class(base: Model, examples: Examples, classes: Sequence[str]) -> None:

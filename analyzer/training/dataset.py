@@ -10,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.rooms import RoomCopy, in_room
 from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.sightings import Sighting
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.description import Amount
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
@@ -50,6 +50,8 @@ class Recording(NamedTuple):
         Segments of it at most, evenly spaced; None for no limit.
     span : (int, int) or None
         Its start and end in nanoseconds of UTC, if that is known.
+    sighting : Sighting or None
+        Whence it came, if that is known.
     """
 
     label: str
@@ -62,6 +64,7 @@ class Recording(NamedTuple):
     copies: Sequence[RoomCopy] = ()
     most: int | None = None
     span: tuple[int, int] | None = None
+    sighting: Sighting | None = None
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,8 @@ class Dataset:
         Number of recordings that gave no segment, by the reason.
     spans : np.ndarray [shape=(k, 2)], int64
         Starts and ends of the recordings that were used, in nanoseconds of UTC, if they are known.
+    sightings : sequence of (Sighting or None)
+        Whence the recording of each segment came, if that is known; empty if it is of none.
     """
 
     windows: Float32
@@ -110,6 +115,7 @@ class Dataset:
     collections: Mapping[tuple[str, str], int]
     skipped: Mapping[str, int]
     spans: Int64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    sightings: Sequence[Sighting | None] = ()
 
     def __len__(self) -> int:
         return len(self.target)
@@ -277,7 +283,8 @@ def cut_recordings(
     target, group_of, collection_of = np.concatenate(rows).T
     weight = np.concatenate(weights)
     kept = _thinned((target * len(groups) + group_of) * len(collections) + collection_of, weight)
-    windows, floors = _cut([chosen[place] for place in kept.tolist()], features)
+    segments = [chosen[place] for place in kept.tolist()]
+    windows, floors = _cut(segments, features)
     return Dataset(
         windows=windows[0],
         target=target[kept],
@@ -293,6 +300,7 @@ def cut_recordings(
         collections=dict(used),
         skipped=dict(sorted(skipped.items())),
         spans=np.array(spans, np.int64).reshape(-1, 2),
+        sightings=[one.recording.sighting for one in segments],
     )
 
 
@@ -321,28 +329,6 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
         for place, copy in enumerate(recording.copies, 1):
             windows[place, number], floors[place, number] = copy.features[frames], copy.floor
     return windows, floors
-
-
-def clip_frames(clip: LabelledClip) -> Float32:
-    """Read a clip.
-
-    Parameters
-    ----------
-    clip : LabelledClip
-
-    Returns
-    -------
-    np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Whole frames at 16 kHz; none of a part behind the end of the file.
-
-    Raises
-    ------
-    SourceError
-        If the clip cannot be read.
-    """
-    cutter = FrameCutter()
-    blocks = [cutter.push(block) for block in read_audio(clip.path, clip.start, clip.end)]
-    return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
 
 
 def _recording(

@@ -10,6 +10,7 @@ import numpy as np
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
+from hearthlog.analyzer.training.sightings import sighting_of
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
@@ -197,6 +198,7 @@ def recording_of(
         Whether it is in the room.
     """
     stamps = sound.stamps[frames]
+    span = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
     day = np.datetime64(int(stamps[0]) // NANOSECONDS, "s").astype("datetime64[D]")
     return Recording(
         label,
@@ -207,5 +209,6 @@ def recording_of(
         HOME_WEIGHT,
         None if sound.floors is None or not floored else sound.floors[frames],
         most=MOST_OF_MARK,
-        span=(int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS),
+        span=span,
+        sighting=sighting_of(sound.microphone, sound.directions.begun_in(*span)),
     )

@@ -57,7 +57,7 @@ class Lessons(NamedTuple):
     nothing: str
 
 
-def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
+def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> Lessons:
     """Read what marks teach a model, and what it is to keep.
 
     Parameters
@@ -66,6 +66,9 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
         Folders of logs, with review layers beside them, and of enrolled sounds.
     model : Model
         Which is to be adapted.
+    scenario : str, optional
+        For which it labels: only what was marked of this scenario, by its name, is learned from;
+        else only what was marked of none.
 
     Raises
     ------
@@ -80,10 +83,10 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
     candidates: list[Candidates] = []
     counts, window = _Counts(), features.window_frames
     for folder in folders:
-        sounds = list(_counted(read_reviewed_sound(folder, features), counts))
+        sounds = list(_counted(read_reviewed_sound(folder, features, scenario), counts))
         marked += marked_recordings(sounds, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
-    scenario, notes, unlearned = _with_new_classes(marked, model, features)
+    taught, notes, unlearned = _with_new_classes(marked, model, features)
     marked = [one for one in marked if one.label not in unlearned]
     notes += counts.notes()
     in_room = [one for one in marked if one.floor is not None]
@@ -91,16 +94,16 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
     if marked:
         kept = chosen(candidates, model)
         if in_room and SILENCE in model.classes and _silent(kept) < MOST_CONFIRMED:
-            kept = chosen([*candidates, *unreviewed_silence(folders, model)], model)
+            kept = chosen([*candidates, *unreviewed_silence(folders, model, scenario)], model)
             if not _silent([*kept, *in_room]):
                 raise DataError(_NO_SILENCE)
         if in_room:
-            kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model))
+            kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model), scenario)
         if in_room and not counts.looked_at:
             notes.append(_NOT_LOOKED_AT)
-    segments = cut_recordings([*marked, *kept], scenario, features)
+    segments = cut_recordings([*marked, *kept], taught, features)
     if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
-        segments = cut_recordings([], scenario, features)
+        segments = cut_recordings([], taught, features)
     nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
     return Lessons(segments, notes, "" if len(segments) else nothing)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,8 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
-from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
+from hearthlog.models.classifiers.directions import NOWHERE, Directions
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
@@ -19,10 +20,11 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import ENROLLED, find_logs
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.messages.topics import LIVE, scenario_labelling, topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = ("header.stamp", "frame", "values")
+_DIRECTION_FIELDS = ("frame", "header.stamp", "azimuth", "confidence")
 _WARM_UP = 600 * NANOSECONDS
 _AROUND = 2 * NANOSECONDS  # by which a short mark is extended, and more
 
@@ -44,6 +46,10 @@ class HomeSound:
         Features; d is 0 if they are of another set.
     floors : np.ndarray [shape=(n, b)], float64, or None
         Floor of the room; None for a feature set without bands.
+    labelling : str
+        The recorder's that it was said of: `live`, or `scenario/<name>`.
+    directions : Directions
+        Of an array; none where only features were wanted.
     """
 
     log: Path
@@ -54,6 +60,8 @@ class HomeSound:
     frames: Int64
     values: Float32
     floors: Float64 | None
+    labelling: str = LIVE
+    directions: Directions = NOWHERE
 
     @property
     def enrolled(self) -> bool:
@@ -85,7 +93,9 @@ class HomeSound:
         return touched
 
 
-def read_reviewed_sound(folder: Path, features: FeatureSet) -> Iterator[HomeSound]:
+def read_reviewed_sound(
+    folder: Path, features: FeatureSet, scenario: str = ""
+) -> Iterator[HomeSound]:
     """Read what was marked or looked at in the logs of a folder, log by log.
 
     Parameters
@@ -93,6 +103,8 @@ def read_reviewed_sound(folder: Path, features: FeatureSet) -> Iterator[HomeSoun
     folder : Path
         Folder of logs, with review layers beside them, and of enrolled sounds.
     features : FeatureSet
+    scenario : str, optional
+        What is said of this scenario, by its name, instead of the sounds of the home.
 
     Raises
     ------
@@ -104,17 +116,18 @@ def read_reviewed_sound(folder: Path, features: FeatureSet) -> Iterator[HomeSoun
     other: tuple[Path, str] | None = None  # log and microphone of another set
     usable = False
     for log in find_logs(folder, enrolled=True):
-        spans: list[Mark | ReviewedSpan] = [*read_marks(log), *read_reviewed(log)]
+        said = read_review(log).get(scenario, ((), ()))
+        spans: list[Mark | ReviewedSpan] = [*said[0], *said[1]]
         if not spans:
             continue
         names = {span.microphone for span in spans}
         limits = min(span.start for span in spans), max(span.end for span in spans)
-        for sound in read_sound_of(log, features, names, limits):
+        for sound in read_sound_of(log, features, names, limits, scenario):
             if sound.values.shape[1]:
                 usable = True
             elif sound.marks:
                 other = log, sound.microphone
-            yield sound
+            yield replace(sound, directions=_directions(log, sound.microphone, limits))
     if other is not None and not usable:
         name = _set_of(*other)
         raise DataError(
@@ -128,6 +141,7 @@ def read_sound_of(
     features: FeatureSet,
     microphones: Collection[str],
     limits: tuple[int, int],
+    scenario: str = "",
 ) -> Iterator[HomeSound]:
     """Read what microphones recorded in a part of a log, and some seconds around it.
 
@@ -141,13 +155,15 @@ def read_sound_of(
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC. The floor is tracked from ten minutes
         before it on.
+    scenario : str, optional
+        As of `read_reviewed_sound`.
 
     Raises
     ------
     LogError
         If the log or its review layer is damaged.
     """
-    marks, reviewed = read_marks(log), read_reviewed(log)
+    marks, reviewed = read_review(log).get(scenario, ((), ()))
     names = {topic(microphone, "features"): microphone for microphone in sorted(microphones)}
     start, end = limits[0] - _WARM_UP, limits[1] + _AROUND
     columns = read_columns([log], names, start, end, _FIELDS)
@@ -172,7 +188,17 @@ def read_sound_of(
             recorded["frame"][own].astype(np.int64),
             values[own],
             None if floors is None else floors[own],
+            scenario_labelling(scenario) if scenario else LIVE,
         )
+
+
+def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directions:
+    name, start, end = topic(microphone, "direction"), limits[0] - _AROUND, limits[1] + _AROUND
+    columns = read_columns([log], {name}, start, end, _DIRECTION_FIELDS).get(name)
+    if columns is None:
+        return NOWHERE
+    numbers, *others = (columns[field] for field in _DIRECTION_FIELDS)
+    return Directions(numbers.astype(np.int64), *others)
 
 
 def _coarse(values: Float32, features: FeatureSet) -> Bool:

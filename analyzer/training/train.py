@@ -17,20 +17,15 @@ from hearthlog.analyzer.training.calibration import (
     inverse_temperature,
     unknown_bias,
 )
+from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import DEFAULT
 from hearthlog.analyzer.training.learned_segments import segment_digests
-from hearthlog.analyzer.training.method import (
-    Fold,
-    Learned,
-    Method,
-    cross_validate,
-    prepare,
-    softmax,
-)
+from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import calibration_error
+from hearthlog.analyzer.training.sightings import with_directions
 from hearthlog.analyzer.training.transitions import (
     LAG_SECONDS,
     REACH_SECONDS,
@@ -135,6 +130,7 @@ def train_model(  # noqa: PLR0913, PLR0917
         transitions=(default_transitions(data.classes) if smoothing == "hmm" else np.empty((0, 0))),
         training_digests=segment_digests(data.windows),
     )
+    model = with_directions(model, data.target, data.sightings)
     if method.remembered(model) is not None:
         return model
     return replace(

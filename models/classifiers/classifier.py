@@ -7,7 +7,7 @@ from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.arrays import Float32, Float64
 
 _ROWS_AT_ONCE = 256
 _STEPS = 1 << 16  # of a probability; what is finer is noise, of the processor too
@@ -61,6 +61,23 @@ class Classifier:
         self._doubts = description.novelty == "doubt"
         self._known = np.array([name != UNKNOWN for name in self.classes])
         self._machine = classifier_kind(description.kind).machine(model)
+        arrays = description.direction_microphones
+        self._direction_weights = dict(zip(arrays, model.direction_weights, strict=True))
+
+    def direction_weights(self, microphone: str) -> Float64 | None:
+        """Return what the directions of an array say, as `DirectionEvidence` takes it.
+
+        Parameters
+        ----------
+        microphone : str
+            Its name.
+
+        Returns
+        -------
+        np.ndarray [shape=(C, S)], float64, or None
+            None where the model takes no directions of this microphone.
+        """
+        return self._direction_weights.get(microphone)
 
     def probabilities(self, inputs: Float32) -> Float32:
         """Compute the probability of each class in each window.
@@ -77,13 +94,15 @@ class Classifier:
         """
         return self.classify(inputs)[0]
 
-    def classify(self, inputs: Float32) -> tuple[Float32, Float32]:
+    def classify(self, inputs: Float32, evidence: Float64 | None = None) -> tuple[Float32, Float32]:
         """Compute the probability of each class, and the novelty of each window.
 
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
             Finite.
+        evidence : np.ndarray [shape=(n, C)], float64, optional
+            Of something else: what is added to the logarithms of the probabilities.
 
         Returns
         -------
@@ -101,6 +120,8 @@ class Classifier:
             decision, novelty[rows] = self._machine.decide(inputs[rows])
             decision += self._bias
             decision *= self._inverse_temperature
+            if evidence is not None:
+                decision += evidence[rows]
             decision -= decision.max(axis=1, keepdims=True)
             np.exp(decision, out=decision)
             result[rows] = decision / decision.sum(axis=1, keepdims=True)

@@ -16,6 +16,8 @@ MOST_SPANS = 1000  # forty kilobytes
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
 MOST_FEATURES = 5000  # those of a network have 4097 at most
 FORMAT: Final = 5
+FORMAT_OF_DIRECTIONS: Final = 6  # which a version that cannot use them refuses
+MOST_ARRAYS = 16  # of microphones, in a home
 MOST_WEIGHT: Final = 10.0
 SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
 _OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
@@ -195,9 +197,11 @@ class Description(_Record):
     elsewhere : Elsewhere or None
         Scores in collections left out, from which the temperature is; None if it is from sources
         left out, for want of collections.
+    direction_microphones : list of str
+        The arrays of a home whose directions the model takes, by name; with any, the format is 6.
     """
 
-    format: Literal[5]
+    format: Literal[5, 6]
     kind: _Text
     parameters: dict[_Text, Any]
     method: _Text
@@ -222,6 +226,7 @@ class Description(_Record):
     smoothing: Smoothing
     training_data: TrainingData
     metrics: Metrics
+    direction_microphones: Annotated[list[_Text], Field(max_length=MOST_ARRAYS)] = []
     versions: dict[_Text, _Text]
 
 
@@ -251,7 +256,7 @@ def read_description(text: str) -> Description:
 
 def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
     number = content.get("format")
-    if isinstance(number, int) and number > FORMAT:
+    if isinstance(number, int) and number > FORMAT_OF_DIRECTIONS:
         raise ModelError(f"is of format {number}, newer than this version of hearthlog: update it")
     if number == 2:
         inputs = content.get("inputs", "statistics")

@@ -33,6 +33,9 @@ class Model:
         Floor of the room in each training window; empty for a feature set without bands.
     training_target, training_group : np.ndarray [shape=(m,)], int64
         Classes of the training windows, and numbers of their source groups.
+    direction_weights : np.ndarray [shape=(M, C, S)], float64
+        For each array of the description, logarithms of how much likelier each class is with each
+        sector of the circle; empty without arrays.
     name : str
         Stem of the model file.
     sha256 : str
@@ -47,6 +50,7 @@ class Model:
     training_floor: Float64 = field(default_factory=lambda: np.empty((0, 0)))
     training_target: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     training_group: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
+    direction_weights: Float64 = field(default_factory=lambda: np.empty((0, 0, 0)))
     name: str = ""
     sha256: str = ""
 

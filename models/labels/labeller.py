@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.directions import NOWHERE, DirectionEvidence, Directions
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
 from hearthlog.schemas.arrays import Float32, Float64, Int64
@@ -73,6 +74,8 @@ class Labeller:
     Parameters
     ----------
     classifier : Classifier
+    microphone : str
+        Name of the one that is heard; the directions of an array that the model knows count.
 
     Attributes
     ----------
@@ -82,28 +85,41 @@ class Labeller:
     segmenter : Segmenter
     """
 
-    def __init__(self, classifier: Classifier) -> None:
+    def __init__(self, classifier: Classifier, microphone: str = "") -> None:
         self.classes = classifier.classes
         self.segmenter = Segmenter(classifier.classes, classifier.smoothing, classifier.transitions)
         self.timing = classifier.timing
         self._classifier = classifier
         self._inputs = classifier.inputs.stream()
         self._window: _Frames | None = None  # the last frames, one less than a window
-        self._floors_converged = not self.timing.needs_floor
+        weights = classifier.direction_weights(microphone)
+        self._evidence = None if weights is None else DirectionEvidence(weights)
+        self._inputs_converged = not self.timing.needs_floor and self._evidence is None
         self._first_label = self._first_segment = 0  # numbers of frames
 
     @property
     def states_converged(self) -> bool:
         """Whether frames before the first one would leave no trace in the states to come."""
-        return self._floors_converged and self.segmenter.states_converged
+        return self._inputs_converged and self.segmenter.states_converged
 
     @property
     def segments_converged(self) -> bool:
         """Whether frames before the first one would leave no trace in the segments to come."""
-        return self._floors_converged and self.segmenter.segments_converged
+        return self._inputs_converged and self.segmenter.segments_converged
 
-    def follow(
-        self, features: Float32, floors: Float64 | None, stamps: Int64, frame: int, unlabelled: int
+    @property
+    def takes_directions(self) -> bool:
+        """Whether directions change its labels."""
+        return self._evidence is not None
+
+    def follow(  # noqa: PLR0913, PLR0917
+        self,
+        features: Float32,
+        floors: Float64 | None,
+        stamps: Int64,
+        frame: int,
+        unlabelled: int,
+        directions: Directions = NOWHERE,
     ) -> None:
         """Take the place of another labeller before a frame, with which segments begin.
 
@@ -119,12 +135,21 @@ class Labeller:
             Number of the frame.
         unlabelled : int
             Number of the first frame that the other one has not labelled.
+        directions : Directions, optional
+            Of the last second before the frame, or more.
         """
         self._first_label, self._first_segment = unlabelled, frame
         self._advance(features, floors if self.timing.needs_floor else None, stamps)
+        if self._evidence is not None:
+            self._evidence.push(directions, frame - len(features), len(features), 0)
 
     def push(
-        self, features: Float32, floors: Floors | None, first: int, stamps: Int64
+        self,
+        features: Float32,
+        floors: Floors | None,
+        first: int,
+        stamps: Int64,
+        directions: Directions = NOWHERE,
     ) -> tuple[FrameLabels, list[Segment]]:
         """Add successive frames.
 
@@ -138,6 +163,8 @@ class Labeller:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
+        directions : Directions, optional
+            That become known with these frames.
 
         Returns
         -------
@@ -146,14 +173,13 @@ class Labeller:
         segments : list of Segment
             Those whose end these frames decide.
         """
-        powers = None
-        if floors is not None and self.timing.needs_floor:
-            powers = floors.powers
-            if floors.converged and not self._floors_converged:
-                self._floors_converged = True
-                self.segmenter.forget()
+        powers = floors.powers if floors is not None and self.timing.needs_floor else None
+        self._converge(floors, first)
         inputs, window = self._advance(features, powers, stamps)
-        probabilities, novelty = self._classify(inputs, window, powers)
+        evidence = None
+        if self._evidence is not None:
+            evidence = self._evidence.push(directions, first, len(features), len(inputs))
+        probabilities, novelty = self._classify(inputs, window, powers, evidence)
         count, spoken = len(inputs), self.timing.label_frame
         first = first + len(features) - count - self.timing.delay
         labelled = LabelledFrames(
@@ -189,8 +215,20 @@ class Labeller:
             In the order of time.
         """
         self._inputs.restart()
+        if self._evidence is not None:
+            self._evidence.restart()
         self._window, self._first_label, self._first_segment = None, 0, 0
         return self.segmenter.close(end)
+
+    def _converge(self, floors: Floors | None, first: int) -> None:
+        """Note from which frame on the inputs do not depend on sound before the first frame."""
+        if self._inputs_converged or (
+            self.timing.needs_floor and not (floors and floors.converged)
+        ):
+            return
+        if self._evidence is None or self._evidence.is_full(first):
+            self._inputs_converged = True
+            self.segmenter.forget()
 
     def _advance(
         self, features: Float32, floors: Float64 | None, stamps: Int64
@@ -215,18 +253,23 @@ class Labeller:
         return self._inputs(features, floors), frames
 
     def _classify(
-        self, inputs: Float32, window: "_Frames", floors: Float64 | None
+        self,
+        inputs: Float32,
+        window: "_Frames",
+        floors: Float64 | None,
+        evidence: Float64 | None,
     ) -> tuple[Float32, Float32]:
         """Classify windows; those that are not above the floor by the gate are silence."""
         gate, powers = self._classifier.gate, self._classifier.feature_set.band_powers
         if not gate or floors is None or powers is None or not len(inputs):
-            return self._classifier.classify(inputs)
+            return self._classifier.classify(inputs, evidence)
         floors = floors[len(floors) - len(inputs) :]
         quiet = is_quiet(powers(window.features), floors, self.timing.window_frames, gate)
         probabilities = np.zeros((len(inputs), len(self.classes)), np.float32)
         novelty = np.zeros(len(inputs), np.float32)
         probabilities[quiet, self.classes.index(SILENCE)] = 1.0
-        probabilities[~quiet], novelty[~quiet] = self._classifier.classify(inputs[~quiet])
+        loud = None if evidence is None else evidence[~quiet]
+        probabilities[~quiet], novelty[~quiet] = self._classifier.classify(inputs[~quiet], loud)
         return probabilities, novelty
 
 

@@ -109,6 +109,9 @@ def model_card(model: Model) -> str:
     if frames := description.training_data.home_frames:
         minutes = frames * FRAME_SECONDS / 60
         lines += ["", f"What follows what is from {minutes:.0f} minutes of a home without marks."]
+    if arrays := description.direction_microphones:
+        named = ", ".join(arrays)
+        lines += ["", f"Takes the directions of {named}; other microphones are labelled without."]
     if description.training_data.simulated:
         lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
     lines += [*_elsewhere(description), "", "Learned from recordings of:", ""]

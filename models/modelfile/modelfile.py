@@ -16,11 +16,13 @@ from safetensors.numpy import load, save
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import (
+    FORMAT_OF_DIRECTIONS,
     Description,
     first_problem,
     one_line,
     read_description,
 )
+from hearthlog.models.classifiers.directions import MOST_EVIDENCE, SECTORS
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
@@ -44,6 +46,7 @@ _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are op
     "training_floor": np.dtype(np.float64),
     "training_target": np.dtype(np.int64),
     "training_group": np.dtype(np.int64),
+    "direction_weights": np.dtype(np.float64),
 }
 
 
@@ -254,7 +257,11 @@ def _problem(description: Description) -> str | None:
         classifier_kind(description.kind).parameters.model_validate(description.parameters)
     except ValidationError as error:
         return first_problem(error)
-    return _problem_of_labels(description, features) or _problem_of_classes(description)
+    return (
+        _problem_of_labels(description, features)
+        or _problem_of_classes(description)
+        or _problem_of_arrays(description)
+    )
 
 
 def _problem_of_labels(description: Description, features: FeatureSet) -> str | None:
@@ -284,6 +291,16 @@ def _problem_of_classes(description: Description) -> str | None:
     return None
 
 
+def _problem_of_arrays(description: Description) -> str | None:
+    """Return what is wrong with the arrays of microphones whose directions a model takes."""
+    names = description.direction_microphones
+    if len(set(names)) < len(names):
+        return "its direction_microphones name one twice"
+    if bool(names) != (description.format == FORMAT_OF_DIRECTIONS):
+        return f"format: is {description.format}; those with directions are {FORMAT_OF_DIRECTIONS}"
+    return None
+
+
 def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | None:
     """Return what is wrong with the arrays of a model."""
     kind, classes = classifier_kind(description.kind), len(description.classes)
@@ -297,13 +314,20 @@ def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | 
     for name, shape in shapes.items():
         if problem := _problem_of_array(arrays[name], dtypes[name], shape):
             return f"{name} {problem}"
+    return _problem_of_values(classes, arrays) or kind.problem(classes, arrays)
+
+
+def _problem_of_values(classes: int, arrays: Mapping[str, Array]) -> str | None:
+    """Return what is wrong with arrays that all kinds of classifiers have."""
     target = arrays.get("training_target", np.empty(0))
     if ((target < 0) | (target >= classes)).any():
         return "training_target has classes that the model has not"
+    if (np.abs(arrays.get("direction_weights", np.empty(0))) > MOST_EVIDENCE).any():
+        return f"direction_weights has values beyond {MOST_EVIDENCE:g}"
     transitions = arrays.get("transitions", np.ones((1, 1)))
     if (transitions < 0).any() or (np.abs(transitions.sum(axis=1) - 1.0) > _ROUNDING).any():
         return "the rows of transitions are no probabilities"
-    return kind.problem(classes, arrays)
+    return None
 
 
 def _problem_of_array(
@@ -327,6 +351,9 @@ def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, 
     shapes = classifier_kind(description.kind).shapes(classes, width, arrays)
     if description.smoothing.method == "hmm":
         shapes["transitions"] = (classes, classes)
+    if description.direction_microphones:
+        count = len(description.direction_microphones)
+        shapes["direction_weights"] = (count, classes, SECTORS)
     digests = arrays.get("training_digests", np.empty(0))
     if digests.ndim and len(digests):
         shapes["training_digests"] = (len(digests),)

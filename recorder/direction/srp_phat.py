@@ -12,12 +12,12 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from hearthlog.models.classifiers.directions import BLOCK_FRAMES
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
-BLOCK_FRAMES = 4  # for which there is one direction: 0.2 s
 _WINDOW, _HOP = 400, 200  # samples
 _HOPS = FRAME_SAMPLES // _HOP  # of a frame
 _LOWEST, _HIGHEST = 200.0, 7000.0  # Hz
@@ -40,7 +40,7 @@ _STARTS = np.searchsorted(_FREQUENCIES[_KEPT], _EDGES)
 _WIDTHS = np.diff([*_STARTS, _BINS])
 
 
-class Directions(NamedTuple):
+class Located(NamedTuple):
     """Directions of the blocks in which something could be located.
 
     Attributes
@@ -59,7 +59,7 @@ class Directions(NamedTuple):
     confidences: Float32
 
 
-_NOWHERE = Directions(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+_NOWHERE = Located(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
 
 
 class DirectionFinder:
@@ -90,7 +90,7 @@ class DirectionFinder:
         self._tail = np.zeros((_WINDOW - _HOP, self._channels), np.float32)
         self._past = np.zeros((_ECHO_HOPS, len(_STARTS)), np.float32)  # powers of the last hops
 
-    def __call__(self, frames: Float32, first: int) -> Directions:
+    def __call__(self, frames: Float32, first: int) -> Located:
         """Add successive frames.
 
         Parameters
@@ -102,7 +102,7 @@ class DirectionFinder:
 
         Returns
         -------
-        Directions
+        Located
             Of the blocks that these frames complete.
         """
         begin = 0
@@ -120,7 +120,7 @@ class DirectionFinder:
         steered = self._steered(frames[: blocks * BLOCK_FRAMES], first + begun)
         azimuths, confidences = self._peaks(steered)
         sure = np.flatnonzero(confidences >= _LEAST_CONFIDENCE)
-        return _directions(begun + sure * BLOCK_FRAMES, azimuths[sure], confidences[sure])
+        return _located(begun + sure * BLOCK_FRAMES, azimuths[sure], confidences[sure])
 
     def _steered(self, frames: Float32, first: int) -> Float32:
         """Return how well the phases of each block agree with each direction, -1 to 1."""
@@ -181,7 +181,7 @@ class DirectionFinder:
         return azimuths, peak - steered.mean(axis=1)
 
 
-def _directions(places: Int64, azimuths: Float64, confidences: Float64) -> Directions:
+def _located(places: Int64, azimuths: Float64, confidences: Float64) -> Located:
     wrapped = np.pi - (np.pi - azimuths) % (2 * np.pi)
     rounded = (np.rint(each * _STEPS) / _STEPS for each in (wrapped, confidences))
-    return Directions(places, *(each.astype(np.float32) for each in rounded))
+    return Located(places, *(each.astype(np.float32) for each in rounded))

@@ -1,29 +1,28 @@
-"""Directions, as messages."""
+"""Directions of an array's frames, and their messages."""
 
 import numpy as np
 
+from hearthlog.models.classifiers.directions import BLOCK_FRAMES, NOWHERE, Directions
 from hearthlog.recorder.direction.channel_watch import ChannelWatch
 from hearthlog.recorder.direction.geometry import ArrayGeometry
-from hearthlog.recorder.direction.srp_phat import BLOCK_FRAMES, DirectionFinder
+from hearthlog.recorder.direction.srp_phat import DirectionFinder
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
 from hearthlog.schemas.messages.topics import topic
 
 
-class DirectionMessages:
-    """Finds whence the sound of an array comes, and encodes it.
+class ArrayDirections:
+    """Finds whence the sound of an array comes, and watches its channels.
 
     Parameters
     ----------
-    microphone : str
-        Its name.
     geometry : ArrayGeometry
     """
 
-    def __init__(self, microphone: str, geometry: ArrayGeometry) -> None:
-        self._microphone = microphone
+    def __init__(self, geometry: ArrayGeometry) -> None:
         self._finder = DirectionFinder(geometry)
         self._watch = ChannelWatch(len(geometry.positions))
         self.restart()
@@ -37,39 +36,51 @@ class DirectionMessages:
         """Return what is wrong with the channels and what to do; empty if nothing is."""
         return self._watch.problem()
 
-    def __call__(self, frames: Frames) -> list[EncodedMessage]:
-        """Encode the directions of the blocks that these frames complete.
+    def __call__(self, frames: Frames) -> Directions:
+        """Find the directions of the blocks that these frames complete.
 
         Parameters
         ----------
         frames : Frames
             The next ones. Without channels, as of a microphone that is heard in place of the array,
             they have no direction.
-
-        Returns
-        -------
-        list of EncodedMessage
-            In the order of their log times: each is known with the last frame of its block.
         """
         if frames.channels is None:
             self.restart()
-            return []
+            return NOWHERE
         self._watch.add(frames.channels)
-        directions = self._finder(frames.channels, frames.first)
+        places, azimuths, confidences = self._finder(frames.channels, frames.first)
         held = len(self._stamps)
         stamps = np.concatenate([self._stamps, frames.stamps])
         self._stamps = stamps[1 - BLOCK_FRAMES :]
-        begin = stamps[held + directions.places]
-        columns: dict[str, Column] = {
-            "header.stamp": begin,
-            "header.frame_id": self._microphone,
-            "frame": frames.first + directions.places,
-            "azimuth": directions.azimuths,
-            "confidence": directions.confidences,
-        }
-        rows = encode_rows(message_types.DIRECTION, columns, len(begin))
-        known = stamps[held + directions.places + BLOCK_FRAMES - 1]
-        name = topic(self._microphone, "direction")
-        return [
-            EncodedMessage(time, name, row) for time, row in zip(known.tolist(), rows, strict=True)
-        ]
+        return Directions(frames.first + places, stamps[held + places], azimuths, confidences)
+
+
+def direction_messages(
+    microphone: str, directions: Directions, known: Int64
+) -> list[EncodedMessage]:
+    """Encode directions.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    directions : Directions
+    known : np.ndarray [shape=(m,)], int64
+        Starts of the last frames of their blocks, in nanoseconds of UTC.
+
+    Returns
+    -------
+    list of EncodedMessage
+        In the order of their log times: each is known with the last frame of its block.
+    """
+    columns: dict[str, Column] = {
+        "header.stamp": directions.stamps,
+        "header.frame_id": microphone,
+        "frame": directions.frames,
+        "azimuth": directions.azimuths,
+        "confidence": directions.confidences,
+    }
+    rows = encode_rows(message_types.DIRECTION, columns, len(known))
+    name = topic(microphone, "direction")
+    return [EncodedMessage(t, name, row) for t, row in zip(known.tolist(), rows, strict=True)]

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.directions import Directions
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
 from hearthlog.models.labels.segments import Segment
@@ -43,15 +44,21 @@ class LabelStream:
         self.last: FrameLabels | None = None
         self._microphone = microphone
         self._labelling = labelling
-        self._labeller = Labeller(classifier)
+        self._labeller = Labeller(classifier, microphone)
 
     @property
     def delay(self) -> int:
         """Frames from one to that at which its label is known."""
         return self._labeller.timing.delay
 
-    def follow(
-        self, features: Float32, floors: Float64 | None, stamps: Int64, frame: int, unlabelled: int
+    def follow(  # noqa: PLR0913, PLR0917
+        self,
+        features: Float32,
+        floors: Float64 | None,
+        stamps: Int64,
+        frame: int,
+        unlabelled: int,
+        directions: Directions,
     ) -> None:
         """Take the place of another stream before a frame; as `Labeller.follow`.
 
@@ -65,11 +72,18 @@ class LabelStream:
             Number of the frame.
         unlabelled : int
             Number of the first frame that has no label yet.
+        directions : Directions
+            Of the last second before it, or more.
         """
-        self._labeller.follow(features, floors, stamps, frame, unlabelled)
+        self._labeller.follow(features, floors, stamps, frame, unlabelled, directions)
 
     def push(
-        self, features: Float32, floors: Floors | None, first: int, stamps: Int64
+        self,
+        features: Float32,
+        floors: Floors | None,
+        first: int,
+        stamps: Int64,
+        directions: Directions,
     ) -> list[EncodedMessage]:
         """Turn successive frames into messages.
 
@@ -81,6 +95,8 @@ class LabelStream:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
+        directions : Directions
+            That become known with these frames.
 
         Returns
         -------
@@ -88,7 +104,7 @@ class LabelStream:
             Segments, then labels; each in the order of their log times.
         """
         self.last = None
-        labels, segments = self._labeller.push(features, floors, first, stamps)
+        labels, segments = self._labeller.push(features, floors, first, stamps, directions)
         if not len(labels.frames):
             return []
         self.last = labels

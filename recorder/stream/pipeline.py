@@ -8,6 +8,7 @@ from operator import attrgetter
 import numpy as np
 
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE, Directions
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
@@ -16,7 +17,7 @@ from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.diagnostics import diagnostics
-from hearthlog.recorder.stream.direction_messages import DirectionMessages
+from hearthlog.recorder.stream.direction_messages import ArrayDirections, direction_messages
 from hearthlog.recorder.stream.feature_messages import FeatureMessages
 from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -85,7 +86,8 @@ class Pipeline:
         self._recent_floors: Float64 | None = None  # of the last window
         self._recent_stamps = np.empty(0, np.int64)  # of the last window
         self._watch = SoundWatch()
-        self._directions = None if array is None else DirectionMessages(microphone, array)
+        self._directions = None if array is None else ArrayDirections(array)
+        self._recent_directions = NOWHERE  # of the last second, or more
         self._end = 0
         self._level = OK
 
@@ -123,7 +125,7 @@ class Pipeline:
         """
         if isinstance(event, Frames):
             self._watch.add_samples(event.samples)
-            directions = [] if self._directions is None else self._directions(event)
+            directions = NOWHERE if self._directions is None else self._directions(event)
             features = self._features(event.samples)
             return self.push_features(features, event.first, event.stamps, directions)
         if isinstance(event, Gap):
@@ -135,7 +137,7 @@ class Pipeline:
         features: Float32,
         first: int,
         stamps: Int64,
-        directions: Sequence[EncodedMessage] = (),
+        directions: Directions = NOWHERE,
     ) -> list[EncodedMessage]:
         """Turn the features of successive frames into messages.
 
@@ -146,22 +148,37 @@ class Pipeline:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-        directions : sequence of EncodedMessage, optional
-            Of these frames.
+        directions : Directions, optional
+            That become known with these frames.
 
         Returns
         -------
         list of EncodedMessage
             In the order of their log times.
         """
-        labels = self._labels(features, self._track_floor(features, first), first, stamps)
+        floors = self._track_floor(features, first)
+        labels = [
+            message
+            for stream in self._streams.values()
+            for message in stream.push(features, floors, first, stamps, directions)
+        ]
         logged = features, first, stamps
         if self._veil is not None:
             logged = self._veil.push(*logged, self.last_labels)
-        messages = [*self._feature_messages(*logged), *directions, *labels]
+        located = self._located(directions, first, stamps)
+        messages = [*self._feature_messages(*logged), *located, *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
         return self.hold(messages)
+
+    def _located(self, directions: Directions, first: int, stamps: Int64) -> list[EncodedMessage]:
+        """Encode the directions of frames, and remember the last ones."""
+        if not len(directions.frames):
+            return []
+        recent = self._recent_directions.followed_by(directions)
+        self._recent_directions = recent.rows(slice(-MEMORY_BLOCKS, None))
+        known = stamps[directions.last_frames - first]
+        return direction_messages(self.microphone, directions, known)
 
     def _remember(self, features: Float32, stamps: Int64) -> None:
         before = features[:0] if self._recent is None else self._recent
@@ -271,7 +288,7 @@ class Pipeline:
         stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
         if floors is not None:
             floors = floors[max(len(floors) - len(recent), 0) :]
-        stream.follow(recent, floors, stamps, frame, unlabelled)
+        stream.follow(recent, floors, stamps, frame, unlabelled, self._recent_directions)
 
     def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
         """Turn a notice into messages.
@@ -319,6 +336,7 @@ class Pipeline:
         self._feature_messages.restart()
         self._recent = None
         self._recent_floors = None
+        self._recent_directions = NOWHERE
         if self._floor is not None:
             self._floor.restart()
         data = encode_gap(self.microphone, gap.start, gap.end, gap.reason, gap.frames_lost)
@@ -340,15 +358,6 @@ class Pipeline:
             recent.insert(0, self._recent_floors)
         self._recent_floors = np.concatenate(recent)[-self.feature_set.window_frames :]
         return floors
-
-    def _labels(
-        self, features: Float32, floors: Floors | None, first: int, stamps: Int64
-    ) -> list[EncodedMessage]:
-        return [
-            message
-            for stream in self._streams.values()
-            for message in stream.push(features, floors, first, stamps)
-        ]
 
     def _close(self, end: int) -> list[EncodedMessage]:
         """End the segments at `end`; the next frame begins anew."""

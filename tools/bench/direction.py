@@ -20,12 +20,13 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SILENCE
+from hearthlog.models.classifiers.directions import BLOCK_FRAMES
 from hearthlog.recorder.direction.geometry import array_geometry
-from hearthlog.recorder.direction.srp_phat import BLOCK_FRAMES, DirectionFinder
+from hearthlog.recorder.direction.srp_phat import DirectionFinder
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE

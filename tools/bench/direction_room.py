@@ -46,6 +46,82 @@ class Scene(NamedTuple):
     microphones: Float64
 
 
+class Room(NamedTuple):
+    """A room, and an array in it whose microphones are not quite where they should be.
+
+    Attributes
+    ----------
+    size, centre : np.ndarray [shape=(3,)], float64
+        Of the room, and where the middle of the array is, in metres.
+    microphones : np.ndarray [shape=(c, 3)], float64
+        Where they are, in metres from the middle of the array.
+    gains : np.ndarray [shape=(c,)], float64
+    rt60 : float
+        Seconds in which an echo falls by 60 dB.
+    """
+
+    size: Float64
+    centre: Float64
+    microphones: Float64
+    gains: Float64
+    rt60: float
+
+    def anywhere(self, rng: np.random.Generator) -> Float64:
+        """Draw a place of a source, 1 to 3.5 m from the array."""
+        return _source(self.size, self.centre, rng)
+
+    def azimuth(self, source: Float64) -> float:
+        """Return whence the sound of a source comes, in radians."""
+        ahead, left, _ = source - self.centre
+        return float(np.arctan2(left, ahead))
+
+    def echoes(self, source: Float64) -> Float64:
+        """Return the impulse responses of the microphones: [shape=(n, c)]."""
+        absorption, order = pra.inverse_sabine(self.rt60, self.size)
+        room = pra.ShoeBox(
+            self.size, fs=SAMPLE_RATE, materials=pra.Material(absorption), max_order=order
+        )
+        room.add_source(source)
+        room.add_microphone_array((self.centre + self.microphones).T)
+        room.compute_rir()
+        length = max(len(one[0]) for one in room.rir)
+        padded = [np.pad(one[0], (0, length - len(one[0]))) for one in room.rir]
+        return np.stack(padded, axis=1) * self.gains
+
+
+def draw_room(places: Float64, rt60: float, rng: np.random.Generator) -> Room:
+    """Draw a room of 3.5 to 6 m.
+
+    Parameters
+    ----------
+    places : np.ndarray [shape=(c, 2)], float64
+        Where the microphones should be, in metres.
+    rt60 : float
+    rng : np.random.Generator
+    """
+    size = rng.uniform(*_ROOMS)
+    microphones = np.pad(places, ((0, 0), (0, 1))) + rng.normal(0, _PLACED, (len(places), 3))
+    gains = 10 ** (rng.normal(0, _MATCHED_DB, len(places)) / 20)
+    centre = _place(size, _FROM_WALLS[1], _HEIGHTS[1], rng)
+    return Room(size, centre, microphones, gains, rt60)
+
+
+def heard_with(echoes: Float64, clip: Float64) -> Float64:
+    """Return what microphones hear of a clip, of a mean square of 1 in its seconds.
+
+    Parameters
+    ----------
+    echoes : np.ndarray [shape=(m, c)], float64
+    clip : np.ndarray [shape=(n,)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(n + m - 1, c)], float64
+    """
+    sound = fftconvolve(clip[:, np.newaxis], echoes, axes=0)
+    return sound / np.sqrt(np.square(sound[: len(clip)]).mean())
+
+
 def room_scene(
     clips: Sequence[Float64], places: Float64, rt60: float, rng: np.random.Generator
 ) -> Scene:
@@ -61,32 +137,34 @@ def room_scene(
         Seconds in which an echo falls by 60 dB.
     rng : np.random.Generator
     """
-    size = rng.uniform(*_ROOMS)
-    microphones = np.pad(places, ((0, 0), (0, 1))) + rng.normal(0, _PLACED, (len(places), 3))
-    gains = 10 ** (rng.normal(0, _MATCHED_DB, len(places)) / 20)
-    centre = _place(size, _FROM_WALLS[1], _HEIGHTS[1], rng)
-    absorption, order = pra.inverse_sabine(rt60, size)
-    heard, sounds, at = [], [], int(_BEFORE * SAMPLE_RATE)
-    for clip in clips:
-        source = _source(size, centre, rng)
-        room = pra.ShoeBox(
-            size, fs=SAMPLE_RATE, materials=pra.Material(absorption), max_order=order
-        )
-        room.add_source(source)
-        room.add_microphone_array((centre + microphones).T)
-        room.compute_rir()
-        length = max(len(one[0]) for one in room.rir)
-        echoes = np.stack([np.pad(one[0], (0, length - len(one[0]))) for one in room.rir], axis=1)
-        sound = fftconvolve(clip[:, np.newaxis], echoes * gains, axes=0)
-        heard.append((at, sound / np.sqrt(np.square(sound[: len(clip)]).mean())))
-        ahead, left, _ = source - centre
+    room = draw_room(places, rt60, rng)
+    sources = [room.anywhere(rng) for _ in clips]
+    heard = [heard_with(room.echoes(at), clip) for at, clip in zip(sources, clips, strict=True)]
+    return laid_out(room, sources, clips, heard)
+
+
+def laid_out(
+    room: Room, sources: Sequence[Float64], clips: Sequence[Float64], heard: Sequence[Float64]
+) -> Scene:
+    """Lay sounds one behind the other.
+
+    Parameters
+    ----------
+    room : Room
+    sources : sequence of np.ndarray [shape=(3,)], float64
+        Where each is.
+    clips, heard : sequence of np.ndarray
+        Without the room, and as `heard_with` returns them.
+    """
+    sounds, at, channels = [], int(_BEFORE * SAMPLE_RATE), len(room.microphones)
+    pause = np.zeros((int(_PAUSE * SAMPLE_RATE), channels))
+    parts = [np.zeros((at, channels))]
+    for source, clip, sound in zip(sources, clips, heard, strict=True):
         end = at + len(clip)
-        sounds.append(Placed(at / SAMPLE_RATE, end / SAMPLE_RATE, float(np.arctan2(left, ahead))))
-        at += len(sound) + int(_PAUSE * SAMPLE_RATE)
-    samples = np.zeros((at, len(places)))
-    for start, sound in heard:
-        samples[start : start + len(sound)] += sound
-    return Scene(samples, sounds, microphones)
+        sounds.append(Placed(at / SAMPLE_RATE, end / SAMPLE_RATE, room.azimuth(source)))
+        parts += [sound, pause]
+        at += len(sound) + len(pause)
+    return Scene(np.concatenate(parts), sounds, room.microphones)
 
 
 def room_noise(scene: Scene, rng: np.random.Generator) -> Float64:

@@ -32,9 +32,11 @@ def label_logs(models: Sequence[Model], logs: Sequence[Path]) -> Iterator[Labell
     LogError
         If a log cannot be read.
     """
-    labellers = [StreamLabeller(Classifier(model)) for model in models]
-    for log in logs:
-        for event in read_sound(infos_for_model(log, models[0], log)[0][0], 0):
+    infos = [infos_for_model(log, models[0], log)[0][0] for log in logs]
+    name = infos[0].microphone
+    labellers = [StreamLabeller(Classifier(model), microphone=name) for model in models]
+    for info in infos:
+        for event in read_sound(info, 0, directions=True):
             for labeller in labellers:
                 labeller.push(event)
     for labeller, model in zip(labellers, models, strict=True):

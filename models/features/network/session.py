@@ -20,7 +20,7 @@ _LARGEST = 65_504.0  # of half precision, to which values are rounded
 _FATAL_ONLY = 4
 _PATIENCE_SECONDS = 20.0
 _SOUND_SEED = 20_261_125
-_UNUSED_LIMIT = 64  # names in a message
+_LONGEST_LIST = 64  # characters of names in a message
 
 
 class Network:
@@ -218,4 +218,4 @@ def _runtime(card: NetworkCard) -> Any:
 
 
 def _listed(names: Any) -> str:
-    return ", ".join(names)[:_UNUSED_LIMIT] or "nothing"
+    return ", ".join(names)[:_LONGEST_LIST] or "nothing"

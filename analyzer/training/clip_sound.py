@@ -1,0 +1,31 @@
+"""The sound of labelled clips."""
+
+import numpy as np
+
+from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.frame_cutter import FrameCutter
+from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.frames import FRAME_SAMPLES
+
+
+def clip_frames(clip: LabelledClip) -> Float32:
+    """Read a clip.
+
+    Parameters
+    ----------
+    clip : LabelledClip
+
+    Returns
+    -------
+    np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        Whole frames at 16 kHz; none of a part behind the end of the file.
+
+    Raises
+    ------
+    SourceError
+        If the clip cannot be read.
+    """
+    cutter = FrameCutter()
+    blocks = [cutter.push(block) for block in read_audio(clip.path, clip.start, clip.end)]
+    return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])

@@ -1,0 +1,178 @@
+"""Whence sound came, and what that says of its class: a home's television stays in its corner."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
+
+BLOCK_FRAMES = 4  # for which there is one direction: 0.2 s
+SECTORS = 36  # of the circle, that a model tells apart
+MEMORY_BLOCKS = 5  # of which the last ones speak of a window: a second
+MOST_EVIDENCE = 5.0  # that a direction is of a class, a logarithm
+
+
+class Directions(NamedTuple):
+    """Directions of the blocks of one stream of frames in which something could be located.
+
+    Attributes
+    ----------
+    frames : np.ndarray [shape=(m,)], int64
+        Number of the first frame of each block, a multiple of four; increasing.
+    stamps : np.ndarray [shape=(m,)], int64
+        Starts of these frames in nanoseconds of UTC.
+    azimuths : np.ndarray [shape=(m,)], float32
+        In radians, -pi to pi, counter-clockwise from x.
+    confidences : np.ndarray [shape=(m,)], float32
+        By how much the microphones agree on this direction more than on any, 0 to 1.
+    """
+
+    frames: Int64
+    stamps: Int64
+    azimuths: Float32
+    confidences: Float32
+
+    @property
+    def last_frames(self) -> Int64:
+        """Numbers of the frames with which the directions are known."""
+        return self.frames + (BLOCK_FRAMES - 1)
+
+    def rows(self, chosen: slice | Indices) -> "Directions":
+        """Return some of the directions."""
+        return Directions(
+            self.frames[chosen],
+            self.stamps[chosen],
+            self.azimuths[chosen],
+            self.confidences[chosen],
+        )
+
+    def known_at(self, first: int, count: int) -> "Directions":
+        """Return those that become known with some successive frames.
+
+        Parameters
+        ----------
+        first, count : int
+            Number of the first frame, and how many.
+        """
+        begin, end = np.searchsorted(self.last_frames, [first, first + count])
+        return self.rows(slice(begin, end))
+
+    def begun_in(self, start: int, end: int) -> "Directions":
+        """Return those whose blocks begin in a span of time.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC: from `start` on, before `end`.
+        """
+        return self.rows(slice(*np.searchsorted(self.stamps, [start, end])))
+
+    def followed_by(self, later: "Directions") -> "Directions":
+        """Join these directions with those that follow."""
+        return Directions(
+            np.concatenate([self.frames, later.frames]),
+            np.concatenate([self.stamps, later.stamps]),
+            np.concatenate([self.azimuths, later.azimuths]),
+            np.concatenate([self.confidences, later.confidences]),
+        )
+
+
+NOWHERE = Directions(
+    np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32)
+)
+
+
+def sectors_of(azimuths: Float32) -> Indices:
+    """Return the sectors of the circle that directions are in; the middle of the first is ahead.
+
+    Parameters
+    ----------
+    azimuths : np.ndarray [shape=(n,)], float32
+        In radians.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], intp
+        0 to 35, counter-clockwise.
+    """
+    places = np.rint(azimuths.astype(np.float64) * (SECTORS / (2 * np.pi)))
+    return places.astype(np.intp) % SECTORS
+
+
+class DirectionEvidence:
+    """What directions say of the windows of one stream of frames.
+
+    To a window belong the blocks that are complete with its last frame, of the last second. What
+    each says is averaged, weighted by its confidence, since the blocks of one sound are no
+    independent witnesses.
+
+    Parameters
+    ----------
+    weights : np.ndarray [shape=(C, S)], float64
+        Logarithms of how much likelier each class is with each sector.
+    """
+
+    def __init__(self, weights: Float64) -> None:
+        self._weights = np.ascontiguousarray(weights.T)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._recent = NOWHERE
+        self._full_from: int | None = None
+
+    def is_full(self, frame: int) -> bool:
+        """Tell whether directions before the first frame leave no trace from a frame on.
+
+        Parameters
+        ----------
+        frame : int
+            Number of the next frame.
+        """
+        return self._full_from is not None and frame >= self._full_from
+
+    def push(self, directions: Directions, first: int, count: int, windows: int) -> Float64:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        directions : Directions
+            That become known with these frames.
+        first, count : int
+            Number of the first frame, and how many.
+        windows : int
+            How many windows end with the last ones of these frames.
+
+        Returns
+        -------
+        np.ndarray [shape=(windows, C)], float64
+            What is added to the logarithms of the probabilities; 0 where nothing was located. The
+            same frames give the same bits in pieces of any size.
+        """
+        if self._full_from is None:
+            self._full_from = first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)
+        known = self._recent.followed_by(directions)
+        end = first + count
+        # The last block that is complete with the last frame of each window.
+        newest = np.arange(end - windows + 1, end + 1) // BLOCK_FRAMES - 1
+        evidence = self._of_blocks(known, newest)
+        oldest = (end // BLOCK_FRAMES - MEMORY_BLOCKS) * BLOCK_FRAMES
+        self._recent = known.rows(slice(np.searchsorted(known.frames, oldest), None))
+        return evidence
+
+    def _of_blocks(self, known: Directions, newest: Int64) -> Float64:
+        """Return what is said by the last second of blocks up to each of some."""
+        if not len(newest):
+            return np.zeros((0, self._weights.shape[1]))
+        count = int(newest[-1] - newest[0]) + 1
+        places = known.frames // BLOCK_FRAMES - newest[0] + MEMORY_BLOCKS - 1
+        inside = (places >= 0) & (places < count + MEMORY_BLOCKS - 1)
+        weights = self._weights[sectors_of(known.azimuths[inside])]
+        said = np.zeros((count + MEMORY_BLOCKS - 1, self._weights.shape[1] + 1))
+        said[places[inside]] = np.pad(weights, ((0, 0), (0, 1)), constant_values=1.0)
+        said[places[inside]] *= known.confidences[inside].astype(np.float64)[:, np.newaxis]
+        total = np.zeros((count, said.shape[1]))
+        for age in range(MEMORY_BLOCKS):
+            total += said[age : age + count]
+        means = total[:, :-1] / np.where(total[:, -1:] > 0, total[:, -1:], 1.0)
+        return means[newest - newest[0]]
