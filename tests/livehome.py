@@ -15,7 +15,7 @@ from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, header, message
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, topics_of
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, scenario_labelling, topics_of
 from hearthlog.schemas.times import NANOSECONDS
 
 FRAME = NANOSECONDS // 20
@@ -36,10 +36,15 @@ class LiveHome:
         Of the log, in nanoseconds of UTC.
     """
 
-    def __init__(self, folder, microphones=("mic",), classes=GENERAL, **metadata):
+    def __init__(self, folder, microphones=("mic",), classes=GENERAL, scenarios=None, **metadata):
         self.folder, self.classes = folder, list(classes)
         self.start = time.time_ns() - 360 * MINUTE
-        topics = {t.name: t for m in microphones for t in topics_of(m, FEATURE_NAMES, self.classes)}
+        beside = {scenario_labelling(name): own for name, own in (scenarios or {}).items()}
+        topics = {
+            topic.name: topic
+            for microphone in microphones
+            for topic in topics_of(microphone, FEATURE_NAMES, self.classes, beside)
+        }
         path = log_path(folder, "home", self.start)
         self._writer = LogWriter(
             path, list(topics.values()), {"version": "0", "node": "home"} | metadata

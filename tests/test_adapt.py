@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
-from functools import cache
+from functools import cache, partial
 from threading import Event
 
 import numpy as np
 import pytest
 import soundfile
 from blobs import blobs, with_arrays
+from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import adaptation_curve as curves
@@ -17,13 +18,14 @@ from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.training.adapt import adapt_model
+from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.dataset import Recording, cut_recordings
 from hearthlog.analyzer.training.home_data import (
     HOME_WEIGHT,
     home_recordings,
     lesson_recordings,
 )
-from hearthlog.analyzer.training.method import prepare, softmax
+from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
 from hearthlog.analyzer.training.svm_method import BANDS, ROOM
 from hearthlog.analyzer.training.train import train_model
@@ -46,6 +48,13 @@ from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
 
 RATE = 16_000
 

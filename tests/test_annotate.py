@@ -484,7 +484,7 @@ def test_a_damaged_layer_is_named_and_left_alone(log, zero, damage):
     [
         ("/mic/review/segment", "speech", "speech and speech overlap"),
         ("/mic/review/segment", "Loud\n", "cannot be the name of a class"),
-        ("/M!c/review/segment", "speech", "microphone name 'M!c' cannot be a topic"),
+        ("/M!c/review/segment", "speech", "is no review layer: it has a topic '/M!c/review"),
         ("/mic/segment", "speech", "is no review layer: it has a topic '/mic/segment'"),
     ],
 )

@@ -474,12 +474,15 @@ def phone(tmp_path_factory):
 def lived(tmp_path_factory):
     """A home with two rooms, and something of everything that a page can show."""
     names = ("living_room", "bathroom")
-    with serving(tmp_path_factory.mktemp("lived"), microphones=names) as home:
+    water = {"water": ["silence", "tap_water", "other"]}
+    folder = tmp_path_factory.mktemp("lived")
+    with serving(folder, microphones=names, scenarios=water) as home:
         for name in names:
             home.log.heard("silence", 350, 60, microphone=name)
             home.log.not_heard(200, 40, microphone=name)
         for number, label in enumerate(LIVED):
             home.log.heard(label, 120 - 5 * number, 30, 0.55 + 0.05 * number, "living_room")
+        home.log.heard("tap_water", 30, 20, microphone="bathroom/scenario/water")
         home.log.says("living_room", 0, "listening", level_dbfs="-43.2")
         home.log.says("bathroom", 2, "no device of this name")
         home.log.says("home disk", 1, "2 days left")
@@ -512,6 +515,8 @@ def test_the_page_says_what_is_heard_now_as_the_log_does(phone, lived):
     heard = phone.text("#heard")
     assert "Living room" in heard
     assert " ".join(heard.split()).endswith("Bathroom Not listening no device of this name")
+    phone.shows("#scenarios", "Water · Bathroom")
+    phone.shows("#scenarios", "Now not listening. Today water tap once (20 seconds).")
     live = phone.of('[...document.querySelectorAll("[aria-live]")].map((e) => e.id)')
     assert live == ["heard"]
 
@@ -535,11 +540,11 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     named = {"button", "DisclosureTriangle", "image", "link", "meter", "radio", "region", "textbox"}
     assert [node for node in tree if node[0] in named | {"table"} and not node[1]] == []
     headings = [name for role, name in tree if role == "heading"]
-    assert headings[:3] == ["Home", "Now", "Today"]
+    assert headings[:4] == ["Home", "Now", "Also listened for", "Today"]
     assert {"main", "banner", "contentinfo", "list", "columnheader", "rowheader"} <= {
         role for role, _ in tree
     }
-    regions = ["Now", "Today", "Last sounds", "Is everything working?"]
+    regions = ["Now", "Also listened for", "Today", "Last sounds", "Is everything working?"]
     assert [name for role, name in tree if role == "region"] == regions
     images = [name for role, name in tree if role == "image"]
     assert len(images) == len(GENERAL) - 1

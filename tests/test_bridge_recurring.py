@@ -39,6 +39,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 NOW = int(datetime(2026, 3, 3, 12, tzinfo=UTC).timestamp()) * NANOSECONDS
 MOMENT = Moment(NOW, UTC)
+KEY = "3 of 5b4e0d1c"
 HOSTILE = '<img src=x onerror="document.title=1">'
 
 
@@ -66,22 +67,22 @@ def group(number, name="", times=84, *, microphones=("mic",), **changes):
     return GroupSummary(number=number, name=name, times=times, **(fields | changes))
 
 
-def summary_of(*groups):
-    return HomeSummary(
-        id="5b4e0d1c", sounds=1000, timezone="UTC", groups_file=GROUPS, groups=list(groups)
-    )
+def summary_of(*groups, of="5b4e0d1c"):
+    return HomeSummary(id=of, sounds=1000, timezone="UTC", groups_file=GROUPS, groups=list(groups))
 
 
-def keep(folder, *groups):
+def keep(folder, *groups, **options):
     folder.mkdir(exist_ok=True)
-    save_summary(summary_of(*groups), folder / SUMMARY)
+    save_summary(summary_of(*groups, **options), folder / SUMMARY)
 
 
 # What is said of them
 
 
 def test_a_sound_that_recurs_is_described_in_words():
-    shown = recurring_list(summary_of(group(4)), NOW - 3600 * NANOSECONDS, {4: "so"}, MOMENT)
+    shown = recurring_list(
+        summary_of(group(4)), NOW - 3600 * NANOSECONDS, {"4 of 5b4e0d1c": "so"}, MOMENT
+    )
     assert shown["looked"] == "11:00"
     assert shown["groups"] == [
         {
@@ -212,8 +213,8 @@ def acting(monkeypatch, text):
 def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, says):
     acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
     naming = GroupNaming(tmp_path)
-    assert naming.start(3, "kettle").startswith("Being marked: Kettle.")
-    told = patiently(lambda: naming.said[3], lambda text: "Being" not in text)
+    assert naming.start(KEY, 3, "kettle").startswith("Being marked: Kettle.")
+    told = patiently(lambda: naming.said[KEY], lambda text: "Being" not in text)
     assert says in told
     assert len(told) < 500
 
@@ -223,20 +224,37 @@ def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(
 ):
     acting(monkeypatch, "import time; time.sleep(600)")
     naming = GroupNaming(tmp_path)
-    naming.start(3, "")
+    naming.start(KEY, 3, "")
     with pytest.raises(BridgeError, match="still marks another sound"):
-        naming.start(4, "kettle")
-    assert 4 not in naming.said
+        naming.start("4 of 5b4e0d1c", 4, "kettle")
+    assert naming.said.keys() == {KEY}
     naming.close()
-    patiently(lambda: naming.said[3], lambda text: "ended by signal 15" in text)
+    patiently(lambda: naming.said[KEY], lambda text: "ended by signal 15" in text)
     acting(monkeypatch, "")
-    naming.start(4, "kettle")
+    naming.start("4 of 5b4e0d1c", 4, "kettle")
+
+
+def test_what_came_of_a_name_is_not_said_of_a_group_of_another_file(tmp_path, monkeypatch):
+    acting(monkeypatch, "import sys; sys.exit(4)")
+    keep(tmp_path, group(3))
+    recurring = Recurring(tmp_path)
+    recurring.describe(MOMENT)
+    recurring.name(KEY, "kettle")
+
+    def said():
+        return [each["said"] for each in recurring.describe(MOMENT)["groups"]]
+
+    patiently(said, lambda texts: texts == ["It was not done: exit status 4"])
+    keep(tmp_path, group(3), of="00c0ffee")
+    assert said() == [""]
+    keep(tmp_path, group(3))
+    assert said() == ["It was not done: exit status 4"]
 
 
 def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
     monkeypatch.setattr(group_naming.os, "access", lambda *_: False)
     with pytest.raises(BridgeError, match="may only read the logs"):
-        GroupNaming(tmp_path).start(3, "kettle")
+        GroupNaming(tmp_path).start(KEY, 3, "kettle")
 
 
 @pytest.mark.parametrize(

@@ -483,6 +483,13 @@ def test_a_part_that_cannot_be_used_is_not_used_and_made_anew(fleet, kind):
     assert not read_catalog(fleet).unusable
 
 
+def test_a_catalogue_of_an_older_version_is_made_anew(fleet):
+    whole = write_catalog(fleet).table
+    for part in (fleet / CATALOG).iterdir():
+        part.write_bytes(unusable("another version", part.read_bytes()))
+    assert write_catalog(fleet, read_catalog(fleet)).table == whole
+
+
 def test_how_much_a_catalogue_holds_is_known_before_it_is_read(fleet):
     write_catalog(fleet)
     part = fleet / CATALOG / part_of("north/anna")

@@ -12,8 +12,9 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from hearthlog.analyzer.training.method import softmax
-from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm, in_whole_steps, rounded
+from hearthlog.analyzer.training.cross_validation import softmax
+from hearthlog.analyzer.training.learned_inputs import in_whole_steps, rounded
+from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.rbf_distances import (

@@ -306,7 +306,8 @@ def make_home(folder):
     do("models promote general-1 --anyway")
     do("models promote general-2")
     do("models promote home-2 --to candidate")
-    do("record day.flac --model models/home.safetensors --start 2026-03-01T06:59 -o logs")
+    recorded = "record day.flac --model models/home.safetensors --start 2026-03-01T06:59 -o logs"
+    do(f"{recorded} --scenario water=bathroom")
     do("models promote general-1 --to candidate")
     for model in ("general-2", "new"):
         do(f"relabel logs --model {model}.safetensors")
@@ -317,8 +318,10 @@ def make_home(folder):
     (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
     for name in ("day.txt", "ten.txt"):
         shutil.copy("labels.txt", name)
+    (folder / "water.txt").write_text("2.0\t9.0\ttap_water\n")
     write_foreign_labels(folder)
     do("annotate import logs labels.txt")
+    do("annotate import logs water.txt --scenario water")
     shutil.copytree("logs", "homes/anna")
     made.write_esc50(folder / "ESC-50-master")
     made.write_fsd50k(folder / "FSD50K")

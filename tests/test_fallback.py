@@ -16,12 +16,12 @@ INSTEAD = "labmic is not there; spare is heard in its place"
 
 
 @contextmanager
-def recording(labmic, logs):
+def recording(labmic, logs, more=""):
     """Record labmic, with another one as its fallback."""
     about = logs.with_suffix(".toml")
     about.write_text(
         f'output = "{logs}"\nmax_bag_duration = 86400\n'
-        '[[microphone]]\ndevice = "labmic"\nfallback = "spare"\n'
+        f'[[microphone]]\ndevice = "labmic"\nfallback = "spare"\n{more}'
     )
     command = [*HEARTHLOG, "record", "--config", str(about)]
     with subprocess.Popen(command, env=labmic.env, stderr=subprocess.PIPE, text=True) as process:
@@ -85,6 +85,19 @@ def test_a_fallback_is_heard_from_the_start_where_the_device_is_not_there(labmic
             wait_for_more(logs, 20)
     (gap,) = read(logs, "gap")
     assert gap.reason == "labmic is there again"
+
+
+def test_a_fallback_is_heard_where_the_device_has_too_few_channels_for_an_array(labmic, tmp_path):
+    labmic.beside("spare")
+    labmic.configure(data=np.ones((1600, 2), np.int16))
+    logs = tmp_path / "logs"
+    with recording(labmic, logs, "array = [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]\n") as process:
+        wait_for_frames(logs, 40)
+    assert process.returncode == 0, process.errors
+    assert devices(logs) == ["spare"]
+    told = "labmic' has 2 channels, and `array` names places for 3: name one for each channel"
+    assert told in process.errors
+    assert "; spare is heard in its place\n" in process.errors
 
 
 @pytest.mark.parametrize("other", ["hall", "spare"])

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classifiers.classifier import Classifier

@@ -1,7 +1,10 @@
 """A home teaches by its marks and by what a review left alone, not by what was drawn at random."""
 
 import json
+import shutil
 from dataclasses import replace
+from datetime import UTC, datetime
+from threading import Event
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +35,9 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.recording_session import RecordingSession
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
@@ -42,13 +47,28 @@ MICROPHONE = SimpleNamespace(device="test")
 SECOND = 10**9
 
 
+@pytest.fixture(scope="module")
+def recorded(day, model_file, tmp_path_factory):
+    """Logs of the same minutes on two days, labelled by a model."""
+    folder = tmp_path_factory.mktemp("recorded")
+    settings = Settings(output=folder, model=model_file)
+    for number in (1, 2):
+        start = int(datetime(2026, 3, number, 7, tzinfo=UTC).timestamp()) * SECOND
+        record(settings, FileSource([day], start), Event())
+    return folder
+
+
 @pytest.fixture
-def home(day, tmp_path, model_file, capfd):
+def two_days(recorded, tmp_path):
+    """The same minutes on two days."""
+    return shutil.copytree(recorded, tmp_path / "logs")
+
+
+@pytest.fixture
+def home(two_days):
     """A folder with a log of some minutes, labelled by a model."""
-    logs = tmp_path / "logs"
-    done = run(capfd, "record", day, "-o", logs, "--model", model_file, "--start", "2026-03-01T07")
-    assert done.returncode == 0, done.stderr
-    return logs
+    logs_in(two_days)[1].unlink()
+    return two_days
 
 
 def logs_in(folder):
@@ -251,14 +271,6 @@ def test_a_model_says_from_which_time_of_the_home_it_has_learned(home, model_fil
     confirmed = lessons.segments.collection_names.index(CONFIRMED)
     count = int((lessons.segments.collection == confirmed).sum())
     assert sum(training.home_confirmed.values()) == count > 0
-
-
-@pytest.fixture
-def two_days(home, day, model_file, capfd):
-    """The same minutes on two days."""
-    done = run(capfd, "record", day, "-o", home, "--model", model_file, "--start", "2026-03-02T07")
-    assert done.returncode == 0, done.stderr
-    return home
 
 
 def kettle(logs, seconds):

@@ -9,7 +9,7 @@ pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchm
 pytest.importorskip("pocketsphinx")
 pytest.importorskip("pystoi")
 
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classifiers.classifier import Classifier

@@ -1,11 +1,13 @@
 """Several models label the same sound at once, each for a scenario, on topics of its own."""
 
 import json
+import math
 import re
 import shutil
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from datetime import UTC
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
@@ -17,15 +19,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from logreader import LogReader
 from mcap.records import Channel
+from prometheus_client.parser import text_string_to_metric_families
 from spliced import run
 from test_swap import MICROPHONE, block, wait_for
 
 from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
+from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.follow_home import is_of_bridge
+from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.discovery import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.page.scenario_lines import scenario_lines
+from hearthlog.analyzer.bridge.page.words import times
+from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
+from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
@@ -57,6 +67,7 @@ from hearthlog.schemas.messages.topics import (
     scenario_labelling,
 )
 from hearthlog.schemas.salvage.thin import STEPS, thin_log
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.options import scenario_files
 
 START = 1_772_348_400 * 1_000_000_000
@@ -399,6 +410,36 @@ def test_what_goes_on_since_another_was_refused_keeps_its_classes(tmp_path):
         assert models.change() == []
 
 
+def test_two_scenarios_whose_files_are_swapped_label_by_each_others_models(tmp_path):
+    waters = ("flushing_water", "tap_water")
+    names = {"a": ("a", "c"), "b": ("b", "d")}
+    files = {
+        name: keep(tmp_path / f"{name}.safetensors", dict(zip(waters, of, strict=True)))
+        for name, of in names.items()
+    }
+    requests = ReloadRequests()
+    with ExitStack() as stack:
+        watches = {
+            name: stack.enter_context(closing(ModelWatch(file, requests.queue(), name)))
+            for name, file in files.items()
+        }
+        models = LabellingModels(None, None, watches)
+        loaded = {name: models.in_use[f"scenario/{name}"] for name in names}
+        watches["a"].ready = loaded["b"]  # one after the other, as they are loaded
+        (refused,) = models.refusals()
+        assert refused.startswith("scenario a: model b refused: labels 'b', and so does scenario b")
+        assert not models.refusals()
+        watches["b"].ready = loaded["a"]
+        assert not models.refusals()
+        assert {change.labelling: change.model.name for change in models.change()} == {
+            "scenario/a": "b",
+            "scenario/b": "a",
+        }
+        watches["b"].ready = loaded["a"]  # as SIGHUP has it
+        assert not models.refusals()
+        assert [change.labelling for change in models.change()] == ["scenario/b"]
+
+
 def test_a_model_for_another_feature_set_is_refused_in_a_line(tmp_path, sound):
     golden = load_model(GOLDEN)
     names = {name: f"my_{name}" for name in golden.classes if name not in {"silence", "unknown"}}
@@ -503,6 +544,49 @@ def test_what_a_bridge_tells_of_a_scenario_is_apart_from_its_microphone(log):
     assert "level" not in told
     assert told["heard"]["state_topic"] == "hearthlog/home/mic-water/heard"
     assert any("tap_water" in key for key in told)
+
+
+def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_path):
+    state = HomeState()
+    columns = read_columns([log], [*OF_WATER, "/mic/gap", "/mic/label", "/mic/segment"])
+    news = News(state, [], [], today(START + 60 * NANOSECONDS, UTC), UTC)
+    figures, home = tmp_path / "figures", Home(tmp_path, "home", UTC)
+    output = PrometheusOutput(PrometheusSettings(text_file=figures), home, tmp_path, 0, pytest.fail)
+
+    def samples() -> dict[tuple[str, ...], float]:
+        output._due = 0.0
+        output.update(news)
+        return {
+            (sample.name, *(value for key, value in sample.labels.items() if key != "node")): float(
+                sample.value
+            )
+            for family in text_string_to_metric_families(figures.read_text())
+            for sample in family.samples
+            if "event" in sample.name
+        }
+
+    state.push([part for topic, part in columns.items() if topic not in OF_WATER])
+    without = samples()
+    assert not any("scenario" in name for name, *_ in without)
+    assert scenario_lines(news) == []
+    state.push([part for topic, part in columns.items() if topic in OF_WATER])
+    found = samples()
+    assert without.items() <= found.items()
+    water = {key: value for key, value in found.items() if "scenario" in key[0]}
+    assert found.keys() - without.keys() == water.keys()
+    flushes = state.scenarios["mic-water"].events("flushing_water", 0)
+    names = ("flushing_water", "mic", "water")
+    assert water["hearthlog_scenario_events_total", *names] == len(flushes) > 0
+    assert water["hearthlog_scenario_event_seconds_total", *names] == sum(
+        flush.seconds for flush in flushes
+    )
+    (line,) = scenario_lines(news)
+    assert line["what"] == "Water"
+    assert line["about"].startswith("Now not listening. Today ")
+    assert f"toilet flush {times(len(flushes))} (" in line["about"]
+    state.scenarios["mic-water"].seen = math.inf
+    assert scenario_lines(news)[0]["about"].startswith("Now ")
+    assert "not listening" not in scenario_lines(news)[0]["about"]
 
 
 def test_alerts_hear_what_a_scenario_labels_from_the_log_and_as_it_is_written(log):

@@ -785,7 +785,7 @@ def test_what_is_not_in_a_lane_any_more_is_hidden_and_what_is_new_is_drawn(tmp_p
     drawn = DrawnLane("mic/lanes/all/00", 0.5, 10 * SECOND)
     first, second = (0, 20, "yelling"), (30, 31, "yelling")
     for marks in ((first,), (first, second), (second,)):
-        drawn.show(reviewed_lane("mic", spans_at(*marks), no_spans()), canvas)
+        drawn.show(reviewed_lane("mic", "", spans_at(*marks), no_spans()), canvas)
     path = tmp_path / "a.rrd"
     path.write_bytes(sink.read())
     root = "/mic/lanes/all/00/1/"

@@ -11,7 +11,8 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset, clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import ROOM

@@ -16,7 +16,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import soundfile
 
-from hearthlog.analyzer.training.dataset import build_dataset, clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import ROOM

@@ -16,7 +16,6 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_of_layer
 from hearthlog.schemas.messages.topics import LIVE, relabelling
 
-_EVER = 1 << 62
 _DAY = 1440 * MINUTE
 _MOST = 7  # days: more would hardly change the share, and take their time
 
@@ -51,7 +50,7 @@ def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
 
 def _days(logs: HomeLogs, labelling: str) -> list[tuple[int, str, str]]:
     days = set()
-    for layer in logs.between(0, _EVER, REVIEW_LAYER):
+    for layer in logs.between(layer=REVIEW_LAYER):
         try:
             spans = read_reviewed(log_of_layer(layer.path))
         except LogError:

@@ -28,7 +28,6 @@ from hearthlog.schemas.logs.files import REVIEW_LAYER, log_of_layer
 from hearthlog.schemas.messages.topics import LIVE, relabelling
 
 _AROUND = AROUND * MINUTE
-_EVER = 1 << 62
 _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
@@ -130,7 +129,7 @@ def _reviewed_labels(
 
 def _logs_around(logs: HomeLogs, start: int, end: int) -> list[Path]:
     near = logs.between(start - _AROUND, end)
-    later = logs.between(start, _EVER)[:_FOLLOWING]
+    later = logs.between(start)[:_FOLLOWING]
     paths = dict.fromkeys(entry.path for entry in [*near, *later])
     return [path for path in paths if path.exists()]
 

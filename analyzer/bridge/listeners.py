@@ -32,6 +32,16 @@ def microphone_of_listener(listener: str) -> str:
     return listener.partition(_BETWEEN)[0]
 
 
+def scenario_of_listener(listener: str) -> str:
+    """Return the name of the scenario; empty for the model of the home.
+
+    Parameters
+    ----------
+    listener : str
+    """
+    return listener.partition(_BETWEEN)[2]
+
+
 def is_of_scenario(listener: str) -> bool:
     """Tell whether the model of a scenario hears.
 

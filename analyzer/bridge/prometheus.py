@@ -3,7 +3,7 @@
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock, Thread
@@ -17,6 +17,11 @@ from prometheus_client.registry import Collector
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import MicrophoneState
+from hearthlog.analyzer.bridge.listeners import (
+    is_of_scenario,
+    microphone_of_listener,
+    scenario_of_listener,
+)
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
@@ -29,6 +34,7 @@ _LATER = 12 * 3600 * NANOSECONDS  # than its beginning an event may be known
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 _TIMEOUT_SECONDS = 5.0
 _LABELS = ("node", "microphone", "label")
+_LABELS_OF_SCENARIOS = ("node", "microphone", "scenario", "label")
 
 
 class PrometheusOutput:
@@ -134,7 +140,7 @@ class _Handler(WSGIRequestHandler):
 class _Figures(Collector):
     """The figures of one moment."""
 
-    def __init__(self, news: News, home: Home, totals: Iterable[Total]) -> None:
+    def __init__(self, news: News, home: Home, totals: Sequence[Total]) -> None:
         self._news = news
         self._home = home
         self._totals = totals
@@ -142,17 +148,15 @@ class _Figures(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield each figure, by microphone and class."""
         node, state = self._home.node, self._news.state
-        events = CounterMetricFamily(
-            "hearthlog_events", "Events of a class, from the log.", labels=_LABELS
-        )
-        seconds = CounterMetricFamily(
-            "hearthlog_event_seconds", "Seconds that a class was heard.", labels=_LABELS
-        )
-        for total in self._totals:
-            names = (node, total.microphone, total.label)
-            events.add_metric(names, total.events)
-            seconds.add_metric(names, total.seconds)
-        yield from (events, seconds)
+        of_home = [total for total in self._totals if not is_of_scenario(total.microphone)]
+        yield from _counters("", _LABELS, [((node, *one[:2]), one) for one in of_home])
+        of_scenarios = [
+            ((node, microphone_of_listener(name), scenario_of_listener(name), one.label), one)
+            for one in self._totals
+            if is_of_scenario(name := one.microphone)
+        ]
+        if of_scenarios:
+            yield from _counters("scenario_", _LABELS_OF_SCENARIOS, of_scenarios)
         yield _gauge("recording", "Whether the recorder writes.", [((node,), state.is_recording())])
         yield from self._of_microphones()
         yield _gauge(
@@ -185,6 +189,21 @@ class _Figures(Collector):
             each(lambda m: m.heard.time / NANOSECONDS),
             "microphone",
         )
+
+
+def _counters(
+    of: str, labels: Sequence[str], totals: Iterable[tuple[Sequence[str], Total]]
+) -> Iterator[Metric]:
+    events = CounterMetricFamily(
+        f"hearthlog_{of}events", "Events of a class, from the log.", labels=labels
+    )
+    seconds = CounterMetricFamily(
+        f"hearthlog_{of}event_seconds", "Seconds that a class was heard.", labels=labels
+    )
+    for names, total in totals:
+        events.add_metric(names, total.events)
+        seconds.add_metric(names, total.seconds)
+    yield from (events, seconds)
 
 
 def _gauge(

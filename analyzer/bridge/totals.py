@@ -18,9 +18,9 @@ _LIMIT = 1 << 20  # bytes
 
 
 class Total(NamedTuple):
-    """What was heard of a class by a microphone."""
+    """What was heard of a class by a microphone, or by a scenario of it."""
 
-    microphone: str
+    microphone: str  # as `MicrophoneState.name`
     label: str
     events: int
     seconds: float
@@ -63,7 +63,7 @@ class Totals:
             self.time, self._kept = kept.time, kept.totals
 
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
-        """Return what was heard, by microphone and class; 0 of a class that was not yet.
+        """Return what was heard, by who heard it and class; 0 of a class that was not yet.
 
         Parameters
         ----------
@@ -73,7 +73,7 @@ class Totals:
             Before which events begin that count, in nanoseconds of UTC; by default all do.
         """
         sums = {total[:2]: total for total in self._kept}
-        for microphone in state.microphones.values():
+        for microphone in state.every():
             known = (label for label in microphone.classes if label != SILENCE)
             for label in dict.fromkeys([*known, *microphone.labels()]):
                 events = [

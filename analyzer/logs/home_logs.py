@@ -13,6 +13,7 @@ from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name
+from hearthlog.schemas.logs.scenario_record import recorded_scenarios
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -37,13 +38,15 @@ class HomeLogs:
     entries: Sequence[HomeLog]
     losses: Sequence[str]  # what cannot be read, and why
 
-    def between(self, start: int, end: int, layer: str = "") -> list[HomeLog]:
+    def between(
+        self, start: int | None = None, end: int | None = None, layer: str = ""
+    ) -> list[HomeLog]:
         """List the logs, or the layers of one name, that may speak of a span of time.
 
         Parameters
         ----------
-        start, end : int
-            Nanoseconds of UTC: from `start` on, before `end`.
+        start, end : int or None
+            Nanoseconds of UTC: from `start` on, before `end`; None for no limit.
         layer : str
             `review` or `relabel-<model>`; empty for logs.
 
@@ -52,7 +55,13 @@ class HomeLogs:
         list of HomeLog
             In the order of time.
         """
-        return [e for e in self.entries if e.layer == layer and e.start < end and e.end > start]
+        return [
+            entry
+            for entry in self.entries
+            if entry.layer == layer
+            and (start is None or entry.end > start)
+            and (end is None or entry.start < end)
+        ]
 
     def latest_models(self) -> list[LabelledBy]:
         """List the models that labelled the latest log of each recorder, each of them once.
@@ -63,7 +72,7 @@ class HomeLogs:
             Of all microphones of a recorder; empty texts for a microphone without a model.
         """
         by_node: dict[str, list[Path]] = {}
-        for entry in self.between(0, _NEVER):
+        for entry in self.between():
             by_node.setdefault(entry.node, []).append(entry.path)
         found: dict[LabelledBy, None] = {}
         for logs in by_node.values():
@@ -71,9 +80,30 @@ class HomeLogs:
             found |= dict.fromkeys(latest.values())
         return list(found)
 
+    def latest_scenario_models(self, scenario: str) -> list[LabelledBy]:
+        """List the models that labelled for a scenario, each of them once.
+
+        Parameters
+        ----------
+        scenario : str
+            Its name.
+
+        Returns
+        -------
+        list of LabelledBy
+            Those of the latest log of each recorder that has the scenario.
+        """
+        found: dict[str, dict[LabelledBy, None]] = {}
+        for record in self.records():
+            own = [one for one in recorded_scenarios(record) if one.name == scenario]
+            models = dict.fromkeys(LabelledBy(one.model, one.sha256) for one in own)
+            if models:
+                found.setdefault(record.get("node", ""), models)
+        return list(dict.fromkeys(model for models in found.values() for model in models))
+
     def first_model(self) -> str:
         """Return the SHA-256 of the model that labelled the first log of one; empty if none did."""
-        logs = [entry.path for entry in reversed(self.between(0, _NEVER))]
+        logs = [entry.path for entry in reversed(self.between())]
         records = (one.get("model_sha256", "") for one in latest_records(logs))
         return next(filter(None, records), "")
 
@@ -85,7 +115,7 @@ class HomeLogs:
 
     def records(self) -> Iterator[Mapping[str, str]]:
         """Yield the `hearthlog` records of the logs, the last log first."""
-        return latest_records(entry.path for entry in self.between(0, _NEVER))
+        return latest_records(entry.path for entry in self.between())
 
     def days(self, zone: tzinfo) -> list[date]:
         """List the days on which there are logs.
@@ -100,7 +130,7 @@ class HomeLogs:
         list of date
             The days on which logs begin, and that of the last message; ascending.
         """
-        days = {local_time(entry.start, zone).date() for entry in self.between(0, _NEVER)}
+        days = {local_time(entry.start, zone).date() for entry in self.between()}
         end = self.end()
         if end is not None:
             days.add(local_time(end - 1, zone).date())
@@ -136,7 +166,7 @@ class HomeLogs:
         int or None
             Nanoseconds of UTC; None if no log has a message that can be read.
         """
-        for entry in reversed(self.between(0, _NEVER)):
+        for entry in reversed(self.between()):
             try:
                 span = time_span(entry.path)
             except LogError:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.logs.recorder_info import first_message, microphones_of
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.scenario_record import recorded_scenarios
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic
@@ -53,7 +54,7 @@ def models_of(log: Path) -> Mapping[str, LabelledBy]:
     return found
 
 
-def model_of(log: Path, microphone: str) -> LabelledBy:
+def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
     """Read which model labelled a microphone of a log, or of a layer; as `models_of`.
 
     Parameters
@@ -61,6 +62,30 @@ def model_of(log: Path, microphone: str) -> LabelledBy:
     log : Path
     microphone : str
         Its name.
+    scenario : str, optional
+        For which it labelled; empty for the sounds of the home.
     """
+    if scenario:
+        return scenario_models(log).get((microphone, scenario), NO_MODEL)
     models = models_of(log)
     return models.get(microphone, models.get(_ANY, NO_MODEL))
+
+
+def scenario_models(log: Path) -> Mapping[tuple[str, str], LabelledBy]:
+    """Read which models labelled for the scenarios of a log.
+
+    Parameters
+    ----------
+    log : Path
+
+    Returns
+    -------
+    mapping of (str, str) to LabelledBy
+        By microphone and scenario; empty if there is none, or the log is damaged.
+    """
+    found: dict[tuple[str, str], LabelledBy] = {}
+    with suppress(LogError), LogFile(log) as file:
+        for record in read_provenance(file):
+            for one in recorded_scenarios(record):
+                found[one.microphone, one.name] = LabelledBy(one.model, one.sha256)
+    return found

@@ -87,6 +87,7 @@ class RecorderInfo:
     # number and time of the first frame of its features; None if they are not wanted, or it has
     # none
     first_frame: tuple[int, int] | None
+    has_directions: bool  # whether those of an array are beside its features
 
 
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
@@ -157,7 +158,12 @@ def _info_of(
         },
         attachments=attachments,
         first_frame=first,
+        has_directions=kind == "features" and _has_topic(file, topic(microphone, "direction")),
     )
+
+
+def _has_topic(file: LogFile, name: str) -> bool:
+    return any(channel.topic == name for channel in file.channels.values())
 
 
 def attachments_of(file: LogFile) -> list[Attachment]:

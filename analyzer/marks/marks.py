@@ -1,60 +1,35 @@
 """Marks, the corrections of a reviewer, and what she looked at, in a layer beside the log."""
 
 import re
-import tempfile
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
+from hearthlog.analyzer.marks.review_layer import Key, Row, layer_bytes, read_rows
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import SUFFIX, review_path, stem
-from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.writer import LogWriter
-from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.messages.topics import (
     LIVE,
-    REVIEW,
-    Topic,
     check_microphone_name,
-    labelling_topic,
+    check_scenario_name,
+    review_labelling,
+    scenario_name,
 )
 from hearthlog.schemas.storage.new_files import locked_folder, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
 PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
-_KINDS = {
-    message_types.SEGMENT: "segment",
-    message_types.MARK: "mark",
-    message_types.REVIEWED: "reviewed",
-}
 PERSON, QUEUE, RANDOM = CHOICES = ("person", "queue", "random")  # how a reviewed span was chosen
-_SPAN = ("header.stamp", "duration", "label")
-_ORIGIN = ("reviewer", "made", "corrects")
-_FIELDS = {
-    message_types.SEGMENT: _SPAN,
-    message_types.MARK: (*_SPAN, *_ORIGIN, "reason"),
-    message_types.REVIEWED: ("header.stamp", "duration", *_ORIGIN, "chosen"),
-}
-_OWN_TEXTS = {
-    message_types.SEGMENT: ("label",),
-    message_types.MARK: ("label", "reason"),
-    message_types.REVIEWED: ("chosen",),
-}
 
 
 class Mark(NamedTuple):
@@ -122,12 +97,51 @@ class ReviewedSpan(NamedTuple):
     chosen: str = PERSON
 
 
-def read_marks(log: Path) -> list[Mark]:
+class Reviewed(NamedTuple):
+    """What reviewers have said of a log, or of one of its scenarios.
+
+    Attributes
+    ----------
+    marks : list of Mark
+        By microphone and time, without overlaps.
+    reviewed : list of ReviewedSpan
+        By microphone and time; they may overlap.
+    """
+
+    marks: list[Mark]
+    reviewed: list[ReviewedSpan]
+
+
+def read_review(log: Path) -> dict[str, Reviewed]:
+    """Read all that reviewers have said of a log.
+
+    Parameters
+    ----------
+    log : Path
+
+    Returns
+    -------
+    dict of str to Reviewed
+        By the name of the scenario, of the sounds of the home by an empty one; empty if there is no
+        review layer.
+
+    Raises
+    ------
+    LogError
+        If the review layer cannot be read, is damaged or cut off, holds other topics, or has marks
+        that are invalid or overlap.
+    """
+    return _read_layer(review_path(log))
+
+
+def read_marks(log: Path, scenario: str = "") -> list[Mark]:
     """Read the marks of a log.
 
     Parameters
     ----------
     log : Path
+    scenario : str, optional
+        The marks of this scenario, by its name, instead of those of the sounds of the home.
 
     Returns
     -------
@@ -137,18 +151,19 @@ def read_marks(log: Path) -> list[Mark]:
     Raises
     ------
     LogError
-        If the review layer cannot be read, is damaged or cut off, holds other topics, or has marks
-        that are invalid or overlap.
+        As of `read_review`.
     """
-    return _read_layer(review_path(log)).marks
+    return read_review(log).get(scenario, _NOTHING).marks.copy()
 
 
-def read_reviewed(log: Path) -> list[ReviewedSpan]:
+def read_reviewed(log: Path, scenario: str = "") -> list[ReviewedSpan]:
     """Read the spans of a log that a reviewer has looked at.
 
     Parameters
     ----------
     log : Path
+    scenario : str, optional
+        As of `read_marks`.
 
     Returns
     -------
@@ -158,26 +173,27 @@ def read_reviewed(log: Path) -> list[ReviewedSpan]:
     Raises
     ------
     LogError
-        If the review layer cannot be read, is damaged or cut off, holds other topics, or has spans
-        or marks that are invalid.
+        As of `read_review`.
     """
-    return _read_layer(review_path(log)).reviewed
+    return read_review(log).get(scenario, _NOTHING).reviewed.copy()
 
 
-class _Layer(NamedTuple):
-    marks: list[Mark]
-    reviewed: list[ReviewedSpan]
+_NOTHING = Reviewed([], [])
 
 
-def _read_layer(path: Path) -> _Layer:
+def _read_layer(path: Path) -> dict[str, Reviewed]:
     """Read a layer; if another process replaces it meanwhile, read again, and it may be gone."""
     while (before := _identity(path)) is not None:
         try:
-            return _read_existing(path)
+            rows = read_rows(path)
+            return {
+                name: _reviewed(path, rows, name)
+                for name in sorted({scenario_name(labelling) for labelling, _ in rows})
+            }
         except LogError:
             if _identity(path) == before:
                 raise
-    return _Layer([], [])
+    return {}
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -189,47 +205,36 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_ino, status.st_mtime_ns
 
 
-def _read_existing(path: Path) -> _Layer:
-    with LogFile(path) as file:
-        complete = file.complete
-    selection = select([path])
-    if not complete:
-        raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
-    for name, same in selection.channels.items():
-        kind = next((k for k in _KINDS if all(is_compatible(*d, k, _FIELDS[k]) for d in same)), "")
-        if not kind or not re.fullmatch(rf"/[^/]+/{REVIEW}/{_KINDS[kind]}", name):
-            raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
-    selection.verify()
-    spans: list[Mark] = []
-    marks: dict[tuple[Any, ...], Mark] = {}
-    reviewed: list[ReviewedSpan] = []
-    for batch in selection.messages():
-        for columns in decode_types(path, batch, _FIELDS):
-            if columns.type == message_types.SEGMENT:
-                spans += _marks(columns)
-            elif columns.type == message_types.REVIEWED:
-                reviewed += _reviewed(columns)
-            else:
-                marks |= {mark[:4]: mark for mark in _marks(columns)}
+def _reviewed(path: Path, rows: Mapping[Key, Sequence[Row]], scenario: str) -> Reviewed:
+    """Take what is said of a scenario out of a layer, and check it."""
+
+    def of_type(type_: str) -> Sequence[Row]:
+        return rows.get((review_labelling(scenario), type_), ())
+
+    known = {mark[:4]: mark for mark in (Mark(*row) for row in of_type(message_types.MARK))}
+    marks = [Mark(*row) for row in of_type(message_types.SEGMENT)]
     try:
-        return _Layer(
-            _checked(marks.get(mark[:4], mark) for mark in spans), _checked_reviewed(reviewed)
+        return Reviewed(
+            _checked(known.get(mark[:4], mark) for mark in marks),
+            _checked_reviewed(ReviewedSpan(*row) for row in of_type(message_types.REVIEWED)),
         )
     except (DataError, LogError) as error:
         raise LogError(f"{path}: {error}; move this layer away to begin anew") from error
 
 
-def write_marks(
+def write_marks(  # noqa: PLR0913
     log: Path,
     marks: Iterable[Mark],
     deleted: Iterable[MarkedSpan] = (),
     *,
     reviewed: Iterable[ReviewedSpan] = (),
     not_reviewed: Iterable[ReviewedSpan] = (),
+    scenario: str = "",
 ) -> Path:
     """Add marks to the review layer of a log; where they overlap older marks, they replace these.
 
     The layer is replaced in one step. Processes that write to the same folder wait for each other.
+    Marks of a scenario, and those of the sounds of the home, leave each other as they are.
 
     Parameters
     ----------
@@ -241,6 +246,8 @@ def write_marks(
         What a reviewer has looked at; added to what the layer has.
     not_reviewed : iterable of ReviewedSpan
         Spans of the layer that are taken out of it, before those are added.
+    scenario : str, optional
+        The name of the scenario that all of it is said of.
 
     Returns
     -------
@@ -253,25 +260,37 @@ def write_marks(
         If the new marks overlap each other, or new marks or spans are invalid.
     LogError
         If there is no such log, if its layer cannot be read or is damaged, if the name of a
-        microphone is invalid, or if the layer cannot be written.
+        microphone or the scenario is invalid, or if the layer cannot be written.
     """
     new, looked_at = _checked(marks), _checked_reviewed(reviewed)
+    if scenario:
+        check_scenario_name(scenario)
     path = review_path(log)
     with _locked(path):
-        layer, before = _read_layer(path)
+        layer = _read_layer(path)
+        kept, before = layer.get(scenario, _NOTHING)
         for span in deleted:
-            layer = list(_subtract(layer, [span]))
-        layer = _checked([*_subtract(layer, new), *new])
-        kept = set(before).difference(not_reviewed)
-        looked_at = sorted(kept.union(looked_at))
-        if not (layer or looked_at):
+            kept = list(_subtract(kept, [span]))
+        kept = _checked([*_subtract(kept, new), *new])
+        looked_at = sorted(set(before).difference(not_reviewed).union(looked_at))
+        spans = _by_topic(layer | {scenario: Reviewed(kept, looked_at)})
+        if not any(spans.values()):
             path.unlink(missing_ok=True)
             return path
         node = next((record.get("node", "") for record in select([log]).metadata), "")
         metadata = provenance(node, log=stem(log) + SUFFIX)
         with replaced_file(path) as temporary:
-            temporary.write_bytes(_layer_bytes(path.name, layer, looked_at, metadata))
+            temporary.write_bytes(layer_bytes(path.name, spans, metadata))
     return path
+
+
+def _by_topic(layer: Mapping[str, Reviewed]) -> dict[Key, Sequence[Mark | ReviewedSpan]]:
+    spans: dict[Key, Sequence[Mark | ReviewedSpan]] = {}
+    for scenario in sorted(layer):
+        labelling, (marks, reviewed) = review_labelling(scenario), layer[scenario]
+        spans[labelling, message_types.SEGMENT] = spans[labelling, message_types.MARK] = marks
+        spans[labelling, message_types.REVIEWED] = reviewed
+    return spans
 
 
 @contextmanager
@@ -283,25 +302,6 @@ def _locked(path: Path) -> Iterator[None]:
         except OSError as error:
             raise LogError(f"{path}: cannot be written ({error.strerror})") from error
         yield
-
-
-def _marks(columns: Columns) -> Iterator[Mark]:
-    microphone = columns.topic.split("/")[1]
-    starts = columns["header.stamp"]
-    ends = starts + columns["duration"]
-    names = (*_ORIGIN, "reason") if columns.type == message_types.MARK else ()
-    origin = [columns[name].tolist() for name in names]
-    for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), *origin, strict=True):
-        yield Mark(microphone, *row)
-
-
-def _reviewed(columns: Columns) -> Iterator[ReviewedSpan]:
-    microphone = columns.topic.split("/")[1]
-    starts = columns["header.stamp"]
-    ends = starts + columns["duration"]
-    others = [columns[name].tolist() for name in (*_ORIGIN, "chosen")]
-    for row in zip(starts.tolist(), ends.tolist(), *others, strict=True):
-        yield ReviewedSpan(microphone, *row)
 
 
 def _checked(marks: Iterable[Mark]) -> list[Mark]:
@@ -359,48 +359,3 @@ def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]
         for start, end in zip(begins, stops, strict=True)
         if end - start > ROUNDING
     ]
-
-
-def _layer_bytes(
-    name: str,
-    marks: Sequence[Mark],
-    reviewed: Sequence[ReviewedSpan],
-    metadata: dict[str, str],
-) -> bytes:
-    """Write the file in another folder, where nobody takes it for a log being recorded."""
-    rows: dict[str, Sequence[Mark | ReviewedSpan]] = {
-        message_types.SEGMENT: marks,
-        message_types.MARK: marks,
-        message_types.REVIEWED: reviewed,
-    }
-    batches = [
-        (
-            Topic(labelling_topic(microphone, REVIEW, kind), type_),
-            [span for span in rows[type_] if span.microphone == microphone],
-        )
-        for type_, kind in _KINDS.items()
-        for microphone in sorted({span.microphone for span in rows[type_]})
-    ]
-    with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
-        writer = LogWriter(Path(folder) / name, [topic for topic, _ in batches], metadata)
-        writer.write_columns([_rows(*batch) for batch in batches])
-        return writer.finish().read_bytes()
-
-
-def _rows(topic: Topic, spans: Sequence[Mark | ReviewedSpan]) -> TopicBatch:
-    starts = np.array([span.start for span in spans])
-    ends = np.array([span.end for span in spans])
-    fields: dict[str, Column] = {
-        "header.stamp": starts,
-        "header.frame_id": spans[0].microphone,
-        "duration": ends - starts,
-    }
-    if topic.type == message_types.SEGMENT:
-        fields["confidence"] = np.ones(len(spans), np.float32)
-    else:
-        for name in ("reviewer", "corrects"):
-            fields[name] = [getattr(span, name) for span in spans]
-        fields["made"] = np.array([span.made for span in spans])
-    for own in _OWN_TEXTS[topic.type]:
-        fields[own] = [getattr(span, own) for span in spans]
-    return TopicBatch(topic.name, ends, fields)

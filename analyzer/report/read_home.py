@@ -39,7 +39,6 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
-_LATEST = 1 << 61
 _FIELDS = {"header.stamp", "duration", "label"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
 Source = tuple[str, str]  # node, microphone
@@ -177,7 +176,7 @@ def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, 
 
 def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
     """Read gaps that end after the days that are reported: they are in later logs."""
-    later = [entry for entry in logs.between(end, _LATEST) if entry.start >= end]
+    later = [entry for entry in logs.between(end) if entry.start >= end]
     for number, entry in enumerate(later):
         if number and entry.start > end + _LATE:
             return

@@ -162,8 +162,8 @@ def chosen(
 
 
 def _labelling(sound: HomeSound, name: str) -> Labelling | None:
-    path, labelled = sound.log, LIVE
-    if name != LIVE:
+    path, labelled = sound.log, sound.labelling
+    if name not in {LIVE, labelled}:
         name = name.removeprefix(relabelling(""))
         path, labelled = relabel_path(sound.log, name), relabelling(name)
     topic = labelling_topic(sound.microphone, labelled, "segment")

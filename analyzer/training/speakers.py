@@ -1,6 +1,8 @@
 """The scenario of speakers: who of those that are enrolled speaks, or somebody else."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +11,16 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
 from hearthlog.analyzer.training.installed import method_named
-from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
+from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.scenario import LABELS, Scenario
-from hearthlog.models.classes import OTHER, SILENCE, UNKNOWN, class_name, find_class
+from hearthlog.models.classes import OTHER, SILENCE, SPEECH, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.files import CUT
+from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 
 SPEAKERS = "speakers"
@@ -27,7 +30,7 @@ _LEAST_TIMES = 2
 
 
 def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterator[Recording]:
-    """Read the marks of a training set of voices; each log is a source.
+    """Read the marks of a training set of voices, and of the scenario; each log is a source.
 
     Enrolled spans of logs are one source where they are less than half an hour apart.
 
@@ -48,8 +51,11 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
     """
     cut: list[Recording] = []
     for folder in folders:
-        for sound in read_reviewed_sound(folder, features):
-            taught = sound if sound.enrolled else teaching(sound)
+        of_both = chain.from_iterable(
+            read_reviewed_sound(folder, features, scenario) for scenario in ("", SPEAKERS)
+        )
+        for sound in of_both:
+            taught = sound if sound.enrolled else _saying_who(teaching(sound))
             for one in marked_recordings([taught], folder, features, 0.0):
                 # A reviewer who says unknown cannot tell, who enrols it says that it is nobody.
                 label = OTHER if class_name(one.label) == UNKNOWN else one.label
@@ -59,6 +65,14 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
                 else:
                     yield own
     yield from _by_time(cut)
+
+
+def _saying_who(sound: HomeSound) -> HomeSound:
+    """Leave out that somebody speaks, which is not said of the scenario."""
+    marks = sound.marks
+    if sound.labelling == LIVE:
+        marks = [mark for mark in marks if class_name(mark.label) != SPEECH]
+    return replace(sound, marks=marks)
 
 
 def _by_time(recordings: Iterable[Recording]) -> Iterator[Recording]:

@@ -17,7 +17,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic, scenario_labelling
 from hearthlog.schemas.times import NANOSECONDS
 
 _RECENT = 14 * 86_400 * NANOSECONDS
@@ -28,7 +28,9 @@ _PART = 3600 * NANOSECONDS
 _VERY_SURE = 0.8  # with less a model that is often wrong here would learn its mistakes
 
 
-def unreviewed_silence(folders: Sequence[Path], model: Model) -> Iterator[Candidates]:
+def unreviewed_silence(
+    folders: Sequence[Path], model: Model, scenario: str = ""
+) -> Iterator[Candidates]:
     """Cut silence out of some logs of the last two weeks.
 
     Parameters
@@ -37,6 +39,8 @@ def unreviewed_silence(folders: Sequence[Path], model: Model) -> Iterator[Candid
         Of logs.
     model : Model
         With a class of silence.
+    scenario : str, optional
+        For which it labels; empty for the sounds of the home.
 
     Raises
     ------
@@ -45,11 +49,12 @@ def unreviewed_silence(folders: Sequence[Path], model: Model) -> Iterator[Candid
     """
     recent = _recent(folders)
     for place in np.linspace(len(recent) - 1, 0, min(len(recent), _SILENT_LOGS)).round():
-        yield from _labelled(recent[int(place)], model, {SILENCE}, _SILENT_PART)
+        log = recent[int(place)]
+        yield from _labelled(log, model, {SILENCE}, _SILENT_PART, scenario)
 
 
 def unreviewed_sounds(
-    folders: Sequence[Path], model: Model, names: Collection[str]
+    folders: Sequence[Path], model: Model, names: Collection[str], scenario: str = ""
 ) -> list[Recording]:
     """Choose sounds of some classes of which a model is very sure.
 
@@ -62,6 +67,8 @@ def unreviewed_sounds(
     model : Model
     names : collection of str
         Of its classes.
+    scenario : str, optional
+        For which it labels; empty for the sounds of the home.
 
     Returns
     -------
@@ -74,23 +81,25 @@ def unreviewed_sounds(
         If there is no log.
     """
     recent = _recent(folders)
-    amounts = np.array([_labelled_time(log, names) for log in recent], np.int64)
+    amounts = np.array([_labelled_time(log, names, scenario) for log in recent], np.int64)
     most = np.argsort(-amounts, kind="stable")[:_LOGS]
     candidates = [
         one
         for place in most[amounts[most] > 0]
-        for one in _labelled(recent[place], model, names, _PART)
+        for one in _labelled(recent[place], model, names, _PART, scenario)
     ]
     return chosen(candidates, model, least=_VERY_SURE, fewest=0)
 
 
 def _recent(folders: Sequence[Path]) -> list[Path]:
-    entries = find_home_logs(folders).between(0, 1 << 62)
+    entries = find_home_logs(folders).between()
     newest = max((entry.start for entry in entries), default=0)
     return [entry.path for entry in entries if newest - entry.start <= _RECENT]
 
 
-def _labelled(log: Path, model: Model, names: Collection[str], length: int) -> Iterator[Candidates]:
+def _labelled(
+    log: Path, model: Model, names: Collection[str], length: int, scenario: str
+) -> Iterator[Candidates]:
     """Cut classes out of the beginning of a log."""
     with suppress(LogError):  # why it cannot be read is said when it is labelled
         features = feature_set(model.description.feature_set)
@@ -98,18 +107,19 @@ def _labelled(log: Path, model: Model, names: Collection[str], length: int) -> I
             if info.first_frame is not None:
                 begin = info.first_frame[1]
                 part = begin, begin + length
-                for sound in read_sound_of(log, features, {info.microphone}, part):
+                for sound in read_sound_of(log, features, {info.microphone}, part, scenario):
                     yield labelled_segments(sound, model.classes, names, features.window_frames)
 
 
-def _labelled_time(log: Path, names: Collection[str]) -> int:
+def _labelled_time(log: Path, names: Collection[str], scenario: str) -> int:
     """Return for how long classes were labelled in a log, in nanoseconds."""
     amount = 0
     with suppress(LogError):
         infos = read_recorder_infos(log, "features")
-        topics = {topic(info.microphone, "segment") for info in infos}
+        labelling = scenario_labelling(scenario) if scenario else LIVE
+        topics = {labelling_topic(info.microphone, labelling, "segment") for info in infos}
         for columns in read_columns([log], topics, fields=SEGMENT_FIELDS).values():
-            labelling = labelling_of(columns)
-            own = np.isin(labelling.labels.astype(str), sorted(names))
-            amount += int((labelling.ends - labelling.starts)[own].sum())
+            labels = labelling_of(columns)
+            own = np.isin(labels.labels.astype(str), sorted(names))
+            amount += int((labels.ends - labels.starts)[own].sum())
     return amount

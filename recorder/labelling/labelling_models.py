@@ -123,8 +123,11 @@ class LabellingModels:
             self._left_out = []
         for watch in self._watches.values():
             refusals += watch.refusals()
+        if any(watch.ready is not None for watch in self._watches.values()):
+            for watch in self._watches.values():
+                watch.offer_again()
         while refused := self._refuse_clashes():
-            refusals += refused
+            refusals += filter(None, refused)
         if self._candidates is not None:
             for candidate in self._candidates.news():
                 self._offered = candidate
@@ -151,7 +154,7 @@ class LabellingModels:
         changes = []
         for labelling, watch in self._watches.items():
             if watch.ready is not None:
-                self.in_use[labelling], watch.ready = watch.ready, None
+                self.in_use[labelling], watch.ready, watch.held = watch.ready, None, None
                 changes.append(Change(labelling, *self.in_use[labelling]))
         if self._trial_changes():
             changes.append(self._change_trial())

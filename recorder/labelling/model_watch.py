@@ -78,6 +78,8 @@ class ModelWatch:
         The model at the start.
     ready : Loaded or None
         The last model that replaced it; to be set to None by who uses it.
+    held : Loaded or None
+        What the file has, and was refused because of what another model labels.
 
     Raises
     ------
@@ -94,11 +96,12 @@ class ModelWatch:
         self._starts_with_starter = is_default and self._seen is None
         self.first = self._load_first()
         self.ready: Loaded | None = None
+        self.held: Loaded | None = None
         self._awaited: Path | None = None  # the judgement that the model in the file lacks
         self._judged: FileIdentity = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
-        self._results: SimpleQueue[Loaded | str] = SimpleQueue()
+        self._results: SimpleQueue[Loaded | str | None] = SimpleQueue()  # None: that in use
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
         self._thread.start()
@@ -121,14 +124,19 @@ class ModelWatch:
         """
         with suppress(Empty):
             while True:
-                result = self._results.get_nowait()
+                result, self.held = self._results.get_nowait(), None
                 if isinstance(result, str):
                     yield result
-                else:
+                elif result is not None:
                     self.ready = result
 
+    def offer_again(self) -> None:
+        """Let what is held be ready, for another model may give up the class that it lacked."""
+        if self.ready is None and self.held is not None:
+            self.ready, self._last = self.held, self.held.model
+
     def refuse_ready(self, reason: str, in_use: Model) -> str:
-        """Refuse the model that is ready.
+        """Refuse the model that is ready, and hold it.
 
         Parameters
         ----------
@@ -140,11 +148,14 @@ class ModelWatch:
         Returns
         -------
         str
-            A sentence about it.
+            A sentence about it; empty if it was refused before.
         """
         assert self.ready is not None
-        name, self.ready, self._last = self.ready.model.name, None, in_use
-        text = self._refusal(name, reason)
+        said, self.held, self.ready = self.ready is self.held, self.ready, None
+        self._last = in_use
+        if said:
+            return ""
+        text = self._refusal(self.held.model.name, reason)
         say(text)
         return text
 
@@ -182,6 +193,7 @@ class ModelWatch:
         self._awaited = self._judged = None
         try:
             if name_and_digest(self._path) == (self._last.name, self._last.sha256):
+                self._results.put(None)
                 return  # a second copy of it in memory would not all be given back
             loaded = load_checked(self._path)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on

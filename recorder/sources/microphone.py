@@ -64,7 +64,8 @@ class MicrophoneSource:
         Another device, which is heard as long as this one is not there; by default none. It is
         no array.
     waits : bool, optional
-        Whether a device that is not there at the start is waited for, as it is later.
+        Whether a device that is not there at the start is waited for, as it is later. One that is
+        no such array is not waited for without a fallback.
     rest : Rest or None
         When the device is to be closed; by default never.
     channels : int or None
@@ -96,6 +97,7 @@ class MicrophoneSource:
         self._fallback = _Device(fallback) if fallback else None
         self._return: ReturnWatch | None = None  # as long as the fallback is heard
         self._lost_at = -math.inf  # when the device was lost
+        self._unfit = ""  # why a device that is there cannot be heard
         self.device = self._own.name
         self._rest = rest
         self._capture: Capture | None = None
@@ -198,10 +200,14 @@ class MicrophoneSource:
     def _try_at_the_start(self, *, waits: bool) -> None:
         try:
             self._hear(self._own, self._open(self._own, Flag()))
-        except DeviceError as error:
-            if not waits:
+        except SourceError as error:
+            self._miss(error)
+            if not waits or (self._unfit and not self._falls_back(Flag())):
                 raise
-            self._health = (ERROR, f"{error}; waiting for it")
+
+    def _miss(self, error: SourceError) -> None:
+        self._unfit = "" if isinstance(error, DeviceError) else str(error)
+        self._health = (ERROR, f"{error}; waiting for it")
 
     def _open(self, device: "_Device", stop: Flag) -> Capture:
         if is_address(device.wanted):
@@ -221,7 +227,7 @@ class MicrophoneSource:
             except SourceError as error:
                 if stop.is_set():
                     return
-                self._health = (ERROR, f"{error}; waiting for it")
+                self._miss(error)
             else:
                 return
             if self._falls_back(stop):
@@ -270,8 +276,8 @@ class MicrophoneSource:
         elif self._clock.trouble:
             self._health = (ERROR, self._clock.trouble)
         elif self._return is not None:
-            own = self._own.name or "the default microphone"
-            self._health = (WARNING, f"{own} is not there; {self.device} is heard in its place")
+            lost = self._unfit or f"{self._own.name or 'the default microphone'} is not there"
+            self._health = (WARNING, f"{lost}; {self.device} is heard in its place")
         else:
             self._health = (OK, "listening")
 

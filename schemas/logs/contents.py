@@ -10,10 +10,9 @@ from mcap.records import Channel, Schema
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.statuses import Status, statuses_of
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages import message_types, topics
 from hearthlog.schemas.messages.fields import missing_fields
 from hearthlog.schemas.messages.labels import is_sound
-from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.schemas.times import NANOSECONDS
 
 STREAM = {
@@ -156,7 +155,7 @@ def is_review(microphone: str) -> bool:
     microphone : str
         As `Contents` has it.
     """
-    return microphone.endswith(f"/{REVIEW}")
+    return topics.is_review(microphone.partition("/")[2])
 
 
 def is_readable(

@@ -11,11 +11,12 @@ from hearthlog.schemas.messages import message_types
 DIAGNOSTICS = "/diagnostics"
 ROSOUT = "/rosout"
 # Labellings: the recorder's, that of a model on trial beside it, a reviewer's, by its name
-# `scenario/<name>`, and by its model `relabel/<model>`.
+# `scenario/<name>`, what a reviewer says of that, and by its model `relabel/<model>`.
 LIVE, CANDIDATE, REVIEW, RELABEL = "live", "candidate", "review", "relabel"
 SCENARIO = "scenario"
 _MICROPHONE = "[a-z](?:_?[a-z0-9])*"  # and the name of a scenario
-_NOT_LIVE = rf"{CANDIDATE}|{REVIEW}|{SCENARIO}/{_MICROPHONE}|{RELABEL}/\w{{1,200}}"
+_SCENARIO = f"{SCENARIO}/{_MICROPHONE}"
+_NOT_LIVE = rf"{CANDIDATE}|{REVIEW}(?:/{_SCENARIO})?|{_SCENARIO}|{RELABEL}/\w{{1,200}}"
 LABELLING = re.compile(f"{LIVE}|{_NOT_LIVE}", re.ASCII)
 _LONGEST_SCENARIO = 64
 _TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_NOT_LIVE})/)?(\w+)", re.ASCII)
@@ -120,6 +121,40 @@ def is_scenario(labelling: str) -> bool:
     return labelling.startswith(f"{SCENARIO}/")
 
 
+def scenario_name(labelling: str) -> str:
+    """Return the name of the scenario that a labelling is of; empty if it is of none.
+
+    Parameters
+    ----------
+    labelling : str
+        Such as `scenario/<name>`, `review/scenario/<name>` or `live`.
+    """
+    parts = labelling.removeprefix(f"{REVIEW}/").partition("/")
+    return parts[2] if parts[0] == SCENARIO else ""
+
+
+def review_labelling(scenario: str = "") -> str:
+    """Name what reviewers say: `review`, or of a scenario `review/scenario/<name>`.
+
+    Parameters
+    ----------
+    scenario : str
+        Its name; empty for the sounds of the home.
+    """
+    return f"{REVIEW}/{scenario_labelling(scenario)}" if scenario else REVIEW
+
+
+def is_review(labelling: str) -> bool:
+    """Tell whether a labelling is that of a reviewer.
+
+    Parameters
+    ----------
+    labelling : str
+        Such as `review` or `review/scenario/<name>`.
+    """
+    return labelling.partition("/")[0] == REVIEW
+
+
 def topic(microphone: str, kind: str) -> str:
     """Name the topic of one kind of a microphone: `/<microphone>/<kind>`.
 
@@ -137,7 +172,7 @@ class TopicName(NamedTuple):
     """The parts of the name of a topic."""
 
     microphone: str
-    labelling: str  # `live`, `candidate`, `review`, `scenario/<name>` or `relabel/<model>`
+    labelling: str  # `live`, `candidate`, `review`, `scenario/<name>`, `relabel/<model>` …
     kind: str  # `features`, `label`, `segment` …
 
 
@@ -149,7 +184,8 @@ def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
     microphone : str
         Its name.
     labelling : str
-        `live`, `candidate`, `review`, `scenario/<name>` or `relabel/<model>`.
+        `live`, `candidate`, `review`, `scenario/<name>`, `review/scenario/<name>` or
+        `relabel/<model>`.
     kind : str
         `label`, `segment` or `mark`.
     """

@@ -29,10 +29,11 @@ from sklearn.model_selection import StratifiedGroupKFold
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import collection_folds, nested_probabilities
+from hearthlog.analyzer.training.cross_validation import Fold, cross_validate
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
 from hearthlog.analyzer.training.installed import OTHERS
 from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.method import Examples, Fold, Method, cross_validate, prepare
+from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scenario import load_scenario
 from hearthlog.analyzer.training.scores import Scores, calibration_error, difference, score
 from hearthlog.analyzer.training.svm_method import ROOM

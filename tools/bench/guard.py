@@ -19,7 +19,7 @@ from hearthlog.analyzer.evaluation.scenes import background
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import SIZE_LIMIT, LabelledClip, read_manifest
 from hearthlog.analyzer.training.rooms import reverberated
 from hearthlog.analyzer.training.scenario import LABELS

@@ -7,8 +7,9 @@ import numpy as np
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
+from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.method import prepare, softmax
+from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import ROOM, LearnedSvm
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF

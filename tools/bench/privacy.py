@@ -18,7 +18,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SPEECH

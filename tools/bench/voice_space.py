@@ -15,7 +15,7 @@ from safetensors.numpy import save_file
 from scipy.linalg import eigh
 
 from hearthlog.analyzer.discover.voice_space import VoiceSpace, describe_speech
-from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.rooms import in_room
 from hearthlog.analyzer.training.scenario import LABELS

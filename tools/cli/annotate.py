@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.marks.label_import import Folded
     from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 
+_SCENARIO = "Scenario that the marks are of, by its name; else they are of the sounds of the home."
 _SHOWN = 10  # names, kinds of labels
 
 annotate = typer.Typer(
@@ -60,6 +61,7 @@ def import_labels(
         str | None,
         typer.Option(help="Who labelled, where the file does not say.", show_default="you"),
     ] = None,
+    scenario: Annotated[str, typer.Option(help=_SCENARIO, show_default="none")] = "",
     strict: Annotated[
         bool, typer.Option("--strict", help="Take nothing unless every label can be taken.")
     ] = False,
@@ -77,16 +79,24 @@ def import_labels(
     from hearthlog.analyzer.marks.label_import import import_labels as read_labels
     from hearthlog.analyzer.marks.marks import RANDOM, read_marks, read_reviewed, write_marks
     from hearthlog.analyzer.marks.merge_marks import new_marks
-    from hearthlog.analyzer.review.queue.asked import asked_path, looked_at, unasked
+    from hearthlog.analyzer.review.queue.asked import (
+        asked_path,
+        check_scenario,
+        looked_at,
+        unasked,
+    )
     from hearthlog.analyzer.review.queue.review_list import read_list
 
-    _check_suffix(labels)
+    _check_use(labels, scenario)
     name, now = reviewer_name(reviewer), time.time_ns()
     choice = Choice(tier or (), _columns(column or []))
     names = None if class_map is None else read_class_map(class_map)
     coverage = find_coverage(log)
     _check_microphone(log, coverage, microphone)
     options = ImportOptions(microphone, names, choice, strict)
+    asked = asked_path(labels)
+    spans = read_list(asked) if asked.exists() else []
+    check_scenario(asked, spans, scenario, "--scenario")
     by_log, left_out, moved = read_labels(
         labels, coverage, options, lambda folded: _agree(labels, folded, yes=yes)
     )
@@ -97,8 +107,6 @@ def import_labels(
         for line in losses:
             tell(line)
         raise typer.Exit(1)
-    asked = asked_path(labels)
-    spans = read_list(asked) if asked.exists() else []
     said = [mark for marks in by_log.values() for mark in marks]
     looked = looked_at(spans, said, coverage, name, now)
     taken: list[Mark] = []
@@ -106,14 +114,14 @@ def import_labels(
     for path in sorted(by_log.keys() | looked.keys()):
         new = [
             mark._replace(reviewer=mark.reviewer or name, made=mark.made or now)
-            for mark in new_marks(by_log.get(path, []), read_marks(path))
+            for mark in new_marks(by_log.get(path, []), read_marks(path, scenario))
         ]
-        known = {span._replace(reviewer="", made=0) for span in read_reviewed(path)}
+        known = {span._replace(reviewer="", made=0) for span in read_reviewed(path, scenario)}
         reviewed = [
             span for span in looked.get(path, []) if span._replace(reviewer="", made=0) not in known
         ]
         if new or reviewed:
-            print(write_marks(path, new, reviewed=reviewed))
+            print(write_marks(path, new, reviewed=reviewed, scenario=scenario))
         taken += new
         seen += reviewed
     _print_amounts(taken)
@@ -129,7 +137,10 @@ def import_labels(
         if others := unasked(spans, taken):
             tell(f"{number(len(others), 'mark')} in no span of {asked}: of your own choice")
     if taken:
-        tell(f"next: a model of this home, from these: hearthlog train --home {quote(str(log))}")
+        what, of = (
+            (f"scenario {scenario}", f" --scenario {scenario}") if scenario else ("this home", "")
+        )
+        tell(f"next: a model of {what}, from these: hearthlog train --home {quote(str(log))}{of}")
     end_with_warnings(losses)
 
 
@@ -139,6 +150,7 @@ def export_labels(
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to make: {PATTERNS}.")],
     microphone: Microphone = None,
+    scenario: Annotated[str, typer.Option(help=_SCENARIO, show_default="none")] = "",
 ) -> None:
     """Write the marks of review layers to a label file."""
     from hearthlog.analyzer.logs.coverage import find_coverage
@@ -146,7 +158,7 @@ def export_labels(
     from hearthlog.analyzer.marks.marks import read_marks
     from hearthlog.schemas.storage.new_files import check_new
 
-    _check_suffix(output)
+    _check_use(output, scenario)
     check_new(output)
     coverage = find_coverage(log)
     _check_microphone(log, coverage, microphone)
@@ -154,16 +166,20 @@ def export_labels(
         mark
         for name, one in coverage.items()
         for path in one.logs
-        for mark in read_marks(path)
+        for mark in read_marks(path, scenario)
         if mark.microphone == name and microphone in {None, name}
     }
     write_labels(output, sorted(marks, key=lambda mark: (mark.start, mark)), coverage)
     print(output)
 
 
-def _check_suffix(path: Path) -> None:
+def _check_use(path: Path, scenario: str) -> None:
+    from hearthlog.schemas.messages.topics import check_scenario_name
+
     if find_format(path) is None:
         wrong_use(f"{path}: a label file is {PATTERNS}")
+    if scenario:
+        check_scenario_name(scenario)
 
 
 def _check_microphone(

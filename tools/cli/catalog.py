@@ -44,7 +44,7 @@ def catalog(
     is unfinished or damaged.
     """
     from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, UNFINISHED
-    from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
+    from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts, scenario_amounts
 
     if folder.is_file():
         wrong_use(f"{folder} is a file; give the folder that holds the logs or homes")
@@ -60,10 +60,11 @@ def catalog(
             "damaged": {row.path: row.error for row in damaged},
             "homes": [_home(home) for home in homes(files)],
             "labels": [asdict(label) for label in label_amounts(files)],
+            "scenarios": [asdict(label) for label in scenario_amounts(files)],
         }
         print(json.dumps(result, indent=2))
     else:
-        _print(homes(files), label_amounts(files), unfinished)
+        _print(homes(files), [*label_amounts(files), *scenario_amounts(files)], unfinished)
     if damaged or unfinished:
         raise typer.Exit(3)
 
@@ -128,7 +129,8 @@ def _label_rows(labels: Sequence["LabelAmount"]) -> Iterator[Sequence[str]]:
     """Add up the labels of all homes, those of one kind and model together."""
     sums: dict[tuple[str, str, str], tuple[float, int]] = {}
     for one in labels:
-        key = one.kind, one.model or "", one.label
+        kind = f"{one.kind}, scenario {one.scenario}" if one.scenario else one.kind
+        key = kind, one.model or "", one.label
         minutes, segments = sums.get(key, (0.0, 0))
         sums[key] = minutes + one.minutes, segments + one.segments
     for key, (minutes, segments) in sorted(

@@ -107,10 +107,10 @@ def _queue(
     from hearthlog.analyzer.review.queue.ranking import make_queue
     from hearthlog.analyzer.review.queue.review_list import queued
     from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
-    from hearthlog.schemas.messages.topics import REVIEW
+    from hearthlog.schemas.messages.topics import is_review, scenario_name
 
     names = [side.name for side in sides]
-    if REVIEW in names:
+    if any(map(is_review, names)):
         wrong_use("a queue is of what is not reviewed yet: compare other labellings")
     with share_done("reading labels") as progress:
         ranked = make_queue(
@@ -118,7 +118,7 @@ def _queue(
             microphone,
             sides[0],
             other=sides[1] if len(sides) > 1 else None,
-            reviewed=reviewed_time(sources, microphone).spans,
+            reviewed=reviewed_time(sources, microphone, scenario_name(names[0])).spans,
             count=count,
             progress=progress,
         )

@@ -103,7 +103,7 @@ def evaluate_log(
 
     check_output("--plot", plot, ".png", "a picture")
     labelled = read_labelling(log, topic)
-    true = read_reference(reference, log, labelled.microphone)
+    true = read_reference(reference, log, labelled.microphone, labelled.scenario)
     result = evaluate_labelling(true, labelled.labelling, labelled.classes)
     _save_plot(plot, f"{labelled.topic} of {log} against {reference}", result.scores)
     if as_json:

@@ -364,11 +364,12 @@ def _row(entry: "ModelEntry") -> tuple[str, ...]:
     if entry.model is None:
         return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
     description = entry.model.description
+    directions = ", directions" if description.direction_microphones else ""
     return (
         entry.name,
         alias,
         f"{description.scenario_name} ({len(description.classes)})",
-        f"{description.feature_set} {description.inputs}",
+        f"{description.feature_set} {description.inputs}{directions}",
         f"{description.metrics.macro_f1:.3f}{' simulated' * description.training_data.simulated}",
         f"{description.metrics.expected_calibration_error:.3f}",
         entry.model.sha256[:12],
@@ -391,6 +392,7 @@ def _as_json(entry: "ModelEntry") -> dict[str, object]:
             "classes": description.classes,
             "feature_set": description.feature_set,
             "inputs": description.inputs,
+            "direction_microphones": description.direction_microphones,
             "simulated": description.training_data.simulated,
             "macro_f1": description.metrics.macro_f1,
             "expected_calibration_error": description.metrics.expected_calibration_error,

@@ -26,6 +26,7 @@ from hearthlog.tools.cli.options import (
     reviewer_name,
 )
 from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.recurring_lanes import add_groups, add_voices
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, tell, wrong_use
 
@@ -71,7 +72,10 @@ def review(
         typer.Option(min=1, help="How many to go through.", show_default="10; all of a list"),
     ] = None,
     labels: Annotated[
-        str, typer.Option(help="Labelling to correct: live, or the model of a relabel layer.")
+        str,
+        typer.Option(
+            help="Labelling to correct: live, a scenario, or the model of a relabel layer."
+        ),
     ] = "live",
     microphone: Microphone = None,
     reviewer: Annotated[
@@ -107,9 +111,9 @@ def review(
         with share_done("reading logs") as progress:
             timeline = read_timeline(logs, *limits, zone=timezone, progress=progress)
         if groups is not None:
-            _add_groups(timeline, logs, groups)
+            add_groups(timeline, logs, groups)
         if voices is not None:
-            _add_voices(timeline, logs, voices)
+            add_voices(timeline, logs, voices)
         return timeline
 
     chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
@@ -128,49 +132,6 @@ def review(
             timeline = read()
             _show(viewer, timeline, logs, chosen)
     end_with_warnings(timeline.losses)
-
-
-def _add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
-    """Add the sounds of groups to a timeline."""
-    from hearthlog.analyzer.discover.group_spans import group_spans
-    from hearthlog.analyzer.discover.groups_file import load_groups
-    from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline.model import LabelledSpans
-
-    groups = load_groups(file)
-    if groups is None:
-        raise DataError(f"{file}: no such file of groups; `hearthlog discover` makes one")
-    span = timeline.grid.start, timeline.grid.end
-    with share_done("finding what recurs") as progress:
-        found, losses = group_spans(find_home_logs(logs), groups, *span, progress)
-    for name, spans in found.items():
-        if name in timeline.microphones:
-            timeline.microphones[name].recurring = LabelledSpans(*spans)
-    timeline.losses += [text for text in losses if text not in timeline.losses]
-
-
-def _add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
-    """Add the turns of voices to a timeline."""
-    from hearthlog.analyzer.discover.home_voices import find_voices
-    from hearthlog.analyzer.discover.read_speech import read_speech
-    from hearthlog.analyzer.discover.voice_summary import spoken_spans
-    from hearthlog.analyzer.discover.voices_file import load_voices
-    from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline.model import LabelledSpans
-
-    known = load_voices(file)
-    if known is None:
-        raise DataError(f"{file}: no such file of voices; `hearthlog voices` makes one")
-    with share_done("telling voices apart") as progress:
-        span = timeline.grid.start, timeline.grid.end
-        speech = read_speech(find_home_logs(logs), *span, progress)
-    voices, of = find_voices(speech, known)
-    for name, spans in spoken_spans(speech, voices, of).items():
-        if name in timeline.microphones:
-            timeline.microphones[name].spoken = LabelledSpans(*spans)
-    timeline.losses += [text for text in speech.losses if text not in timeline.losses]
 
 
 class ReviewCommand(TyperCommand):
@@ -244,6 +205,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     from hearthlog.analyzer.review.session.session import Session
     from hearthlog.analyzer.review.session.sound import listen
     from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
+    from hearthlog.analyzer.review.timeline.model import no_spans
     from hearthlog.analyzer.review.timeline.read_timeline import (
         MOST_FRAMES,
         read_frames,
@@ -252,6 +214,9 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
 
     microphone = _microphone(timeline, choice.microphone)
     items, marking = _work(timeline, logs, choice, microphone)
+    heard = timeline.microphones[microphone]
+    if marking.scenario:
+        heard.reviewed_scenarios.setdefault(marking.scenario, no_spans())  # or it has no lane
 
     def say(text: str) -> None:
         print(printable(text), flush=True)
@@ -270,11 +235,11 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     session = Session(
         viewer,
         marking,
-        timeline.microphones[microphone].classes,
+        heard.classes_of(marking.scenario),
         home_zone(timeline.zone),
         say,
         look_closely,
-        lambda start, end: listen(timeline.microphones[microphone].clips, start, end),
+        lambda start, end: listen(heard.clips, start, end),
         items,
     )
     keys: SimpleQueue[str] = SimpleQueue()
@@ -290,9 +255,13 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):
         if session.run(keys):
-            homes = shlex.join(word for log in logs for word in ("--home", str(log)))
-            tell(f"next: a model of this home, from what is marked: hearthlog train {homes}")
-    _say_how_right(logs)
+            words = [word for log in logs for word in ("--home", str(log))]
+            words += ["--scenario", marking.scenario] if marking.scenario else []
+            what = f"scenario {marking.scenario}" if marking.scenario else "this home"
+            train = f"hearthlog train {shlex.join(words)}"
+            tell(f"next: a model of {what}, from what is marked: {train}")
+    if not marking.scenario:
+        _say_how_right(logs)
 
 
 def _say_how_right(logs: list[Path]) -> None:
@@ -315,7 +284,7 @@ def _work(
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.queue_items import review_items
     from hearthlog.analyzer.review.timeline.model import no_spans
-    from hearthlog.schemas.messages.topics import LIVE
+    from hearthlog.schemas.messages.topics import LIVE, scenario_name
 
     segments = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []
@@ -331,6 +300,7 @@ def _work(
         choice.reviewer,
         corrected_name(labelling),
         segments.get(labelling, no_spans()),
+        scenario_name(labelling),
     )
     return items, marking
 
@@ -342,6 +312,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
     from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.review.queue.asked import asked_path, labels_of
     from hearthlog.analyzer.review.queue.review_list import write_list
+    from hearthlog.schemas.messages.topics import scenario_name
     from hearthlog.schemas.storage.new_files import check_new
 
     if find_format(path) is None:
@@ -367,9 +338,11 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
         ],
     )
     _tell_fewer(len(spans), choice)
+    scenario = scenario_name(labelling)
+    of = f" --scenario {scenario}" if scenario else ""
     tell(
         f"{path}: correct the labels, delete the lines that you cannot judge, and take the rest as "
-        f"marks: hearthlog annotate import {logs[0]} {path}"
+        f"marks: hearthlog annotate import {logs[0]} {path}{of}"
     )
     end_with_warnings(sources.losses)
 

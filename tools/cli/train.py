@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
+_SCENARIO = f"{SCENARIO} With --home alone a scenario of the recorder, by its name."
 _SPEAKERS = "speakers"  # the scenario of who speaks
 
 
@@ -49,7 +50,7 @@ def train(
         ),
     ] = None,
     data: Annotated[list[Path] | None, typer.Option(help=CLIPS)] = None,
-    scenario: Annotated[str | None, typer.Option(help=SCENARIO)] = None,
+    scenario: Annotated[str | None, typer.Option(help=_SCENARIO)] = None,
     home: Annotated[
         list[Path] | None,
         typer.Option(
@@ -84,20 +85,21 @@ def train(
     `hearthlog models promote` ends with 1 if it may not label.
     """
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
+    from hearthlog.schemas.messages.topics import check_scenario_name
 
     speakers = scenario == _SPEAKERS
     if speakers or data:
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
-    elif scenario or not home or scheduler or (cost, gamma) != (None, None):
+    elif not home or scheduler or (cost, gamma) != (None, None):
         wrong_use("give --data and --scenario, or --home without what is about --data")
     else:
-        base = base or _model_of(home)
+        base = base or _model_of(home, check_scenario_name(scenario) if scenario else "")
     if output is not None:
         check_output(output)
     if not data and not speakers:
         assert base is not None
         assert home is not None
-        model, segments = _adapted(base, home)
+        model, segments = _adapted(base, home, scenario or "")
     else:
         assert scenario is not None
         from hearthlog.analyzer.workers.parallel import fits_on
@@ -105,10 +107,11 @@ def train(
         chosen = chosen_method(method, cost=cost, gamma=gamma)
         with fits_on(scheduler):
             model, segments = _learned(data or [], scenario, home or [], chosen, smoothing)
-    output = output or _next_of_home()
+    output = output or _next_model(f"scenario-{scenario}" if scenario else "home")
     save_model(model, output)
     saved = load_model(output)
-    verdict = _judged(saved, output, home) if home and not speakers else None
+    of_home = bool(home) and (scenario is None or (bool(data) and not speakers))
+    verdict = _judged(saved, output, home or []) if of_home else None
     if as_json:
         result = {"model": str(output), "sha256": saved.sha256, "skipped": dict(segments.skipped)}
         if verdict is not None:
@@ -121,6 +124,11 @@ def train(
             own = output.parent == models_folder()
             print_verdict(verdict, home or [], output.stem if own else str(output))
             _print_next(verdict, output)
+        elif scenario and not (data or speakers):
+            print(
+                f"\nto let it label: put it in the place of the file of scenario {scenario}, or "
+                f"`hearthlog record --scenario {scenario}={output}`"
+            )
 
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
@@ -145,21 +153,28 @@ def _print_next(verdict: "Verdict", output: Path) -> None:
         )
 
 
-def _next_of_home() -> Path:
-    """Name the next model of the home, in the folder of models, which is made."""
+def _next_model(name: str) -> Path:
+    """Name the next model of the home or of a scenario, in the folder of models, which is made."""
     folder = models_folder()
-    numbers = (path.stem.removeprefix("home-") for path in folder.glob("home-*.safetensors"))
+    numbers = (path.stem.removeprefix(f"{name}-") for path in folder.glob(f"{name}-*.safetensors"))
     number = max((int(text) for text in numbers if text.isdecimal()), default=0) + 1
     folder.mkdir(exist_ok=True)
-    return folder / f"home-{number}.safetensors"
+    return folder / f"{name}-{number}.safetensors"
 
 
-def _model_of(home: list[Path]) -> Path:
+def _model_of(home: list[Path], scenario: str) -> Path:
     """Find the model that labelled the latest log, and name it."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.models.modelfile.registry import find_model
 
-    (name, sha256), *others = find_home_logs(home).latest_models()
+    logs = find_home_logs(home)
+    models = logs.latest_scenario_models(scenario) if scenario else logs.latest_models()
+    if not models:
+        wrong_use(
+            f"--scenario {scenario}: no log has labels of it; name one that was recorded, or its "
+            "model with --base, or learn one from clips with --data"
+        )
+    (name, sha256), *others = models
     if others:
         names = listed([name, *(other for other, _ in others)], "and")
         wrong_use(f"the latest logs are labelled by {names}: choose one with --base")
@@ -256,14 +271,14 @@ def _learned_voices(
     return model, segments
 
 
-def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
+def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.training.adapt import adapt_model
     from hearthlog.analyzer.training.home_lessons import home_lessons
     from hearthlog.models.modelfile.modelfile import load_model
 
     model = load_model(base)
-    segments, notes, nothing = home_lessons(home, model)
+    segments, notes, nothing = home_lessons(home, model, scenario)
     for note in notes:
         tell(note)
     if not len(segments):

@@ -264,8 +264,13 @@ class Logs:
         vectors = as_vectors(columns["azimuth"], columns["confidence"])
         return mean_bearings(columns["header.stamp"], vectors, segments.starts, segments.ends)
 
-    def marks(self) -> list[Mark]:
+    def marks(self, scenario: str = "") -> list[Mark]:
         """Read the marks of reviewers, which correct labels.
+
+        Parameters
+        ----------
+        scenario : str, optional
+            The marks of this scenario, by its name, instead of those of the sounds of the home.
 
         Returns
         -------
@@ -283,7 +288,8 @@ class Logs:
         >>> [(mark.label, mark.reviewer) for mark in hearthlog.open_logs("logs").marks()]
         [('coughing', 'ada')]
         """
-        marks = [mark for path in self.paths if not is_layer(path) for mark in read_marks(path)]
+        logs = [path for path in self.paths if not is_layer(path)]
+        marks = [mark for path in logs for mark in read_marks(path, scenario)]
         marks = [mark for mark in marks if self.start is None or mark.end > self.start]
         marks = [mark for mark in marks if self.end is None or mark.start < self.end]
         return sorted(marks, key=attrgetter("start"))

@@ -122,7 +122,7 @@ def extract_features(
 
 
 def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0) -> SoundLabels:
-    """Label sound, to the bits that a recorder would log with this model.
+    """Label sound, to the bits that a recorder of one channel would log with this model.
 
     Parameters
     ----------

@@ -31,24 +31,26 @@ class GroupNaming:
 
     Attributes
     ----------
-    said : dict of int to str
-        What has become of what people said, in words, by the numbers of groups.
+    said : dict of str to str
+        What has become of what people said, in words, by the keys of groups.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.said: dict[int, str] = {}
+        self.said: dict[str, str] = {}
         self._folder = folder
         self._process: subprocess.Popen[str] | None = None
         self._thread: Thread | None = None
         self._lock = Lock()
 
-    def start(self, number: int, label: str) -> str:
+    def start(self, key: str, number: int, label: str) -> str:
         """Begin to mark the sounds of a group, and say so.
 
         Parameters
         ----------
+        key : str
+            Of the group, which no group of another file has.
         number : int
-            Of the group.
+            Of the group in its file.
         label : str
             The class that they are; empty to take the marks back.
 
@@ -71,8 +73,8 @@ class GroupNaming:
             if not os.access(self._folder, os.W_OK):
                 raise BridgeError(READ_ONLY)
             process = self._process = _started([*asked, "--json", "--", str(self._folder)])
-            self.said[number] = text
-            self._thread = Thread(target=self._follow, args=(process, number), daemon=True)
+            self.said[key] = text
+            self._thread = Thread(target=self._follow, args=(process, key, number), daemon=True)
             self._thread.start()
         return text
 
@@ -82,14 +84,14 @@ class GroupNaming:
             if self._process is not None:
                 self._process.terminate()
 
-    def _follow(self, process: subprocess.Popen[str], number: int) -> None:
+    def _follow(self, process: subprocess.Popen[str], key: str, number: int) -> None:
         """Wait for the end, and keep what it says."""
         timer = Timer(_LONGEST_SECONDS, process.kill)
         timer.daemon = True
         timer.start()
         with process:
             result, last = _read(cast(IO[str], process.stderr), f"{_PREFIX}group {number}:")
-            self.said[number] = _outcome(process.wait(), result, last)
+            self.said[key] = _outcome(process.wait(), result, last)
         timer.cancel()
 
 

@@ -20,6 +20,7 @@ from hearthlog.analyzer.bridge.page.page_token import page_token
 from hearthlog.analyzer.bridge.page.recurring import Recurring
 from hearthlog.analyzer.bridge.page.recurring_list import Moment
 from hearthlog.analyzer.bridge.page.said import Said
+from hearthlog.analyzer.bridge.page.scenario_lines import scenario_lines
 from hearthlog.analyzer.bridge.page.server import PageServer
 from hearthlog.analyzer.bridge.page.words import clock, room
 from hearthlog.analyzer.bridge.settings import PageSettings
@@ -89,6 +90,7 @@ class HomePage:
         last = last_events(news, self._said.of)
         self._events = last.events
         self._put("now", self._now.describe(news))
+        self._put("scenarios", scenario_lines(news))
         self._put("home", {"home": room(self._node), "clock": clock(news.today.now, news.zone)})
         self._put("events", last.shown)
         self._put("recurring", self._recurring.describe(Moment(news.today.now, news.zone)))

@@ -61,13 +61,14 @@ class NowHeard:
 def _sentence(microphone: MicrophoneState) -> str:
     if not microphone.is_listening():
         return _NOT_LISTENING
-    names = [class_words(label) for label in _heard_classes(microphone)]
+    names = [class_words(label) for label in heard_classes(microphone)]
     if names:
         return listed([names[0], *map(str.lower, names[1:])], "and")
     return "A sound" if microphone.heard.is_heard(ANY_SOUND) else in_words(SILENCE)
 
 
-def _heard_classes(microphone: MicrophoneState) -> list[str]:
+def heard_classes(microphone: MicrophoneState) -> list[str]:
+    """Return the classes of sound that are heard now, in the order of the model."""
     return [
         label
         for label in microphone.classes
@@ -79,7 +80,7 @@ def _known_since(microphone: MicrophoneState) -> int:
     """Return since when it has been so, as far as the log says; 0 if it does not."""
     if not microphone.is_listening():
         return microphone.heard.time
-    heard = _heard_classes(microphone)
+    heard = heard_classes(microphone)
     if heard:
         last = [microphone.last_event(label) for label in heard]
         end = microphone.heard.time - _GOES_ON

@@ -67,6 +67,16 @@ function showNow({ is_recording: isRecording, rooms }) {
   });
 }
 
+function showScenarios(lines) {
+  place("scenarios").hidden = !lines.length;
+  keep(place("scenario-lines"), lines, () => make("li", {}, make("div", {},
+    make("p", { class: "what" }), make("p", { class: "about" }))),
+  (child, { what, about }) => {
+    write(child.firstElementChild.children[0], what);
+    write(child.firstElementChild.children[1], about);
+  });
+}
+
 function spans(list, width) {
   return list.map(([a, b]) => `M${a * width} 0H${b * width}V${LANE}H${a * width}Z`).join("");
 }
@@ -341,8 +351,8 @@ function beat() {
 
 function connect() {
   const source = new EventSource("/events");
-  const shows = { home: showHome, now: showNow, day: showDay, events: showEvents, recurring: showRecurring,
-    health: showHealth };
+  const shows = { home: showHome, now: showNow, scenarios: showScenarios, day: showDay, events: showEvents,
+    recurring: showRecurring, health: showHealth };
   for (const [name, show] of Object.entries(shows)) {
     source.addEventListener(name, ({ data }) => show(JSON.parse(data)));
   }

@@ -37,7 +37,7 @@ class Recurring:
         self._looked = 0
         self._summary: HomeSummary | None = None
         self._naming = GroupNaming(folder)
-        self._key: Any = None
+        self._state: Any = None
         self._described: Any = _NOTHING
 
     def describe(self, moment: Moment) -> Any:
@@ -46,9 +46,9 @@ class Recurring:
         if self._summary is None:
             return _NOTHING
         said = dict(self._naming.said)
-        key = self._seen, said, local_time(*moment).date()
-        if key != self._key:
-            self._key = key
+        state = self._seen, said, local_time(*moment).date()
+        if state != self._state:
+            self._state = state
             self._described = recurring_list(self._summary, self._looked, said, moment)
         return self._described
 
@@ -58,7 +58,7 @@ class Recurring:
         Parameters
         ----------
         key : str
-            The id of a group that is shown.
+            Of a group that is shown, as of `shown_groups`.
         text : str
             A class, by its name or in words; empty to take the name back.
 
@@ -74,7 +74,7 @@ class Recurring:
         label = class_of(text) if text else ""
         if label == SILENCE:
             raise BridgeError("Write what it was: a sound that recurs cannot be named silence.")
-        return self._naming.start(group.number, label)
+        return self._naming.start(key, group.number, label)
 
     def close(self) -> None:
         """Name no more."""

@@ -23,7 +23,7 @@ class Moment(NamedTuple):
 
 
 def shown_groups(summary: HomeSummary) -> dict[str, GroupSummary]:
-    """Choose the groups that are shown, by ids that no groups of another file have.
+    """Choose the groups that are shown, by keys that no group of another file has.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def shown_groups(summary: HomeSummary) -> dict[str, GroupSummary]:
 
 
 def recurring_list(
-    summary: HomeSummary, looked: int, said: Mapping[int, str], moment: Moment
+    summary: HomeSummary, looked: int, said: Mapping[str, str], moment: Moment
 ) -> Any:
     """Describe the sounds that recur for JSON.
 
@@ -49,20 +49,18 @@ def recurring_list(
     summary : HomeSummary
     looked : int
         When the summary was written, in nanoseconds of UTC.
-    said : mapping of int to str
-        What has become of what people said, by the numbers of groups.
+    said : mapping of str to str
+        What has become of what people said, by the keys of groups.
     moment : Moment
     """
     shown = shown_groups(summary)
-    left = sum(not each.name for each in summary.groups) - sum(
-        not each.name for each in shown.values()
-    )
+    left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED
     is_alone = len({name for each in summary.groups for name in each.microphones}) <= 1
     return {
         "looked": when(min(max(looked, 0), moment.now), *moment),
-        "more": f"{left} more without a name come later." if left else "",
+        "more": f"{left} more without a name come later." if left > 0 else "",
         "groups": [
-            _described(key, group, said.get(group.number, ""), moment, is_alone=is_alone)
+            _described(key, group, said.get(key, ""), moment, is_alone=is_alone)
             for key, group in shown.items()
         ],
     }

@@ -50,6 +50,7 @@ class CatalogRow:
     gaps: int = 0
     gap_seconds: float = 0.0
     labels: Sequence[Mapping[str, Any]] = ()
+    scenarios: Sequence[Mapping[str, Any]] = ()
 
     @property
     def span(self) -> tuple[int, int] | None:

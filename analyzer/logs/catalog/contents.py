@@ -17,7 +17,13 @@ from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import microphone_of, parse_topic
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    SCENARIO,
+    microphone_of,
+    parse_topic,
+    scenario_name,
+)
 from hearthlog.schemas.times import NANOSECONDS
 
 _FEATURES: dict[str, Sequence[str]] = {message_types.FEATURES: ("header.stamp", "frame")}
@@ -47,8 +53,9 @@ class Contents:
     last: tuple[int, int] | None = None
     gaps: int = 0
     gap_seconds: float = 0.0
-    seconds: Counter[str] = field(default_factory=Counter)  # by label, of its segments
-    segments: Counter[str] = field(default_factory=Counter)  # their number, by label
+    # By scenario, which is empty for the sounds of the home, and by label: of its segments
+    seconds: dict[str, Counter[str]] = field(default_factory=dict)
+    segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number
 
 
 def read_contents(path: Path, labelling: str) -> Contents:
@@ -58,7 +65,8 @@ def read_contents(path: Path, labelling: str) -> Contents:
     ----------
     path : Path
     labelling : str
-        `live`, `relabel` or `review`; only segments of this labelling are counted.
+        `live`, `relabel` or `review`; only segments of this labelling, and of its scenarios, are
+        counted.
 
     Raises
     ------
@@ -136,13 +144,17 @@ class _Reading:
         elif columns.type == message_types.GAP:
             self._contents.gaps += len(columns)
             self._contents.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
-        elif self._is_labelled(columns.topic):
-            self._note_segments(columns)
+        elif (scenario := self._scenario(columns.topic)) is not None:
+            self._note_segments(columns, scenario)
 
-    def _is_labelled(self, name: str) -> bool:
+    def _scenario(self, name: str) -> str | None:
+        """Return the scenario of which a topic has segments; None if they do not count."""
         topic = parse_topic(name)
-        labelling = "" if topic is None else topic.labelling.partition("/")[0]
-        return labelling == self._labelling and name.endswith("/segment")
+        if topic is None or topic.kind != "segment":
+            return None
+        root = topic.labelling.partition("/")[0]
+        is_own = (LIVE if root == SCENARIO else root) == self._labelling
+        return scenario_name(topic.labelling) if is_own else None
 
     def _note_features(self, columns: Columns) -> None:
         ends = columns.take(np.array([0, len(columns) - 1]))
@@ -151,15 +163,19 @@ class _Reading:
         self._contents.first = self._contents.first or first
         self._contents.frames += len(columns)
 
-    def _note_segments(self, columns: Columns) -> None:
+    def _note_segments(self, columns: Columns, scenario: str) -> None:
+        amounts = self._contents.segments, self._contents.seconds
+        counts, lengths = (amount.setdefault(scenario, Counter()) for amount in amounts)
         labels, numbers = np.unique(columns["label"], return_inverse=True)
         seconds = np.bincount(numbers, columns["duration"] / NANOSECONDS)
         for label, count, length in zip(
             labels.tolist(), np.bincount(numbers).tolist(), seconds.tolist(), strict=True
         ):
-            self._contents.segments[label[:_LONGEST]] += count
-            self._contents.seconds[label[:_LONGEST]] += length
-        if len(self._contents.segments) > MOST_CLASSES:
+            counts[label[:_LONGEST]] += count
+            lengths[label[:_LONGEST]] += length
+        if len(amounts[0]) > MOST_CLASSES:
+            raise LogError(f"{self._file.path}: has more than {MOST_CLASSES} scenarios")
+        if len(counts) > MOST_CLASSES:
             raise LogError(
                 f"{self._file.path}: has more than {MOST_CLASSES} different labels; "
                 "no classifier has so many"

@@ -10,11 +10,13 @@ import pyarrow.parquet as pq
 
 _MOMENT = pa.timestamp("ns", "UTC")
 _LABELS = {"label": pa.string(), "minutes": pa.float64(), "segments": pa.int64()}
+_SCENARIOS = {"scenario": pa.string(), "model": pa.string(), **_LABELS}
 _ALWAYS = {
     "path": pa.string(), "home": pa.string(), "kind": pa.string(), "state": pa.string(),
     "size": pa.int64(), "mtime": _MOMENT, "frames": pa.int64(),
     "gaps": pa.int64(), "gap_seconds": pa.float64(),
-    "labels": pa.list_(pa.struct(_LABELS.items())), "microphones": pa.list_(pa.string()),
+    "labels": pa.list_(pa.struct(_LABELS.items())),
+    "scenarios": pa.list_(pa.struct(_SCENARIOS.items())), "microphones": pa.list_(pa.string()),
 }  # fmt: skip
 _IF_KNOWN = {
     "error": pa.string(), "log": pa.string(), "node": pa.string(),
@@ -28,16 +30,18 @@ SCHEMA = pa.schema(
         *(pa.field(name, kind, nullable=False) for name, kind in _ALWAYS.items()),
         *(pa.field(name, kind) for name, kind in _IF_KNOWN.items()),
     ],
-    metadata={"hearthlog_catalog": "1"},  # the number stands for the columns and their meaning
+    metadata={"hearthlog_catalog": "2"},  # the number stands for the columns and their meaning
 )
 _TEXTS = [
     *(field.name for field in SCHEMA if field.type == pa.string()),
     "labels.list.element.label",
+    *(f"scenarios.list.element.{name}" for name in ("scenario", "model", "label")),
     "microphones.list.element",
 ]
 _LEAVES = {
     *(field.name for field in SCHEMA if not pa.types.is_list(field.type)),
     *(f"labels.list.element.{name}" for name in _LABELS),
+    *(f"scenarios.list.element.{name}" for name in _SCENARIOS),
     "microphones.list.element",
 }
 _BATCH = 1000  # rows
@@ -193,5 +197,6 @@ def _size(batch: pa.RecordBatch) -> int:
 
 def _parts(batch: pa.RecordBatch) -> list[pa.Array]:
     """Return what is in the lists."""
-    labels = batch.column("labels").flatten()
-    return [labels, *labels.flatten(), batch.column("microphones").flatten()]
+    lists = [batch.column(name).flatten() for name in ("labels", "scenarios")]
+    parts = [part for each in lists for part in (each, *each.flatten())]
+    return [*parts, batch.column("microphones").flatten()]

@@ -13,7 +13,6 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames
 _FUNCTIONS = {"start": "min", "end": "max"}
-_LABELLING = ("home", "kind", "model")
 
 
 @dataclass(frozen=True)
@@ -48,6 +47,7 @@ class LabelAmount:
     label: str
     minutes: float
     segments: int
+    scenario: str = ""  # empty for the sounds of the home
 
 
 def homes(catalog: Catalog) -> list[HomeSummary]:
@@ -87,14 +87,35 @@ def label_amounts(catalog: Catalog) -> list[LabelAmount]:
     list of LabelAmount
         In the order of home, kind and model; within these the label with most minutes first.
     """
-    table = catalog.table
-    lists = table["labels"].combine_chunks()
+    return _amounts(catalog.table, "labels", ["home", "kind", "model"], ["label"])
+
+
+def scenario_amounts(catalog: Catalog) -> list[LabelAmount]:
+    """Sum up the labels of the scenarios of each home, by kind of labelling, scenario and model.
+
+    Returns
+    -------
+    list of LabelAmount
+        In the order of home, kind, scenario and model; within these the label with most minutes
+        first.
+    """
+    return _amounts(catalog.table, "scenarios", ["home", "kind"], ["scenario", "model", "label"])
+
+
+def _amounts(
+    table: pa.Table, column: str, keys: Sequence[str], own: Sequence[str]
+) -> list[LabelAmount]:
+    """Sum up what is in the lists of a column, by columns of the table and some of its own."""
+    lists = table[column].combine_chunks()
     labels = pa.Table.from_struct_array(lists.flatten())
-    for name in _LABELLING:
+    for name in keys:
         labels = labels.append_column(name, table[name].take(pc.list_parent_indices(lists)))
     values = [("minutes", "sum"), ("segments", "sum")]
-    amounts = [LabelAmount(**row) for row in _grouped(labels, [*_LABELLING, "label"], values)]
-    return sorted(amounts, key=lambda one: (one.home, one.kind, one.model or "", -one.minutes))
+    amounts = [LabelAmount(**row) for row in _grouped(labels, [*keys, *own], values)]
+    return sorted(
+        amounts,
+        key=lambda one: (one.home, one.kind, one.scenario, one.model or "", -one.minutes),
+    )
 
 
 def _grouped(

@@ -59,7 +59,8 @@ def write_catalog(
     listing = list_logs(folder)
     listed = listing.logs
     kept, new = _divided(listed, before)
-    tables = [SCHEMA.empty_table() if before is None else before.table.take(kept)]
+    rows = pa.array(kept, pa.int64())
+    tables = [SCHEMA.empty_table() if before is None else before.table.take(rows)]
     stopped: BaseException | None = None
     try:
         for read, done in _read(folder, new, workers or InlineWorkers()):

@@ -1,10 +1,11 @@
 """The rows of a catalogue, made from the files."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -14,6 +15,7 @@ from hearthlog.analyzer.logs.catalog.file import table_of
 from hearthlog.analyzer.logs.listing import catalogued_name, size_and_time
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import log_name, log_of_layer
+from hearthlog.schemas.logs.scenario_record import recorded_scenarios
 from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
@@ -91,11 +93,28 @@ def _filled(row: CatalogRow, contents: Contents) -> CatalogRow:
         version=record.get("version"),
         gaps=contents.gaps,
         gap_seconds=contents.gap_seconds,
-        labels=[
-            {"label": label, "minutes": contents.seconds[label] / 60, "segments": count}
-            for label, count in sorted(contents.segments.items())
+        labels=list(_labels(contents, "")),
+        scenarios=[
+            {"scenario": scenario, "model": _model(record, scenario), **labelled}
+            for scenario in sorted(contents.segments.keys() - {""})
+            for labelled in _labels(contents, scenario)
         ],
     )
+
+
+def _labels(contents: Contents, scenario: str) -> Iterator[dict[str, Any]]:
+    for label, count in sorted(contents.segments.get(scenario, {}).items()):
+        minutes = contents.seconds[scenario][label] / 60
+        yield {"label": label, "minutes": minutes, "segments": count}
+
+
+def _model(record: Mapping[str, str], scenario: str) -> str:
+    """Name the models that labelled for a scenario, of which microphones may have different ones.
+
+    Empty where a person did.
+    """
+    models = {one.model for one in recorded_scenarios(record) if one.name == scenario}
+    return ", ".join(sorted(models))
 
 
 def _relative(path: Path, folder: Path) -> str:

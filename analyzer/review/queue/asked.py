@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import one, pieces
 from hearthlog.analyzer.marks.formats.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan
-from hearthlog.schemas.messages.topics import RELABEL
+from hearthlog.schemas.messages.topics import RELABEL, scenario_name
 
 _SUFFIX = ".queue.csv"
 
@@ -37,14 +38,40 @@ def chosen_as(span: ReviewSpan) -> str:
 
 
 def corrected_name(labelling: str) -> str:
-    """Return the name of a labelling, as marks say it: `live`, or the name of a model.
+    """Return the name of a labelling, as marks say it: that of a model without `relabel/`.
 
     Parameters
     ----------
     labelling : str
-        `live`, or `relabel/` and a model.
+        `live`, or `scenario/` and a name, or `relabel/` and a model.
     """
     return labelling.removeprefix(f"{RELABEL}/")
+
+
+def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, option: str) -> None:
+    """Check that all spans of a list are of one scenario.
+
+    Parameters
+    ----------
+    path : Path
+        Of the list, for errors.
+    spans : iterable of ReviewSpan
+    scenario : str
+        Its name; empty for the sounds of the home.
+    option : str
+        By which a user names it, for errors.
+
+    Raises
+    ------
+    DataError
+        If a span is of another one.
+    """
+    for span in spans:
+        other = scenario_name(span.a)
+        if other != scenario:
+            do = f"give {option} {other}" if other else f"leave out {option} {scenario}"
+            what = f"scenario {other}" if other else "the sounds of the home"
+            raise DataError(f"{path}: asks for {what}: {do}")
 
 
 def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:

@@ -26,7 +26,7 @@ from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns
-from hearthlog.schemas.messages.topics import labelling_topic
+from hearthlog.schemas.messages.topics import labelling_topic, scenario_name
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -162,7 +162,7 @@ def make_queue(  # noqa: PLR0913
     parts = means.uncertainty.values(), differing, means.novelty.values()
     if ranking == USEFUL:
         logs = sources.with_topic(labelling_topic(microphone, side.name, "segment"))
-        model = labelling_model(logs, microphone, models)
+        model = labelling_model(logs, microphone, models, scenario_name(side.name))
 
         def sounds(some: JudgeableSpans) -> SpanSounds:
             return span_sounds(

@@ -6,7 +6,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.labellings import Labellings
 from hearthlog.analyzer.logs.spans import Spans, joined
-from hearthlog.analyzer.marks.marks import RANDOM, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import RANDOM, read_review
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import is_layer
 
@@ -25,24 +25,27 @@ class ReviewedTime(NamedTuple):
     random: frozenset[int]
 
 
-def reviewed_time(sources: Labellings, microphone: str) -> ReviewedTime:
-    """Read what is reviewed of a microphone, by anyone and of any labelling.
+def reviewed_time(sources: Labellings, microphone: str, scenario: str = "") -> ReviewedTime:
+    """Read what is reviewed of a microphone, by anyone and of any labelling of one scenario.
 
     Parameters
     ----------
     sources : Labellings
         Layers that cannot be read are added to its losses.
     microphone : str
+    scenario : str, optional
+        Its name; empty for the sounds of the home.
     """
     times, random = [], set[int]()
     for log in sources.logs:
         if is_layer(log.path):
             continue
         try:
-            marks, looked_at = read_marks(log.path), read_reviewed(log.path)
+            review = read_review(log.path)
         except LogError as error:
             sources.lose(error)
             continue
+        marks, looked_at = review.get(scenario, ((), ()))
         own = [span for span in looked_at if span.microphone == microphone]
         random |= {span.start for span in own if span.chosen == RANDOM}
         times += [(span.start, span.end) for span in own]

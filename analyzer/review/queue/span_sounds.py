@@ -49,7 +49,9 @@ class SpanSounds(NamedTuple):
     gamma: float
 
 
-def labelling_model(logs: list[LogContents], microphone: str, models: Path) -> Model | None:
+def labelling_model(
+    logs: list[LogContents], microphone: str, models: Path, scenario: str = ""
+) -> Model | None:
     """Find the model that labelled a microphone in the latest of some logs or layers.
 
     Parameters
@@ -59,6 +61,8 @@ def labelling_model(logs: list[LogContents], microphone: str, models: Path) -> M
     microphone : str
     models : Path
         Folder of model files; the starter models are known without.
+    scenario : str, optional
+        For which it labelled; empty for the sounds of the home.
 
     Returns
     -------
@@ -66,7 +70,7 @@ def labelling_model(logs: list[LogContents], microphone: str, models: Path) -> M
         None if its file is gone, or cannot be used.
     """
     with suppress(ModelError):
-        path = find_model(models, model_of(logs[-1].path, microphone).model_sha256)
+        path = find_model(models, model_of(logs[-1].path, microphone, scenario).model_sha256)
         return None if path is None else load_model(path)
     return None
 

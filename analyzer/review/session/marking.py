@@ -43,9 +43,11 @@ class Marking:
         Of the microphone.
     reviewer : str
     corrects : str
-        The labelling that is reviewed: `live`, or the name of a model.
+        The labelling that is reviewed: `live`, `scenario/<name>`, or the name of a model.
     labelled : LabelledSpans
         The segments of that labelling.
+    scenario : str, optional
+        The name of the scenario whose labelling it is.
     """
 
     microphone: str
@@ -53,6 +55,7 @@ class Marking:
     reviewer: str
     corrects: str
     labelled: LabelledSpans
+    scenario: str = ""
     _done: list[list[_Change]] = field(default_factory=list)
     _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
     _reviewed: dict[Path, list[ReviewedSpan]] = field(default_factory=dict)
@@ -103,7 +106,7 @@ class Marking:
         now = time.time_ns()
         changes = [self._change(*piece, now, chosen) for piece in self._pieces(start, end)]
         for change in changes:
-            write_marks(change.log, [], reviewed=change.reviewed)
+            write_marks(change.log, [], reviewed=change.reviewed, scenario=self.scenario)
             self._read_layer(change.log)
         self._done.append(changes)
 
@@ -226,7 +229,8 @@ class Marking:
                 self._read_layer(log)
 
     def _read_layer(self, log: Path) -> None:
-        self._marks[log], self._reviewed[log] = read_marks(log), read_reviewed(log)
+        self._marks[log] = read_marks(log, self.scenario)
+        self._reviewed[log] = read_reviewed(log, self.scenario)
 
     def _pieces(self, start: int, end: int) -> list[tuple[Path, int, int]]:
         """Divide a span of time among the logs, each with its start and end."""
@@ -272,7 +276,14 @@ class Marking:
         instead_of: MarkedSpan | None = None,
     ) -> None:
         span = instead_of or change.span
-        write_marks(change.log, marks, [span], reviewed=reviewed, not_reviewed=not_reviewed)
+        write_marks(
+            change.log,
+            marks,
+            [span],
+            reviewed=reviewed,
+            not_reviewed=not_reviewed,
+            scenario=self.scenario,
+        )
         self._read_layer(change.log)
 
     def _change(  # noqa: PLR0913
@@ -281,7 +292,7 @@ class Marking:
         """Return the marks that a change will touch, and the span that they reach over."""
         touched = [
             mark
-            for mark in read_marks(log)
+            for mark in read_marks(log, self.scenario)
             if mark.microphone == self.microphone and mark.start < end and mark.end > start
         ]
         first = min([start, *(mark.start for mark in touched)])
@@ -289,7 +300,7 @@ class Marking:
         span = MarkedSpan(self.microphone, first, last)
         change = _Change(log, span, touched, self._looked_at(start, end, now, chosen))
         if deleted:
-            for one in read_reviewed(log):
+            for one in read_reviewed(log, self.scenario):
                 if one.microphone == self.microphone and one.start < end and one.end > start:
                     change.not_reviewed.append(one)
                     change.reviewed += _outside(one, start, end)

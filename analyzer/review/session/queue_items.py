@@ -10,7 +10,7 @@ from hearthlog.analyzer.gate.changes import A_DAY, class_words, time_words
 from hearthlog.analyzer.logs.labellings import Labellings
 from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.analyzer.marks.marks import RANDOM
-from hearthlog.analyzer.review.queue.asked import chosen_as
+from hearthlog.analyzer.review.queue.asked import check_scenario, chosen_as
 from hearthlog.analyzer.review.queue.changed_spans import changed_by
 from hearthlog.analyzer.review.queue.random_minutes import MINUTE, draw_minutes, whole_minutes
 from hearthlog.analyzer.review.queue.ranking import DISAGREEING, RANKINGS, USEFUL, make_queue
@@ -28,7 +28,7 @@ from hearthlog.models.classes import in_words
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
-from hearthlog.schemas.messages.topics import REVIEW
+from hearthlog.schemas.messages.topics import is_review, scenario_name
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 QUEUES = (*RANKINGS, RANDOM)
@@ -70,7 +70,8 @@ def queue_spans(  # noqa: PLR0913, PLR0917
         of a `useful` queue is a minute drawn at random, and every one of a `random` one.
     sources : Labellings
     labelled : (str, str)
-        The microphone, and the labelling: `live`, or `relabel/` and a model.
+        The microphone, and the labelling: `live`, or `scenario/` and a name, or `relabel/` and a
+        model.
     limits : (int or None, int or None)
         Start and end in nanoseconds of UTC; None for all that there is.
     count : int or None
@@ -89,26 +90,30 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     Raises
     ------
     DataError
-        If there is nothing to review, or no such list or model.
+        If there is nothing to review, or no such list or model; of a scenario also if minutes are
+        to be drawn at random, or the changes of a model are asked for.
     ModelError
         If the model that labels now cannot be found or used.
     LogError
         If the labelling has no segment in these limits, or its segments overlap or cannot be.
     """
     microphone, labelling = labelled
+    scenario = scenario_name(labelling)
     if queue.endswith(".csv"):
-        return _listed(Path(queue), microphone, limits)[:count]
+        return _listed(Path(queue), microphone, limits, scenario)[:count]
+    if scenario and queue not in RANKINGS:
+        raise DataError(f"--queue {queue[:64]}: of a scenario use {', '.join(RANKINGS)}, or a list")
     model = None if queue in QUEUES else _model(queue, models)
     side = sources.read(microphone, labelling, *limits)
     if model is not None:
         return changed_by(model, side, sources, microphone, count or _TEN, progress)
-    others = [name for name in sources.names(microphone) if name not in {labelling, REVIEW}]
+    others = [name for name in sources.names(microphone) if _is_comparable(name, labelling)]
     if queue == DISAGREEING and not others:
         raise DataError("no other labelling to disagree with: `hearthlog relabel` makes one")
     other = sources.read(microphone, others[0], *limits) if others else None
-    done, wanted = reviewed_time(sources, microphone), count or _TEN
+    done, wanted = reviewed_time(sources, microphone, scenario), count or _TEN
     minutes = Spans(*(np.empty(0, np.int64),) * 2)
-    if queue in {USEFUL, RANDOM}:
+    if queue in {USEFUL, RANDOM} and not scenario:
         there = whole_minutes(side.labelling)
         few = min(wanted // _MINUTE_EVERY, len(there.starts) // _MINUTES_LEFT)
         drawn = draw_minutes(there, wanted if queue == RANDOM else few, done.random, done.spans)
@@ -138,6 +143,13 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     return _mixed(spans, drawn_at_random)
 
 
+def _is_comparable(name: str, labelling: str) -> bool:
+    """Tell whether another labelling is by a model that has the same classes to choose from."""
+    return not (
+        scenario_name(labelling) or scenario_name(name) or name == labelling or is_review(name)
+    )
+
+
 def _model(queue: str, models: Path) -> tuple[Path, Model]:
     """Load the model that the changes of are asked for; return its folder, too."""
     place = Path(queue)
@@ -151,7 +163,7 @@ def _model(queue: str, models: Path) -> tuple[Path, Model]:
         ) from error
 
 
-def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
+def _listed(path: Path, microphone: str, limits: Limits, scenario: str) -> list[ReviewSpan]:
     start, end = limits
     spans = [
         span
@@ -162,6 +174,7 @@ def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
     ]
     if not spans:
         raise DataError(f"{path}: lists nothing of {microphone} in these logs")
+    check_scenario(path, spans, scenario, "--labels")
     return spans
 
 

@@ -90,12 +90,15 @@ class Screen(Protocol):
             In nanoseconds of UTC.
         """
 
-    def redraw_marks(self, microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> None:
+    def redraw_marks(
+        self, microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
+    ) -> None:
         """Draw what is reviewed of a microphone again.
 
         Parameters
         ----------
-        microphone : str
+        microphone, scenario : str
+            Their names; the second is empty for the sounds of the home.
         marks, reviewed : LabelledSpans
             All that it has now.
         """
@@ -280,9 +283,10 @@ class Session:
             self._go(judged - self._at)
 
     def _redraw(self) -> None:
+        of = self.marking.microphone, self.marking.scenario
         marks, reviewed = self.marking.marks(), self.marking.reviewed()
         with self._unless_silent():
-            self.screen.redraw_marks(self.marking.microphone, marks, reviewed)
+            self.screen.redraw_marks(*of, marks, reviewed)
 
     @contextmanager
     def _unless_silent(self) -> Iterator[None]:

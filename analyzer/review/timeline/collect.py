@@ -1,7 +1,7 @@
 """Rows of messages, collected on the grid of a timeline."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.bearings import degrees_of
 from hearthlog.analyzer.logs.health import MicrophoneState, lasting
-from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
+from hearthlog.analyzer.marks.marks import Reviewed, ReviewedSpan
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
     DirectionRows,
@@ -35,7 +35,7 @@ from hearthlog.analyzer.review.timeline.model import (
 )
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.topics import LIVE, REVIEW
+from hearthlog.schemas.messages.topics import LIVE, is_review, review_labelling
 
 
 @dataclass
@@ -72,7 +72,7 @@ class _Microphone:
     label_frames: dict[str, list[FrameValues]] = field(default_factory=dict)
     novelty: dict[str, GridMeans] = field(default_factory=dict)
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
-    reviewed: list[LabelledSpans] = field(default_factory=list)
+    reviewed: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by scenario
     gaps: list[LabelledSpans] = field(default_factory=list)
     directions: GridMeans | None = None  # ahead and left
     states: list[MicrophoneState] = field(default_factory=list)
@@ -87,7 +87,7 @@ class _Microphone:
     def labellings(self) -> list[str]:
         """The names of its labellings: the recorder's first, the reviewer's last."""
         names = {*self.labels, *self.spans}
-        return sorted(names, key=lambda name: (name == REVIEW, name != LIVE, name))
+        return sorted(names, key=lambda name: (is_review(name), name != LIVE, name))
 
 
 class Collector:
@@ -142,31 +142,27 @@ class Collector:
         """Note that a log or a layer has topics of a microphone."""
         self._microphone(microphone).logs.add(log)
 
-    def add_marks(self, marks: Iterable[Mark]) -> None:
-        """Add the marks that are in the span of the grid.
+    def add_review(self, review: Mapping[str, Reviewed]) -> None:
+        """Add the marks that are in the span of the grid, and what a person has looked at.
 
         Parameters
         ----------
-        marks : iterable of Mark
-            Of any microphones, in any order.
+        review : mapping of str to Reviewed
+            By scenario, as `read_review` returns it.
         """
-        for mark in marks:
-            if mark.start < self._grid.end and mark.end > self._grid.start:
-                span = np.array([mark.start]), np.array([mark.end])
-                label = np.array([mark.label], object)
-                self._spans(mark.microphone, REVIEW).append(LabelledSpans(*span, label))
+        for scenario, (marks, reviewed) in review.items():
+            for mark in marks:
+                if mark.start < self._grid.end and mark.end > self._grid.start:
+                    span = np.array([mark.start]), np.array([mark.end])
+                    label = np.array([mark.label], object)
+                    own = self._spans(mark.microphone, review_labelling(scenario))
+                    own.append(LabelledSpans(*span, label))
+                    self._looked_at(mark.microphone, scenario)
+            for one in reviewed:
+                self._looked_at(one.microphone, scenario).append(_one_span(one))
 
-    def add_reviewed(self, spans: Iterable[ReviewedSpan]) -> None:
-        """Add spans that a person has looked at.
-
-        Parameters
-        ----------
-        spans : iterable of ReviewedSpan
-            Of any microphones, in any order.
-        """
-        for one in spans:
-            span = np.array([one.start]), np.array([one.end]), np.array([one.chosen], object)
-            self._microphone(one.microphone).reviewed.append(LabelledSpans(*span))
+    def _looked_at(self, microphone: str, scenario: str) -> list[LabelledSpans]:
+        return self._microphone(microphone).reviewed.setdefault(scenario, [])
 
     def add_clip(self, microphone: str, clip: SoundClip) -> None:
         """Add kept sound."""
@@ -250,11 +246,14 @@ class Collector:
             level=level,
             level_frames=rows.level_frames,
             floor=_floor(rows.states, self._grid, features),
-            reviewed=self._join(rows.reviewed),
+            reviewed=self._join(rows.reviewed.get("", [])),
             gaps=self._join(rows.gaps),
             troubles=_trouble_spans(rows.states, self._grid.end),
             clips=_join_clips(rows.clips),
             direction=None if rows.directions is None else degrees_of(rows.directions.values),
+            reviewed_scenarios={
+                name: self._join(parts) for name, parts in sorted(rows.reviewed.items()) if name
+            },
         )
 
     def _labelling(self, rows: _Microphone, name: str) -> LabellingTimeline:
@@ -282,6 +281,11 @@ class Collector:
         inside = np.flatnonzero(starts < ends)
         order = inside[np.argsort(starts[inside], kind="stable")]
         return LabelledSpans(starts[order], ends[order], spans.texts[order])
+
+
+def _one_span(span: ReviewedSpan) -> LabelledSpans:
+    text = np.array([span.chosen], object)
+    return LabelledSpans(np.array([span.start]), np.array([span.end]), text)
 
 
 def _shares(means: _NamedMeans, grid: Grid) -> Iterator[FrameValues]:

@@ -12,7 +12,7 @@ from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import REVIEW, TopicName, parse_topic
+from hearthlog.schemas.messages.topics import TopicName, is_review, parse_topic
 
 ENERGY = "energy"
 FIELDS = {
@@ -172,7 +172,7 @@ def shown_topic(name: str) -> TopicName | None:
         None for any other topic. Marks are not shown by their topic, but read from their layers.
     """
     topic = parse_topic(name)
-    if topic is None or topic.kind not in _KINDS or topic.labelling == REVIEW:
+    if topic is None or topic.kind not in _KINDS or is_review(topic.labelling):
         return None
     return topic
 

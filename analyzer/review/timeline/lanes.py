@@ -16,7 +16,14 @@ from hearthlog.analyzer.review.timeline.model import (
     no_spans,
 )
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name, in_words
-from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW, SCENARIO, is_scenario
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    RELABEL,
+    is_review,
+    is_scenario,
+    review_labelling,
+    scenario_name,
+)
 
 REVIEWED = "Reviewed"  # the name of the lane, and of its spans without a mark
 NOT_HEARD = "Not heard"
@@ -63,8 +70,8 @@ def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
     Lane
         For each labelling a lane for each class but silence: what was heard for the shortest time
         comes first, what was not heard last. Then what stands beside all labellings: a lane for
-        each scenario, where others differ from the first one, what is reviewed, what was not heard,
-        and trouble.
+        each scenario, where others differ from the first one, what is reviewed, also of scenarios,
+        what was not heard, and trouble.
     """
     for microphone in timeline.microphones.values():
         labellings = labellings_of(microphone)
@@ -78,7 +85,7 @@ def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
 
 def labellings_of(microphone: MicrophoneTimeline) -> list[LabellingTimeline]:
     """Return the labellings of a microphone by models of the home, the recorder's first."""
-    models = [one for one in microphone.labellings if one.name != REVIEW]
+    models = [one for one in microphone.labellings if not is_review(one.name)]
     return [one for one in models if not is_scenario(one.name)]
 
 
@@ -101,12 +108,16 @@ def scenario_sounds(spans: LabelledSpans) -> LabelledSpans:
     return LabelledSpans(spans.starts[named], spans.ends[named], spans.texts[named])
 
 
-def reviewed_lane(microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> Lane:
+def reviewed_lane(
+    microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
+) -> Lane:
     """Make the lane of what is reviewed.
 
     Parameters
     ----------
     microphone : str
+    scenario : str
+        Its name; empty for the sounds of the home.
     marks : LabelledSpans
         With the label of each mark.
     reviewed : LabelledSpans
@@ -118,7 +129,8 @@ def reviewed_lane(microphone: str, marks: LabelledSpans, reviewed: LabelledSpans
     starts = np.concatenate([reviewed.starts, marks.starts])
     ends = np.concatenate([reviewed.ends, marks.ends])
     spans = LabelledSpans(starts, ends, texts)
-    return Lane(microphone, "", REVIEWED, spans, {REVIEWED: _LOOKED_AT, **shades})
+    name = f"{in_words(scenario)} reviewed" if scenario else REVIEWED
+    return Lane(microphone, "", name, spans, {REVIEWED: _LOOKED_AT, **shades})
 
 
 def _classes(
@@ -158,8 +170,10 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
     for name, named in ((_RECURRING, microphone.recurring), (_VOICES, microphone.spoken)):
         if len(named):
             yield _named_lane(microphone.name, name, named)
-    marks = next((one.spans for one in microphone.labellings if one.name == REVIEW), no_spans())
-    yield reviewed_lane(microphone.name, marks, microphone.reviewed)
+    marks = {one.name: one.spans for one in microphone.labellings if is_review(one.name)}
+    for scenario, looked_at in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
+        own = marks.get(review_labelling(scenario), no_spans())
+        yield reviewed_lane(microphone.name, scenario, own, looked_at)
     kinds = (NOT_HEARD, microphone.gaps, GAP), (_TROUBLE, microphone.troubles, _TROUBLED)
     for name, spans, shade in kinds:
         if len(spans):
@@ -174,7 +188,7 @@ def _scenario_lane(microphone: str, labelling: LabellingTimeline) -> Lane:
     shades = {in_words(text): colour(text) for text in dict.fromkeys(spans.texts)}
     words = np.array([in_words(text) for text in spans.texts], object)
     own = LabelledSpans(*spans[:2], words)
-    name = in_words(labelling.name.removeprefix(f"{SCENARIO}/"))
+    name = in_words(scenario_name(labelling.name))
     return Lane(microphone, "", name, own, shades)
 
 

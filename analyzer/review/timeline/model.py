@@ -12,7 +12,7 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.home_clock import HomeClock, home_clock
 from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
-from hearthlog.schemas.messages.topics import is_scenario
+from hearthlog.schemas.messages.topics import scenario_name
 from hearthlog.schemas.times import NANOSECONDS
 
 
@@ -162,6 +162,8 @@ class MicrophoneTimeline:
         Turns of voices, with whose they are.
     direction : np.ndarray [shape=(count,)], float64, or None
         Whence the sound of an array came, in degrees; NaN where nothing was located.
+    reviewed_scenarios : dict of str to LabelledSpans
+        As `reviewed`, of scenarios of which something is marked or looked at, by their names.
     """
 
     name: str
@@ -177,11 +179,22 @@ class MicrophoneTimeline:
     recurring: LabelledSpans = field(default_factory=no_spans)
     spoken: LabelledSpans = field(default_factory=no_spans)
     direction: Float64 | None = None
+    reviewed_scenarios: dict[str, LabelledSpans] = field(default_factory=dict)
 
     @property
     def classes(self) -> list[str]:
         """The classes of the models but those of scenarios, then other labels that there are."""
-        labellings = [one for one in self.labellings if not is_scenario(one.name)]
+        return self.classes_of("")
+
+    def classes_of(self, scenario: str) -> list[str]:
+        """Return the classes of a scenario, then other labels that there are.
+
+        Parameters
+        ----------
+        scenario : str
+            Its name; empty for all labellings that are of none.
+        """
+        labellings = [one for one in self.labellings if scenario_name(one.name) == scenario]
         series = [one.probabilities for one in labellings if one.probabilities is not None]
         names = [name for each in series for name in each.names]
         return list(dict.fromkeys([*names, *(t for one in labellings for t in one.spans.texts)]))

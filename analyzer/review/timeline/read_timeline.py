@@ -16,7 +16,7 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.logs.spans import one as one_span
 from hearthlog.analyzer.logs.typed_columns import decode_types
-from hearthlog.analyzer.marks.marks import read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import read_review
 from hearthlog.analyzer.review.timeline.collect import Collector
 from hearthlog.analyzer.review.timeline.decode import FIELDS, read_rows, shown_topic
 from hearthlog.analyzer.review.timeline.grid import Grid
@@ -215,8 +215,7 @@ class _Reader:
             types = {name: FIELDS[name] for name in _OF_LAYERS}
         self._read_messages(file, types)
         if not file.layer:  # last, for a damaged layer must not hide its log
-            self.collector.add_marks(read_marks(file.path))
-            self.collector.add_reviewed(read_reviewed(file.path))
+            self.collector.add_review(read_review(file.path))
 
     def _read_messages(self, file: TimedFile, types: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):

@@ -116,7 +116,7 @@ def lanes_entity(microphone: str, labelling: str) -> str:
     return f"{microphone}/lanes/{_word(labelling) or 'all'}"
 
 
-def draw(timeline: Timeline, canvas: Canvas) -> dict[str, DrawnLane]:
+def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]:
     """Draw all of a timeline but the single frames.
 
     Parameters
@@ -127,8 +127,8 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[str, DrawnLane]:
 
     Returns
     -------
-    dict of str to DrawnLane
-        By microphone: what is reviewed, to show it again when there is more of it.
+    dict of (str, str) to DrawnLane
+        By microphone and name: what is reviewed, to show it again when there is more of it.
 
     Raises
     ------
@@ -142,8 +142,8 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[str, DrawnLane]:
         canvas.write(place.name, lane.name)
         drawn = DrawnLane(place.entity, place.height, timeline.grid.step)
         drawn.show(lane, canvas)
-        if lane.name == REVIEWED and not lane.labelling:
-            reviewed[lane.microphone] = drawn
+        if REVIEWED in lane.colours:
+            reviewed[lane.microphone, lane.name] = drawn
     _draw_plots(timeline, canvas)
     for plot in timeline_plots(timeline):
         canvas.write(text_entity(plot), plot.text)

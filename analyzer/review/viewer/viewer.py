@@ -124,7 +124,7 @@ class Viewer:
         self._control = control
         self._recording = rr.RecordingStream(APPLICATION)
         self._canvas = Canvas(self._recording, HomeClock("", 0))
-        self._reviewed: dict[str, DrawnLane] = {}
+        self._reviewed: dict[tuple[str, str], DrawnLane] = {}
         self._asked = 0
         self._close = NONE  # what was drawn close up
         self._sent = False
@@ -226,17 +226,20 @@ class Viewer:
         self._asked += 1
         self._flush()
 
-    def redraw_marks(self, microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> None:
+    def redraw_marks(
+        self, microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
+    ) -> None:
         """Draw what is reviewed of a microphone again.
 
         Parameters
         ----------
-        microphone : str
+        microphone, scenario : str
+            Their names; the second is empty for the sounds of the home.
         marks, reviewed : LabelledSpans
             All that it has now; what was drawn before and is not among them goes away.
         """
-        lane = reviewed_lane(microphone, marks, reviewed)
-        self._reviewed[microphone].show(lane, self._canvas)
+        lane = reviewed_lane(microphone, scenario, marks, reviewed)
+        self._reviewed[microphone, lane.name].show(lane, self._canvas)
         self._flush()
 
     def wait_until_drawn(self) -> ViewerState:

@@ -1,7 +1,6 @@
 """Feature set `logmel`: the level of each frame, and of forty mel bands of its spectrum, in dB."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +64,7 @@ def _names() -> tuple[str, ...]:
     return (LEVEL, *(f"mel_{number}" for number in range(1, BANDS + 1)))
 
 
-LOGMEL: Any = FeatureSet(
+LOGMEL = FeatureSet(
     name="logmel",
     version=1,
     feature_names=_names(),
