@@ -392,7 +392,7 @@ def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_d
         (["--undo", "1"], 1, "there is no group 1"),
         (["--name", "99=door"], 1, "there is no group 99"),
         (["--of", "loud"], 2, "it is one of all, unsure, unknown"),
-        (["--end", "2026-03-01T08:00:20"], 1, "sounds are too few to group: it takes 16"),
+        (["--end", "2026-03-01T08:00:20"], 1, "and it takes 16"),
         (["--end", "2026-01-01"], 1, "no log has features and labels"),
     ],
 )

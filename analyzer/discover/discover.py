@@ -56,7 +56,7 @@ def discover(
     is_new, drawn = groups is None, _drawn(sounds)
     if groups is None:
         if count < 2 * least:
-            raise DataError(f"{count} sounds are too few to group: it takes {2 * least}")
+            raise DataError(f"too few sounds to group: {count}, and it takes {2 * least}")
         groups = make_space(sounds.features, sounds.descriptors[drawn])
     points = np.concatenate(
         [
