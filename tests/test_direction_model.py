@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from logs import read
 from lossy import LossySource
+from rewriting import Log
 from safetensors.numpy import load, save
 
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
@@ -48,6 +49,7 @@ from hearthlog.recorder.events import Gap
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
@@ -316,6 +318,17 @@ def test_marks_in_logs_of_an_array_teach_directions_and_others_do_not(recorded, 
     save_model(adapted, path)
     np.testing.assert_array_equal(load_model(path).direction_weights, adapted.direction_weights)
     assert "directions of mic" in model_card(load_model(path))
+
+
+@pytest.mark.parametrize("value", [{"azimuth": np.nan}, {"confidence": np.inf}, {"frame": 1 << 63}])
+def test_nothing_is_learned_from_directions_that_no_array_has(recorded, tmp_path, value):
+    changed = Log(find_logs(recorded)[1])
+    one = changed.messages("/mic/direction")[5]
+    changed.change(one, **value)
+    changed.write(path := tmp_path / "home_20260301T070000Z.mcap")
+    write_marks(path, [Mark("mic", one.log_time, one.log_time + NANOSECONDS, "music")])
+    with pytest.raises(LogError, match=f"{path.name}: /mic/direction: holds directions that no"):
+        home_lessons([tmp_path], load_model(starter_file(GENERAL)))
 
 
 @pytest.mark.parametrize(

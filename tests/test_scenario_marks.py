@@ -14,9 +14,10 @@ from test_review import Screen
 from test_scenarios_at_once import START, record, sound
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.gate.reference import reference
 from hearthlog.analyzer.logs.catalog.catalog import read_catalog
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labellings import Labellings, LogContents, find_labellings
 from hearthlog.analyzer.marks.marks import (
     PERSON,
     RANDOM,
@@ -39,6 +40,7 @@ from hearthlog.models.starter import BATHROOM
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import review_path
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.tools.home.shifted_log import ShiftedLog
 
 __all__ = ["sound"]  # a fixture
 
@@ -133,6 +135,21 @@ def test_a_queue_of_a_scenario_asks_for_what_is_not_reviewed_of_it(home):
         queue_spans(RANDOM, sources, ("mic", WATER), limits, None)
 
 
+def test_a_scenario_that_is_called_like_something_else_is_not_taken_for_it(home, capfd):
+    write_marks(home, [mark(1, 2, "tap_water")], scenario="review")
+    assert "next: ten spans to" in run(capfd, "info", home.parent).stdout
+    assert not ShiftedLog(review_path(home)).first_starts, "these are marks, and not cut off"
+    drawn = ReviewedSpan("mic", START, START + 9 * SECOND, corrects="water", chosen=RANDOM)
+    write_marks(home, [], reviewed=[drawn])
+    with pytest.raises(DataError, match="no labelling 'relabel/water'"):
+        reference(home)
+    topics = frozenset(f"/mic/{name}/segment" for name in (WATER, "relabel/water"))
+    sources = Labellings([LogContents(home, 0, 0, True, topics, {})])
+    with pytest.raises(DataError, match=f"which 'water'. There is relabel/water and {WATER}"):
+        sources.find("mic", "water")
+    assert [sources.find("mic", name) for name in (WATER, "relabel")] == [WATER, "relabel/water"]
+
+
 def test_label_files_are_of_the_scenario_that_is_named(home, tmp_path, capfd):
     labels = tmp_path / "water.txt"
     labels.write_text(
@@ -155,11 +172,13 @@ def test_label_files_are_of_the_scenario_that_is_named(home, tmp_path, capfd):
 
 
 def test_an_evaluation_takes_the_marks_of_the_scenario_for_its_reference(home, capfd):
+    topic = ("--topic", "/mic/scenario/water/segment")
     write_marks(home, [mark(1, 9, "speech")])
+    done = run(capfd, "evaluate", "log", home, "--reference", "review", *topic)
+    assert "nothing of water of mic is reviewed; `hearthlog annotate import --sc" in done.stderr
     labelling = find_labellings(home).read("mic", WATER).labelling
     spans = zip(labelling.starts.tolist(), labelling.ends.tolist(), labelling.labels, strict=True)
     write_marks(home, [Mark("mic", *span) for span in spans], scenario="water")
-    topic = ("--topic", "/mic/scenario/water/segment")
     done = run(capfd, "evaluate", "log", home, "--reference", "review", *topic, "--json")
     assert json.loads(done.stdout)["frames"] > 100
     assert json.loads(done.stdout)["macro_f1"] == 1.0

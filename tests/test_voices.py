@@ -270,6 +270,14 @@ def test_people_who_speak_at_once_in_two_rooms_are_both_heard(rooms):
     assert speech_of(rooms / "kitchen", rooms / "bath").seconds > 0.95 * (kitchen + bath)
 
 
+def test_what_is_said_when_the_time_asked_for_begins_and_ends_is_heard_as_in_the_whole(rooms):
+    home = find_home_logs([rooms / "kitchen"])
+    whole = read_speech(home)
+    for cut in [START + second * NANOSECONDS for second in range(5, 40, 5)]:
+        parts = read_speech(home, None, cut), read_speech(home, cut, None)
+        assert sum(part.seconds for part in parts) == pytest.approx(whole.seconds, abs=0.5)
+
+
 @pytest.mark.parametrize("late", [-3, 0, 3])
 def test_what_was_left_out_leaves_nothing_out(late):
     frames, turn = np.arange(200), np.zeros(200, np.int64)

@@ -76,7 +76,7 @@ def heard_louder(heard: Sequence[HeardSpeech]) -> list[Bool]:
         counts = np.bincount(own.turn)
         found = np.zeros(len(counts), np.bool_)
         for before, other in enumerate(kept):
-            if before != place:
+            if before != place and _is_of_one_time(own, other):
                 found |= _is_louder(own, counts, other, or_as_loud=before < place)
         louder.append(found)
         # what was left out is no reason to leave out others, or nobody would have heard it
@@ -84,9 +84,19 @@ def heard_louder(heard: Sequence[HeardSpeech]) -> list[Bool]:
     return louder
 
 
+def _is_of_one_time(own: HeardSpeech, other: HeardSpeech) -> bool:
+    """Tell whether some of the frames may be the same; most logs of a home are of other times."""
+    if not (len(own.frames) and len(other.frames)):
+        return False
+    early, late = min(_LATE), max(_LATE)
+    return bool(
+        own.frames[0] + early <= other.frames[-1] and other.frames[0] <= own.frames[-1] + late
+    )
+
+
 def _is_louder(own: HeardSpeech, counts: Int64, other: HeardSpeech, *, or_as_loud: bool) -> Bool:
     best, found = np.full(len(counts), _ALIKE), np.zeros(len(counts), np.bool_)
-    for late in _LATE if len(other.frames) else ():
+    for late in _LATE:
         times = own.frames + late
         rows = np.minimum(np.searchsorted(other.frames, times), len(other.frames) - 1)
         both = other.frames[rows] == times

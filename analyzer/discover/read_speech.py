@@ -138,10 +138,11 @@ class _Reader:
         if entry.start >= self._recent_end:
             self._settle()
         log = entry.path
-        segments = self._columns(log, _is_segments)
+        segments = _columns(log, _is_segments)
         spoken = self._spoken(log, segments)
         is_used = bool(segments) and not spoken
-        for features in self._columns(log, [topic(name, "features") for name in spoken]).values():
+        heard = [topic(name, "features") for name in spoken]
+        for features in _columns(log, heard, *self._span).values():
             if features.type != message_types.FEATURES:
                 continue
             names = checked_array_names(log, features, "values")
@@ -151,19 +152,30 @@ class _Reader:
                 self._add(log, microphone, features, names, spoken[microphone])
         self._without += not is_used
 
-    def _columns(self, log: Path, topics: TopicChoice) -> dict[str, Columns]:
-        return read_columns([log], topics, *self._span, fields=_FIELDS) if topics else {}
-
     def _spoken(self, log: Path, segments: dict[str, Columns]) -> dict[str, Spans]:
         """Return when somebody speaks, for each microphone that hears it."""
-        named = {microphone_of(name): each for name, each in segments.items()}
+        named = {microphone_of(name): self._inside(each) for name, each in segments.items()}
         doubtful = [topic(name, "label") for name, each in named.items() if is_doubtful(each).any()]
-        labels = self._columns(log, doubtful)
+        labels = _columns(log, doubtful)
         spans = {
             name: speech_spans(each, labels.get(topic(name, "label")))
             for name, each in named.items()
         }
         return {name: each for name, each in spans.items() if len(each.starts)}
+
+    def _inside(self, segments: Columns) -> Columns:
+        """Return the segments of the time that is asked for, which may begin before, or end later.
+
+        They are known later than they begin, so that they are not chosen by their log times.
+        """
+        start, end = self._span
+        starts = segments["header.stamp"]
+        inside = np.ones(len(starts), np.bool_)
+        if start is not None:
+            inside &= starts + segments["duration"] > start
+        if end is not None:
+            inside &= starts < end
+        return segments.take(np.flatnonzero(inside))
 
     def _add(
         self, log: Path, microphone: str, features: Columns, names: Sequence[str], speech: Spans
@@ -221,6 +233,12 @@ class _Reader:
             [*losses, *self.losses],
             self._without,
         )
+
+
+def _columns(
+    log: Path, topics: TopicChoice, start: int | None = None, end: int | None = None
+) -> dict[str, Columns]:
+    return read_columns([log], topics, start, end, fields=_FIELDS) if topics else {}
 
 
 def _is_segments(name: str) -> bool:

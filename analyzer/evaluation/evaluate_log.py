@@ -265,7 +265,9 @@ def read_reference(source: str, path: Path, microphone: str, scenario: str = "")
     """
     if source == REVIEW:
         marks = [mark for log in find_logs(path) for mark in read_marks(log, scenario)]
-        where = f"{path}: nothing of {microphone} is reviewed; `hearthlog annotate import` does it"
+        of, option = (f"{scenario} of ", f" --scenario {scenario}") if scenario else ("", "")
+        do = f"`hearthlog annotate import{option}` does it"
+        where = f"{path}: nothing of {of}{microphone} is reviewed; {do}"
     else:
         marks = [mark for _, mark in read_lines(Path(source), find_coverage(path), microphone)]
         where = f"{source}: has no label of {microphone}"

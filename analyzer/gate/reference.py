@@ -10,6 +10,7 @@ import numpy as np
 from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, joined, remains
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.schemas.messages.topics import LIVE, relabelling
 from hearthlog.schemas.times import NANOSECONDS
 
 _SHORTEST = NANOSECONDS // 2  # sound that counts
@@ -72,7 +73,8 @@ def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> 
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
         yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
-    name = labellings.find(span.microphone, span.corrects)
+    corrects = LIVE if span.corrects == LIVE else relabelling(span.corrects)
+    name = labellings.find(span.microphone, corrects)
     labels = labellings.read(span.microphone, name, span.start, span.end).labelling
     rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))
     for start, end, label in zip(rest.starts, rest.ends, labels.labels[row], strict=True):

@@ -140,16 +140,20 @@ class Labellings:
         Raises
         ------
         DataError
-            If the microphone has no such labelling.
+            If the microphone has no such labelling, or a scenario and a model are called so.
         """
         names = self.names(microphone)
         layers = [name for name in names if name.startswith(f"{RELABEL}/")]
         if text == RELABEL and len(layers) == 1:
             return layers[0]
+        if text in names:
+            return text
         layer = relabelling(text.removeprefix(f"{RELABEL}/"))
-        for name in (text, layer, scenario_labelling(text)):
-            if name in names:
-                return name
+        found = [name for name in (layer, scenario_labelling(text)) if name in names]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise DataError(f"{microphone}: which {text[:64]!r}? There is {' and '.join(found)}")
         there = f"there is {', '.join(names)}{self._first_loss()}"
         raise DataError(f"{microphone}: no labelling {text[:64]!r}; {there}")
 

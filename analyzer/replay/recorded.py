@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.directions import LARGEST_FRAME, directions_of
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES, NOWHERE, Directions
+from hearthlog.models.classifiers.directions import NOWHERE, Directions
 from hearthlog.recorder.events import Gap, SourceHealth
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
@@ -31,7 +32,6 @@ _FIELDS = {
     message_types.SEGMENT: ("label",),
 }
 _LARGEST_VALUE = 1e30  # of a feature: its statistics are still finite
-_LARGEST_FRAME = 1 << 62
 _PLACE_BITS = 40
 
 _RawByType = dict[str, list[RawMessages]]
@@ -176,7 +176,7 @@ def _features(raw: RawMessages, width: int) -> Fields:
         raise LogError(f"{columns.topic}: frames are not of {width} values")
     if not np.abs(values).max() < _LARGEST_VALUE:  # a NaN compares as false
         raise LogError(f"{columns.topic}: holds values that no sound has")
-    if numbers.max() > _LARGEST_FRAME:
+    if numbers.max() > LARGEST_FRAME:
         raise LogError(f"{columns.topic}: holds a frame of number {numbers.max()}")
     _check_times(columns, columns["header.stamp"])
     return columns.fields | {"frame": numbers.astype(np.int64)}
@@ -185,13 +185,7 @@ def _features(raw: RawMessages, width: int) -> Fields:
 def _directions(raw: RawMessages) -> tuple[Int64, Directions]:
     """Return directions, and when they were known."""
     (columns,) = decode([raw], _FIELDS[message_types.DIRECTION])
-    numbers, azimuths, confidences = (columns[k] for k in ("frame", "azimuth", "confidence"))
-    possible = (numbers <= _LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)
-    possible &= (np.abs(azimuths) <= np.float32(np.pi)) & (confidences >= 0) & (confidences <= 1)
-    if not possible.all():
-        raise LogError(f"{columns.topic}: holds directions that no array has")
-    frames = numbers.astype(np.int64)
-    return columns.log_times, Directions(frames, columns["header.stamp"], azimuths, confidences)
+    return columns.log_times, directions_of(columns)
 
 
 def _located(run: Features, known: Sequence[tuple[Int64, Directions]]) -> Features:

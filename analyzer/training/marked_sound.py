@@ -9,6 +9,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.directions import directions_of
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
@@ -20,6 +21,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import ENROLLED, find_logs
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, scenario_labelling, topic
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -195,10 +197,12 @@ def read_sound_of(
 def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directions:
     name, start, end = topic(microphone, "direction"), limits[0] - _AROUND, limits[1] + _AROUND
     columns = read_columns([log], {name}, start, end, _DIRECTION_FIELDS).get(name)
-    if columns is None:
+    if columns is None or columns.type != message_types.DIRECTION:
         return NOWHERE
-    numbers, *others = (columns[field] for field in _DIRECTION_FIELDS)
-    return Directions(numbers.astype(np.int64), *others)
+    try:
+        return directions_of(columns)
+    except LogError as error:
+        raise LogError(f"{log}: {error}") from error
 
 
 def _coarse(values: Float32, features: FeatureSet) -> Bool:

@@ -53,7 +53,7 @@ def next_step(summary: Summary, path: Path) -> str | None:
         heard.update(map(class_name, counts))
     if not heard.keys() - {SILENCE}:
         return "nothing but quiet was heard yet: leave it recording, or try the microphone"
-    marked = any(name.endswith(f"/{REVIEW}") for name in summary.segments)
+    marked = any(name.partition("/")[2] == REVIEW for name in summary.segments)
     if marked and latest["starter"] and not _has_learned(summary.layers):
         return f"a model of this home, from what is marked: hearthlog train --home {place}"
     kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())

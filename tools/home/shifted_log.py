@@ -21,7 +21,7 @@ from hearthlog.schemas.mcap.records import parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
-from hearthlog.schemas.messages.topics import REVIEW, parse_topic
+from hearthlog.schemas.messages.topics import is_review, parse_topic
 from hearthlog.schemas.messages.type_definitions import MessageType, message_type
 from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
@@ -218,7 +218,7 @@ class ShiftedLog:
         offsets, sizes = starts + MESSAGE_HEAD.itemsize, heads["length"] - MESSAGE_FIXED
         kind = message_type(schema.name, schema.encoding, schema.data)
         parts = parse_topic(channel.topic)
-        if schema.name == message_types.SEGMENT and parts and parts.labelling != REVIEW:
+        if schema.name == message_types.SEGMENT and parts and not is_review(parts.labelling):
             names = ("header.stamp", "duration")
             spans = zip(*(self._numbers(kind, offsets, sizes, name) for name in names), strict=True)
             self._segments += (_Segments(channel.topic, *span) for span in spans)

@@ -1,0 +1,30 @@
+"""Directions of an array, read back from its log."""
+
+import numpy as np
+
+from hearthlog.models.classifiers.directions import BLOCK_FRAMES, Directions
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
+
+LARGEST_FRAME = 1 << 62
+
+
+def directions_of(columns: Columns) -> Directions:
+    """Return the directions that a log has.
+
+    Parameters
+    ----------
+    columns : Columns
+        Of the type `AudioDirection`.
+
+    Raises
+    ------
+    LogError
+        If no array has such directions.
+    """
+    numbers, azimuths, confidences = (columns[k] for k in ("frame", "azimuth", "confidence"))
+    possible = (numbers <= LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)
+    possible &= (np.abs(azimuths) <= np.float32(np.pi)) & (confidences >= 0) & (confidences <= 1)
+    if not possible.all():
+        raise LogError(f"{columns.topic}: holds directions that no array has")
+    return Directions(numbers.astype(np.int64), columns["header.stamp"], azimuths, confidences)
