@@ -20,14 +20,16 @@ from rewriting import Log
 from safetensors.numpy import load, save
 
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
-from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.analyzer.replay.replay import replay
 from hearthlog.analyzer.training.adapt import adapt_model
+from hearthlog.analyzer.training.confirmed import chosen, confirmed_segments
 from hearthlog.analyzer.training.home_lessons import home_lessons
+from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.analyzer.training.sightings import Sighting, evidence_of, with_directions
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.classifier import Classifier
@@ -295,6 +297,16 @@ def test_marks_are_compared_by_whence_they_came_too():
     evidence = evidence_of(classifier, [seen(3, 0), None, seen(3, 0)._replace(microphone="door")])
     np.testing.assert_array_equal(evidence, [strong()[:, 3], *np.zeros((2, len(strong())))])
     assert evidence_of(classifier, []) is None
+
+
+def test_what_was_left_alone_is_judged_by_whence_it_came_too(recorded, tmp_path):
+    logs = Path(shutil.copytree(recorded, tmp_path / "logs"))
+    for log in find_logs(logs):
+        write_marks(log, [], reviewed=[ReviewedSpan("mic", START, START + 300 * NANOSECONDS)])
+    model = taking(strong())
+    sounds = read_reviewed_sound(logs, Classifier(model).feature_set)
+    left_alone = [confirmed_segments(sound, model.classes) for sound in sounds]
+    assert len(chosen(left_alone, model)) > len(chosen(left_alone, taking(0 * strong())))
 
 
 def test_marks_in_logs_of_an_array_teach_directions_and_others_do_not(recorded, tmp_path):

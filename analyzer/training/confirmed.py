@@ -15,6 +15,7 @@ from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording
 from hearthlog.analyzer.training.home_data import recording_of
 from hearthlog.analyzer.training.marked_sound import HomeSound
 from hearthlog.analyzer.training.method import loud_windows
+from hearthlog.analyzer.training.sightings import evidence_of
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
@@ -241,7 +242,9 @@ def _probabilities(
             quiet[row] = _quiet_windows(recording, recording.floor, classifier)
     of_each = of_segments(inputs, segments, floors)
     by_window = np.zeros((*quiet.shape, len(model.classes)))
-    by_window[~quiet] = classifier.probabilities(of_each[~quiet])
+    evidence = evidence_of(classifier, [recording.sighting for recording in recordings])
+    told = None if evidence is None else evidence[np.nonzero(~quiet)[0]]
+    by_window[~quiet] = classifier.classify(of_each[~quiet], told)[0]
     if quiet.any():
         by_window[quiet, model.classes.index(SILENCE)] = 1.0
     loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)
