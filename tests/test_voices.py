@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 from spoken import ALLISON, DAY, START, THEO, record_conversation, two_voices
 
-from hearthlog.analyzer.discover.heard_twice import HeardSpeech, heard_louder
+from hearthlog.analyzer.discover.common_speech import SpeechFrames, louder_elsewhere
 from hearthlog.analyzer.discover.home_voices import NO_VOICE, Voices, find_voices
 from hearthlog.analyzer.discover.read_speech import (
     HomeSpeech,
@@ -283,9 +283,9 @@ def test_what_was_left_out_leaves_nothing_out(late):
     frames, turn = np.arange(200), np.zeros(200, np.int64)
     loudness = np.random.default_rng(1).normal(-40.0, 10.0, 200)
     moved = (np.arange(200) >= 140).astype(np.int64)  # away from the other microphone
-    one = HeardSpeech(frames, loudness, turn)
-    other = HeardSpeech(frames + late, loudness + np.where(moved, -3.0, 6.0), moved)
-    assert [each.tolist() for each in heard_louder([one, other])] == [[True], [False, False]]
+    one = SpeechFrames(frames, loudness, turn)
+    other = SpeechFrames(frames + late, loudness + np.where(moved, -3.0, 6.0), moved)
+    assert [each.tolist() for each in louder_elsewhere([one, other])] == [[True], [False, False]]
 
 
 def test_a_log_that_is_there_twice_counts_once(rooms, tmp_path):

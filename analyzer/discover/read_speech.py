@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.discover.heard_twice import HeardSpeech, heard_louder, heard_speech
+from hearthlog.analyzer.discover.common_speech import SpeechFrames, louder_elsewhere, speech_frames
 from hearthlog.analyzer.discover.speech_spans import is_doubtful, speech_spans
 from hearthlog.analyzer.discover.voice_space import (
     ENERGY,
@@ -128,7 +128,7 @@ class _Reader:
         self._logs: list[Path] = []
         self._microphones: list[str] = []
         self._turns = [Turns(*(np.empty(0, np.int64) for _ in Turns._fields))]
-        self._recent: list[tuple[Turns, HeardSpeech]] = []  # of logs of one time
+        self._recent: list[tuple[Turns, SpeechFrames]] = []  # of logs of one time
         self._recent_end = 0
         dimensions = len(voice_space().spread)
         self._voices = [Evidence(np.empty(0), np.empty((0, dimensions)))]
@@ -141,8 +141,8 @@ class _Reader:
         segments = _columns(log, _is_segments)
         spoken = self._spoken(log, segments)
         is_used = bool(segments) and not spoken
-        heard = [topic(name, "features") for name in spoken]
-        for features in _columns(log, heard, *self._span).values():
+        topics = [topic(name, "features") for name in spoken]
+        for features in _columns(log, topics, *self._span).values():
             if features.type != message_types.FEATURES:
                 continue
             names = checked_array_names(log, features, "values")
@@ -193,13 +193,15 @@ class _Reader:
         conversations = [*_conversations(stamps)]
         if not conversations:
             return
-        said = [self._tell_apart(stamps[rows], values[rows], names) for rows in conversations]
-        starts, ends, voice = (np.concatenate(each) for each in zip(*said, strict=True))
+        turns_of_each = [
+            self._tell_apart(stamps[rows], values[rows], names) for rows in conversations
+        ]
+        starts, ends, voice = (np.concatenate(each) for each in zip(*turns_of_each, strict=True))
         in_log, of_microphone = (np.full(len(starts), each) for each in place)
         kept = np.concatenate([np.arange(rows.start, rows.stop) for rows in conversations])
         energy = values[kept, list(names).index(ENERGY)]
         turns = Turns(starts, ends, in_log, of_microphone, voice)
-        self._recent.append((turns, heard_speech(stamps[kept], energy, starts)))
+        self._recent.append((turns, speech_frames(stamps[kept], energy, starts)))
         self._recent_end = max(self._recent_end, int(starts[-1]))
 
     def _tell_apart(
@@ -215,8 +217,8 @@ class _Reader:
     def _settle(self) -> None:
         """Leave out the turns that another microphone hears louder, as far as logs were read."""
         if self._recent:
-            turns, heard = zip(*self._recent, strict=True)
-            for own, louder in zip(turns, heard_louder(heard), strict=True):
+            turns, speech = zip(*self._recent, strict=True)
+            for own, louder in zip(turns, louder_elsewhere(speech), strict=True):
                 self._turns.append(Turns(*(each[~louder] for each in own)))
         self._recent = []
 
@@ -224,12 +226,12 @@ class _Reader:
         self._settle()
         turns = Turns(*(np.concatenate(each) for each in zip(*self._turns, strict=True)))
         voices = Evidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True)))
-        heard, voice = np.unique(turns.voice, return_inverse=True)
+        rows, voice = np.unique(turns.voice, return_inverse=True)
         return HomeSpeech(
             self._logs,
             self._microphones,
             turns._replace(voice=voice),
-            voices.rows(heard),
+            voices.rows(rows),
             [*losses, *self.losses],
             self._without,
         )

@@ -41,17 +41,19 @@ def models_of(log: Path) -> Mapping[str, LabelledBy]:
         that of its `hearthlog` record, by an empty name. Empty if it says nothing, is damaged, or
         has no message of several microphones yet.
     """
-    found: dict[str, LabelledBy] = {}
+    models: dict[str, LabelledBy] = {}
     with suppress(LogError), LogFile(log) as file:
         names = sorted(microphones_of(file, "info"))
         for name in names:
             info = first_message(file, topic(name, "info"), message_types.STREAM_INFO)
             if info:
-                found[name] = LabelledBy(info["model"], info["model_sha256"])
-        if not found and len(names) <= 1:
+                models[name] = LabelledBy(info["model"], info["model_sha256"])
+        if not models and len(names) <= 1:
             for record in read_provenance(file)[-1:]:
-                found[_ANY] = LabelledBy(record.get("model", ""), record.get("model_sha256", ""))
-    return found
+                models[_ANY] = LabelledBy(
+                    record.get("model", ""), record.get("model_sha256", "")
+                )
+    return models
 
 
 def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
@@ -83,9 +85,9 @@ def scenario_models(log: Path) -> Mapping[tuple[str, str], LabelledBy]:
     mapping of (str, str) to LabelledBy
         By microphone and scenario; empty if there is none, or the log is damaged.
     """
-    found: dict[tuple[str, str], LabelledBy] = {}
+    of_scenarios: dict[tuple[str, str], LabelledBy] = {}
     with suppress(LogError), LogFile(log) as file:
         for record in read_provenance(file):
             for one in recorded_scenarios(record):
-                found[one.microphone, one.name] = LabelledBy(one.model, one.sha256)
-    return found
+                of_scenarios[one.microphone, one.name] = LabelledBy(one.model, one.sha256)
+    return of_scenarios

@@ -149,11 +149,11 @@ class Labellings:
         if text in names:
             return text
         layer = relabelling(text.removeprefix(f"{RELABEL}/"))
-        found = [name for name in (layer, scenario_labelling(text)) if name in names]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise DataError(f"{microphone}: which {text[:64]!r}? There is {' and '.join(found)}")
+        matching = [name for name in (layer, scenario_labelling(text)) if name in names]
+        if len(matching) == 1:
+            return matching[0]
+        if matching:
+            raise DataError(f"{microphone}: which {text[:64]!r}? There is {' and '.join(matching)}")
         there = f"there is {', '.join(names)}{self._first_loss()}"
         raise DataError(f"{microphone}: no labelling {text[:64]!r}; {there}")
 

@@ -193,14 +193,14 @@ def _located(run: Features, known: Sequence[tuple[Int64, Directions]]) -> Featur
 
     Frames of another run of a recorder may have the same numbers, but not the same times.
     """
-    found = NOWHERE
+    located = NOWHERE
     for times, directions in known:
         places = directions.last_frames - run.first
         inside = np.flatnonzero((places >= 0) & (places < len(run.stamps)))
         same = inside[run.stamps[places[inside]] == times[inside]]
-        found = found.followed_by(directions.rows(same))
-    _, once = np.unique(found.frames, return_index=True)
-    return run._replace(directions=found.rows(once))
+        located = located.followed_by(directions.rows(same))
+    _, once = np.unique(located.frames, return_index=True)
+    return run._replace(directions=located.rows(once))
 
 
 def _gaps(raw: RawMessages) -> list[Gap]:

@@ -118,8 +118,8 @@ def read_reviewed_sound(
     other: tuple[Path, str] | None = None  # log and microphone of another set
     usable = False
     for log in find_logs(folder, enrolled=True):
-        said = read_review(log).get(scenario, ((), ()))
-        spans: list[Mark | ReviewedSpan] = [*said[0], *said[1]]
+        marks, reviewed = read_review(log).get(scenario, ((), ()))
+        spans: list[Mark | ReviewedSpan] = [*marks, *reviewed]
         if not spans:
             continue
         names = {span.microphone for span in spans}

@@ -154,8 +154,8 @@ def _likelihood(shares: Float64, hours: Int64) -> Float64:
         return np.full(SECTORS, 1 / SECTORS)
     left_out = (others @ near)[tried] / others.sum(axis=1, keepdims=True)[tried]
     again = _AGAIN[:, np.newaxis, np.newaxis]
-    found = np.log(again * left_out + (1 - again) / SECTORS)
-    best = _AGAIN[(found * shares[tried]).sum(axis=(1, 2)).argmax()]
+    likelihoods = np.log(again * left_out + (1 - again) / SECTORS)
+    best = _AGAIN[(likelihoods * shares[tried]).sum(axis=(1, 2)).argmax()]
     best *= len(shares) / (len(shares) + 1)
     likely: Float64 = best * near.mean(axis=0) + (1 - best) / SECTORS
     return likely

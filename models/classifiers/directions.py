@@ -168,11 +168,11 @@ class DirectionEvidence:
         places = known.frames // BLOCK_FRAMES - newest[0] + MEMORY_BLOCKS - 1
         inside = (places >= 0) & (places < count + MEMORY_BLOCKS - 1)
         weights = self._weights[sectors_of(known.azimuths[inside])]
-        said = np.zeros((count + MEMORY_BLOCKS - 1, self._weights.shape[1] + 1))
-        said[places[inside]] = np.pad(weights, ((0, 0), (0, 1)), constant_values=1.0)
-        said[places[inside]] *= known.confidences[inside].astype(np.float64)[:, np.newaxis]
-        total = np.zeros((count, said.shape[1]))
+        witnesses = np.zeros((count + MEMORY_BLOCKS - 1, self._weights.shape[1] + 1))
+        witnesses[places[inside]] = np.pad(weights, ((0, 0), (0, 1)), constant_values=1.0)
+        witnesses[places[inside]] *= known.confidences[inside].astype(np.float64)[:, np.newaxis]
+        total = np.zeros((count, witnesses.shape[1]))
         for age in range(MEMORY_BLOCKS):
-            total += said[age : age + count]
+            total += witnesses[age : age + count]
         means = total[:, :-1] / np.where(total[:, -1:] > 0, total[:, -1:], 1.0)
         return means[newest - newest[0]]

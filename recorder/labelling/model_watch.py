@@ -151,9 +151,9 @@ class ModelWatch:
             A sentence about it; empty if it was refused before.
         """
         assert self.ready is not None
-        said, self.held, self.ready = self.ready is self.held, self.ready, None
+        is_known, self.held, self.ready = self.ready is self.held, self.ready, None
         self._last = in_use
-        if said:
+        if is_known:
             return ""
         text = self._refusal(self.held.model.name, reason)
         say(text)

@@ -110,20 +110,20 @@ def _scores(
     clips: Sequence[tuple[LabelledClip, Float64]], rng: np.random.Generator
 ) -> dict[tuple[str, str], float]:
     """Return the F1 of each class in one home, by the kind of the model."""
-    heard, unheard = _divided(clips, rng)
+    marked_clips, tested_clips = _divided(clips, rng)
     room = draw_room(np.array(_SQUARE), _RT60, rng)
     corner = room.anywhere(rng)
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
         logs = Path(folder) / "marked"
-        marked = [_recorded(logs, day, room, corner, heard, rng) for day in range(2)]
+        marked = [_recorded(logs, day, room, corner, marked_clips, rng) for day in range(2)]
         models = _models(logs, marked)
         unmarked = Path(folder) / "others"
-        tried = [_recorded(unmarked, day, room, corner, unheard, rng) for day in range(2, 4)]
-        said = label_logs(list(models.values()), [log for log, _ in tried])
+        tried = [_recorded(unmarked, day, room, corner, tested_clips, rng) for day in range(2, 4)]
+        labelled = label_logs(list(models.values()), [log for log, _ in tried])
         truth = [sound for _, sounds in tried for sound in sounds]
         return {
             (kind, name): score
-            for kind, labelling in zip(models, said, strict=True)
+            for kind, labelling in zip(models, labelled, strict=True)
             for name, score in _f1(labelling, truth, of_resident=kind in _OF_RESIDENT).items()
         }
 
@@ -150,11 +150,11 @@ def _recorded(  # noqa: PLR0913, PLR0917
     sources = [corner if kind == TELEVISION else room.anywhere(rng) for kind in kinds]
     chosen = [_clip(kind, clips, rng) for kind in kinds]
     echoes = room.echoes(corner)
-    heard = [
+    echoed = [
         heard_with(echoes if source is corner else room.echoes(source), clip)
         for source, clip in zip(sources, chosen, strict=True)
     ]
-    scene = laid_out(room, sources, chosen, heard)
+    scene = laid_out(room, sources, chosen, echoed)
     noise = room_noise(Scene(scene.samples[:_NOISE], [], room.microphones), rng)
     samples = add_noise(scene, np.resize(noise, scene.samples.shape), _SNR)
     start = _START + day * _DAY
@@ -223,13 +223,13 @@ def _f1(labelling: Labelling, truth: Sequence[Sound], *, of_resident: bool) -> d
     """Return the F1 of frames of each class; of a resident's model where no television is on."""
     scores = {}
     pieces = [_frames(labelling, same) for same in _by_day(truth)]
-    true, said = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    true, labelled = (np.concatenate(column) for column in zip(*pieces, strict=True))
     if of_resident:
-        true, said = true[true != TELEVISION], said[true != TELEVISION]
+        true, labelled = true[true != TELEVISION], labelled[true != TELEVISION]
     for name in (TELEVISION, SPEECH, COUGHING, SILENCE):
-        total = np.count_nonzero(true == name) + np.count_nonzero(said == name)
+        total = np.count_nonzero(true == name) + np.count_nonzero(labelled == name)
         if total and not (of_resident and name == TELEVISION):
-            scores[name] = float(2 * np.count_nonzero((true == name) & (said == name)) / total)
+            scores[name] = float(2 * np.count_nonzero((true == name) & (labelled == name)) / total)
     return scores
 
 
@@ -248,8 +248,8 @@ def _frames(labelling: Labelling, sounds: Sequence[Sound]) -> tuple[np.ndarray, 
         scored &= ~((times >= end) & (times < end + _ECHO))
     rows = np.maximum(np.searchsorted(labelling.starts, times, "right") - 1, 0)
     inside = (labelling.starts[rows] <= times) & (times < labelling.ends[rows])
-    said = np.where(inside, labelling.labels[rows], "")
-    return true[scored], said[scored]
+    labelled = np.where(inside, labelling.labels[rows], "")
+    return true[scored], labelled[scored]
 
 
 def _print(scores: Sequence[dict[tuple[str, str], float]]) -> None:

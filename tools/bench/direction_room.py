@@ -139,12 +139,12 @@ def room_scene(
     """
     room = draw_room(places, rt60, rng)
     sources = [room.anywhere(rng) for _ in clips]
-    heard = [heard_with(room.echoes(at), clip) for at, clip in zip(sources, clips, strict=True)]
-    return laid_out(room, sources, clips, heard)
+    echoed = [heard_with(room.echoes(at), clip) for at, clip in zip(sources, clips, strict=True)]
+    return laid_out(room, sources, clips, echoed)
 
 
 def laid_out(
-    room: Room, sources: Sequence[Float64], clips: Sequence[Float64], heard: Sequence[Float64]
+    room: Room, sources: Sequence[Float64], clips: Sequence[Float64], echoed: Sequence[Float64]
 ) -> Scene:
     """Lay sounds one behind the other.
 
@@ -153,13 +153,13 @@ def laid_out(
     room : Room
     sources : sequence of np.ndarray [shape=(3,)], float64
         Where each is.
-    clips, heard : sequence of np.ndarray
+    clips, echoed : sequence of np.ndarray
         Without the room, and as `heard_with` returns them.
     """
     sounds, at, channels = [], int(_BEFORE * SAMPLE_RATE), len(room.microphones)
     pause = np.zeros((int(_PAUSE * SAMPLE_RATE), channels))
     parts = [np.zeros((at, channels))]
-    for source, clip, sound in zip(sources, clips, heard, strict=True):
+    for source, clip, sound in zip(sources, clips, echoed, strict=True):
         end = at + len(clip)
         sounds.append(Placed(at / SAMPLE_RATE, end / SAMPLE_RATE, room.azimuth(source)))
         parts += [sound, pause]

@@ -36,8 +36,8 @@ def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
         raise DataError(f"{file}: no such file of groups; `hearthlog discover` makes one")
     span = timeline.grid.start, timeline.grid.end
     with share_done("finding what recurs") as progress:
-        found, losses = group_spans(find_home_logs(logs), groups, *span, progress)
-    for name, spans in found.items():
+        spans_by_name, losses = group_spans(find_home_logs(logs), groups, *span, progress)
+    for name, spans in spans_by_name.items():
         if name in timeline.microphones:
             timeline.microphones[name].recurring = LabelledSpans(*spans)
     timeline.losses += [text for text in losses if text not in timeline.losses]

@@ -15,7 +15,7 @@ _LEAST_ENERGY = 1e-12
 _TINY = 1e-12
 
 
-class HeardSpeech(NamedTuple):
+class SpeechFrames(NamedTuple):
     """Frames of speech of one microphone in one log.
 
     Attributes
@@ -32,12 +32,12 @@ class HeardSpeech(NamedTuple):
     loudness: Float64
     turn: Int64
 
-    def rows(self, rows: Bool) -> "HeardSpeech":
+    def rows(self, rows: Bool) -> "SpeechFrames":
         """Return some of the frames."""
-        return HeardSpeech(self.frames[rows], self.loudness[rows], self.turn[rows])
+        return SpeechFrames(self.frames[rows], self.loudness[rows], self.turn[rows])
 
 
-def heard_speech(stamps: Int64, energy: Float32, starts: Int64) -> HeardSpeech:
+def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames:
     """Return frames of speech as they are compared.
 
     Parameters
@@ -50,10 +50,10 @@ def heard_speech(stamps: Int64, energy: Float32, starts: Int64) -> HeardSpeech:
     """
     loudness = 10.0 * np.log10(np.maximum(energy.astype(np.float64), _LEAST_ENERGY))
     frames = (stamps + FRAME_NANOSECONDS // 2) // FRAME_NANOSECONDS
-    return HeardSpeech(frames, loudness, np.searchsorted(starts, stamps, side="right") - 1)
+    return SpeechFrames(frames, loudness, np.searchsorted(starts, stamps, side="right") - 1)
 
 
-def heard_louder(heard: Sequence[HeardSpeech]) -> list[Bool]:
+def louder_elsewhere(speech: Sequence[SpeechFrames]) -> list[Bool]:
     """Tell which turns another microphone hears as well, and louder.
 
     That is so if in most of a turn's frames the other one hears speech, too, and if its loudness
@@ -62,7 +62,7 @@ def heard_louder(heard: Sequence[HeardSpeech]) -> list[Bool]:
 
     Parameters
     ----------
-    heard : sequence of HeardSpeech
+    speech : sequence of SpeechFrames
         Of each microphone.
 
     Returns
@@ -70,21 +70,21 @@ def heard_louder(heard: Sequence[HeardSpeech]) -> list[Bool]:
     list of np.ndarray [shape=(turns,)], bool
         For each microphone.
     """
-    kept = list(heard)
-    louder = []
-    for place, own in enumerate(heard):
+    kept = list(speech)
+    louder: list[Bool] = []
+    for place, own in enumerate(speech):
         counts = np.bincount(own.turn)
-        found = np.zeros(len(counts), np.bool_)
+        is_louder = np.zeros(len(counts), np.bool_)
         for before, other in enumerate(kept):
             if before != place and _is_of_one_time(own, other):
-                found |= _is_louder(own, counts, other, or_as_loud=before < place)
-        louder.append(found)
+                is_louder |= _is_louder(own, counts, other, or_as_loud=before < place)
+        louder.append(is_louder)
         # what was left out is no reason to leave out others, or nobody would have heard it
-        kept[place] = own.rows(~found[own.turn])
+        kept[place] = own.rows(~is_louder[own.turn])
     return louder
 
 
-def _is_of_one_time(own: HeardSpeech, other: HeardSpeech) -> bool:
+def _is_of_one_time(own: SpeechFrames, other: SpeechFrames) -> bool:
     """Tell whether some of the frames may be the same; most logs of a home are of other times."""
     if not (len(own.frames) and len(other.frames)):
         return False
@@ -94,8 +94,8 @@ def _is_of_one_time(own: HeardSpeech, other: HeardSpeech) -> bool:
     )
 
 
-def _is_louder(own: HeardSpeech, counts: Int64, other: HeardSpeech, *, or_as_loud: bool) -> Bool:
-    best, found = np.full(len(counts), _ALIKE), np.zeros(len(counts), np.bool_)
+def _is_louder(own: SpeechFrames, counts: Int64, other: SpeechFrames, *, or_as_loud: bool) -> Bool:
+    best, is_louder = np.full(len(counts), _ALIKE), np.zeros(len(counts), np.bool_)
     for late in _LATE:
         times = own.frames + late
         rows = np.minimum(np.searchsorted(other.frames, times), len(other.frames) - 1)
@@ -109,6 +109,6 @@ def _is_louder(own: HeardSpeech, counts: Int64, other: HeardSpeech, *, or_as_lou
         alike = xy / np.sqrt(np.maximum(xx * yy, _TINY))
         alike[counts < _SHORT] = 1.0
         better = (2 * common > counts) & (alike > best)
-        found[better] = (mean_y >= mean_x if or_as_loud else mean_y > mean_x)[better]
+        is_louder[better] = (mean_y >= mean_x if or_as_loud else mean_y > mean_x)[better]
         best[better] = alike[better]
-    return found
+    return is_louder
