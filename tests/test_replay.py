@@ -92,11 +92,16 @@ def replay(source, output=None, model=None, **wanted):
     return replay_logs(logs, ReplayOptions(model=lambda _: loaded, output=output, **wanted), Flag())
 
 
+def is_of_disk(message):
+    """Whether it is the health of the disk: told when that was looked at, and not replayed."""
+    return b"hearthlog: home disk" in message.data
+
+
 def content(folder):
-    """All messages of a folder of logs, as written, by the names of the logs."""
+    """Messages of a folder of logs, as written, by the names of the logs."""
     return {
         log.relative_to(folder).as_posix(): [
-            (m.topic, m.log_time, m.data) for m in LogReader(log).messages()
+            (m.topic, m.log_time, m.data) for m in LogReader(log).messages() if not is_of_disk(m)
         ]
         for log in find_logs(folder)
     }
@@ -107,7 +112,8 @@ def kept(folder, start, end):
     found = {}
     for log in find_logs(folder):
         for m in LogReader(log).messages():
-            if start <= m.log_time < end and not (m.topic == "/rosout" and b"recording" in m.data):
+            is_start = m.topic == "/rosout" and b"recording" in m.data
+            if start <= m.log_time < end and not is_start and not is_of_disk(m):
                 found.setdefault(m.topic, []).append((m.log_time, m.data))
     found.pop("/mic/info", None)
     return found
