@@ -50,9 +50,7 @@ def models_of(log: Path) -> Mapping[str, LabelledBy]:
                 models[name] = LabelledBy(info["model"], info["model_sha256"])
         if not models and len(names) <= 1:
             for record in read_provenance(file)[-1:]:
-                models[_ANY] = LabelledBy(
-                    record.get("model", ""), record.get("model_sha256", "")
-                )
+                models[_ANY] = LabelledBy(record.get("model", ""), record.get("model_sha256", ""))
     return models
 
 
