@@ -43,6 +43,8 @@ from hearthlog.models.classifiers.directions import (
     sectors_of,
 )
 from hearthlog.models.errors import ModelError
+from hearthlog.models.features.floor import Floors, FloorTracker
+from hearthlog.models.labels.labeller import Labeller
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import GENERAL, starter_file
@@ -207,6 +209,19 @@ def test_a_model_that_takes_over_knows_the_directions_of_the_second_before(recor
     labels = [one.data for one in messages if one.topic == "/mic/label"]
     assert labels[-100:] == whole[-100:]
     assert labels[105:] == whole[105:]
+
+
+def test_states_begin_to_converge_once_a_second_of_directions_is_known(recorded, monkeypatch):
+    classifier = Classifier(taking(strong()))
+    sound = next(one for one in events(recorded) if isinstance(one, Features))
+    powers = FloorTracker()(classifier.feature_set.band_powers(sound.values), sound.first).powers
+    labeller, forgotten = Labeller(classifier, "mic"), []
+    monkeypatch.setattr(labeller.segmenter, "forget", lambda: forgotten.append(frame.first))
+    for place in range(60):
+        frame = sound.part(slice(place, place + 1))
+        floors = Floors(powers[place : place + 1], converged=True)
+        labeller.push(frame.values, floors, frame.first, frame.stamps, frame.directions)
+    assert forgotten == [sound.first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)]
 
 
 def of_blocks(blocks, seed):

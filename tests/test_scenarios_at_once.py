@@ -587,6 +587,8 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     state.scenarios["mic-water"].seen = math.inf
     assert scenario_lines(news)[0]["about"].startswith("Now ")
     assert "not listening" not in scenario_lines(news)[0]["about"]
+    tomorrow = News(state, [], [], today(START + 86_400 * NANOSECONDS, UTC), UTC)
+    assert scenario_lines(tomorrow)[0]["about"].endswith("Today nothing.")
 
 
 def test_alerts_hear_what_a_scenario_labels_from_the_log_and_as_it_is_written(log):
