@@ -7,6 +7,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 
 LARGEST_FRAME = 1 << 62
+DIRECTION_FIELDS = ("header.stamp", "frame", "azimuth", "confidence")
 
 
 def directions_of(columns: Columns) -> Directions:
@@ -15,16 +16,16 @@ def directions_of(columns: Columns) -> Directions:
     Parameters
     ----------
     columns : Columns
-        Of the type `AudioDirection`.
+        Of the type `AudioDirection`, with `DIRECTION_FIELDS`.
 
     Raises
     ------
     LogError
         If no array has such directions.
     """
-    numbers, azimuths, confidences = (columns[k] for k in ("frame", "azimuth", "confidence"))
+    stamps, numbers, azimuths, confidences = (columns[path] for path in DIRECTION_FIELDS)
     possible = (numbers <= LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)
     possible &= (np.abs(azimuths) <= np.float32(np.pi)) & (confidences >= 0) & (confidences <= 1)
     if not possible.all():
         raise LogError(f"{columns.topic}: holds directions that no array has")
-    return Directions(numbers.astype(np.int64), columns["header.stamp"], azimuths, confidences)
+    return Directions(numbers.astype(np.int64), stamps, azimuths, confidences)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.directions import LARGEST_FRAME, directions_of
+from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, LARGEST_FRAME, directions_of
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.models.classifiers.directions import NOWHERE, Directions
@@ -26,7 +26,7 @@ _TYPES = _SOUND_TYPES | {"label": message_types.LABEL, "segment": message_types.
 _FIELDS = {
     message_types.FEATURES: ("header.stamp", "frame", "values"),
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
-    message_types.DIRECTION: ("header.stamp", "frame", "azimuth", "confidence"),
+    message_types.DIRECTION: DIRECTION_FIELDS,
     message_types.DIAGNOSTICS: ("status",),
     message_types.LABEL: ("label",),
     message_types.SEGMENT: ("label",),

@@ -243,8 +243,8 @@ def _probabilities(
     of_each = of_segments(inputs, segments, floors)
     by_window = np.zeros((*quiet.shape, len(model.classes)))
     evidence = evidence_of(classifier, [recording.sighting for recording in recordings])
-    told = None if evidence is None else evidence[np.nonzero(~quiet)[0]]
-    by_window[~quiet] = classifier.classify(of_each[~quiet], told)[0]
+    of_windows = None if evidence is None else evidence[np.nonzero(~quiet)[0]]
+    by_window[~quiet] = classifier.classify(of_each[~quiet], of_windows)[0]
     if quiet.any():
         by_window[quiet, model.classes.index(SILENCE)] = 1.0
     loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)

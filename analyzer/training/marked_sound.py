@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.directions import directions_of
+from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, directions_of
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
@@ -26,7 +26,6 @@ from hearthlog.schemas.messages.topics import LIVE, scenario_labelling, topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = ("header.stamp", "frame", "values")
-_DIRECTION_FIELDS = ("frame", "header.stamp", "azimuth", "confidence")
 _WARM_UP = 600 * NANOSECONDS
 _AROUND = 2 * NANOSECONDS  # by which a short mark is extended, and more
 
@@ -196,7 +195,7 @@ def read_sound_of(
 
 def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directions:
     name, start, end = topic(microphone, "direction"), limits[0] - _AROUND, limits[1] + _AROUND
-    columns = read_columns([log], {name}, start, end, _DIRECTION_FIELDS).get(name)
+    columns = read_columns([log], {name}, start, end, DIRECTION_FIELDS).get(name)
     if columns is None or columns.type != message_types.DIRECTION:
         return NOWHERE
     try:
