@@ -196,3 +196,15 @@ def test_what_a_process_left_is_done_by_the_next_one(live_hour, tmp_path):
     finisher.add([second])
     finisher.close()
     assert [path.suffix for path in find_logs(tmp_path)] == [".mcap", ".mcap"]
+
+
+def test_a_rewriting_that_has_ended_leaves_no_process(live_hour, tmp_path):
+    finisher = LogFinisher()
+    finisher.add([shutil.copy(live_hour[0], tmp_path / live_hour[0].name)])
+    process = Path(f"/proc/{finisher._processes[0].pid}")
+    deadline = time.monotonic() + 120
+    while process.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    assert [path.suffix for path in find_logs(tmp_path)] == [".mcap"]
+    finisher.close()

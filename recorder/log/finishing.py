@@ -47,7 +47,10 @@ class LogFinisher:
         self._left = [path for path in dict.fromkeys([*self._left, *active]) if path.exists()]
         command = [*_COMMAND, *map(str, self._left)]
         with suppress(OSError):  # no memory for a process: the next one does it
-            self._processes.append(subprocess.Popen(command, stdin=subprocess.PIPE))  # noqa: S603
+            process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603
+            self._processes.append(process)
+            # Collects its status as soon as it ends, which the next log may do an hour later.
+            threading.Thread(target=process.wait, daemon=True).start()
 
     def close(self) -> None:
         """Give all logs their names that can get them.
