@@ -502,10 +502,10 @@ def test_messages_of_other_encodings_are_left_out_and_named(hearthlog, mixed, tm
         "1970-01-01T00:00:00.000Z /place stamp=1970-01-01T00:00:00.000Z frame_id=mic"
     ]
     warning = "hearthlog: /state: holds no ROS 2 messages ('json')"
-    assert done.stderr == f"{warning}: left out\n"
+    assert done.stderr == f"{warning}: left out; --topics chooses others\n"
 
     done = hearthlog("export", mixed, "--output", tmp_path / "tables", "--format", "csv")
-    assert (done.returncode, done.stderr) == (3, f"{warning}: left out\n")
+    assert (done.returncode, done.stderr) == (3, f"{warning}: left out; --topics chooses others\n")
     assert [path.name for path in (tmp_path / "tables").iterdir()] == ["place.csv"]
 
     done = hearthlog("cat", mixed, "--topics", "/state")

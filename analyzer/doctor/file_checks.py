@@ -21,7 +21,7 @@ from hearthlog.analyzer.doctor.message_checks import MessageChecks
 from hearthlog.analyzer.doctor.metadata_checks import ATTACHMENTS, MetadataChecks
 from hearthlog.analyzer.doctor.topic_types import ALWAYS, LOG_NAME, split_topic
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.logs.columns import decode
+from hearthlog.schemas.logs.columns import decode, faults, unreadable
 from hearthlog.schemas.logs.contents import Contents
 from hearthlog.schemas.logs.contents_record import METADATA as CONTENTS
 from hearthlog.schemas.logs.contents_record import stated_contents
@@ -31,6 +31,7 @@ from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import read_footer
 from hearthlog.schemas.progress import Progress, ignore_progress
 
@@ -257,11 +258,22 @@ class ForeignMessages:
                 continue
             if raw.schema is None or raw.schema.encoding not in ROS_ENCODINGS:
                 continue
+            if unreadable(raw.channel, raw.schema):
+                continue  # which is said of its definition
             try:
                 decode([raw])
             except LogError as error:
-                what = f"cannot be read: {error}"
-                self._findings.error("cdr", what, time=int(raw.log_times[0]))
+                self._report(raw, error)
+
+    def _report(self, raw: RawMessages, error: LogError) -> None:
+        """Report the messages that are not of their type, or else texts that are not UTF-8."""
+        wrong = faults(raw)
+        for row, fault in wrong.items():
+            what, time = f"cannot be read: {raw.channel.topic}: {fault}", int(raw.log_times[row])
+            self._findings.error("cdr", what, time=time)
+        if not wrong:
+            advice = "readers put U+FFFD in the place of what cannot be read"
+            self._findings.warning("text", str(error), advice, time=int(raw.log_times[0]))
 
     def interrupt(self) -> None:
         """Note that messages are missing here, which makes no difference."""

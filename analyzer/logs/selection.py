@@ -14,7 +14,7 @@ from mcap.records import Channel, Schema
 from hearthlog.analyzer.logs.log_spans import LogSpans, find_spans
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.logs.log_stream import ENCODING
+from hearthlog.schemas.logs.columns import leave_out, unreadable
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
@@ -26,6 +26,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
 _LAST = (1 << 63) - 1  # log time
+_NAMED = 5  # topics of which none can be decoded
 Result = TypeVar("Result")
 Described = tuple[Channel, Schema | None]
 
@@ -131,27 +132,33 @@ class Selection:
         return replace(self, topics=frozenset(topics), channels=left)
 
     def decodable(self) -> "Selection":
-        """Return the selection without topics whose messages are not of ROS 2, each with a warning.
+        """Return the selection without channels that cannot be decoded, each with a warning.
+
+        These are not of ROS 2, or the log does not define their type as it can be understood.
 
         Raises
         ------
         LogError
-            If no topic is left.
+            If no channel is left.
         """
-        others = {
-            topic: channel.message_encoding
-            for topic, channels in self.channels.items()
-            for channel, schema in channels
-            if schema is None or channel.message_encoding != ENCODING
-        }
-        if not others:
+        left: dict[str, Sequence[Described]] = {}
+        faults: dict[str, str] = {}
+        for topic, channels in self.channels.items():
+            reasons = [unreadable(*channel) for channel in channels]
+            readable = [channel for channel, why in zip(channels, reasons, strict=True) if not why]
+            if readable:
+                left[topic] = readable
+            for why in filter(None, reasons):
+                faults[topic] = why
+        if not faults:
             return self
-        texts = {topic: f"holds no ROS 2 messages ({form!r})" for topic, form in others.items()}
-        if texts.keys() == self.channels.keys():
-            raise LogError("; ".join(f"{topic}: {text}" for topic, text in texts.items()))
-        for topic, text in texts.items():
-            warnings.warn(HearthlogWarning(f"{text}: left out", topic), stacklevel=2)
-        return self.only(self.channels.keys() - texts.keys())
+        if not left:
+            named = [f"{topic}: {why}" for topic, why in faults.items()]
+            more = [f"and {len(named) - _NAMED} more"] if len(named) > _NAMED else []
+            raise LogError("; ".join([*named[:_NAMED], *more]))
+        for topic, why in faults.items():
+            leave_out(topic, why)
+        return replace(self, topics=frozenset(left), channels=left)
 
     def no_messages(self) -> list[RawMessages]:
         """Return zero messages of each channel, of which a decoder makes columns without rows."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from mcap.records import Channel, Schema
 
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.columns import Columns, decode, decode_readable
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.fields import Field, fields_of, missing_fields
@@ -68,13 +68,8 @@ def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
     Returns
     -------
     list of TypedColumns
-        Messages of one topic and definition are together.
-
-    Raises
-    ------
-    LogError
-        If a message is not of the type that its channel says, is not encoded as CDR, or if the
-        definition of a type cannot be understood.
+        Messages of one topic and definition are together. What cannot be decoded is left out, with
+        a `HearthlogWarning`, as `decode_readable` does.
     """
     groups: dict[Any, list[RawMessages]] = {}
     for raw in batch:
@@ -82,11 +77,11 @@ def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
         groups.setdefault((raw.channel.topic, definition), []).append(raw)
     decoded: list[TypedColumns] = []
     for group in groups.values():
-        parts = decode(group)
         schema = group[0].schema
-        assert schema is not None  # it was decoded
-        fields = fields_of(message_type(schema.name, schema.encoding, schema.data))
-        decoded += [TypedColumns(columns, fields) for columns in parts]
+        if parts := decode_readable(group):
+            assert schema is not None  # it was decoded
+            fields = fields_of(message_type(schema.name, schema.encoding, schema.data))
+            decoded += [TypedColumns(columns, fields) for columns in parts]
     return decoded
 
 

@@ -1,25 +1,36 @@
 """Read topics of logs as columns, in the order of time and within bounded memory."""
 
-from collections import Counter
+import warnings
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
 from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
 from hearthlog.schemas.mcap.statistics import topic_counts
-from hearthlog.schemas.messages.cdr_codec import Fields, decode_rows, ragged
+from hearthlog.schemas.messages.cdr_codec import (
+    Fields,
+    UndecodableText,
+    decode_rows,
+    ragged,
+    unreadable_rows,
+)
+from hearthlog.schemas.messages.fields import fields_of
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.storage.byte_ranges import map_logs
+from hearthlog.schemas.times import millisecond_text
 
+_DEFINITIONS_KEPT = 256
 _HEADS = ("log_times", "publish_times", "sequences")
 
 
@@ -126,13 +137,13 @@ def read_columns(
     -------
     dict of str to Columns
         By topic; a topic without a message is not there. Where the files of a topic do not agree
-        on its metadata, or on its fields, only what they agree on is kept.
+        on its metadata, or on its fields, only what they agree on is kept. What cannot be decoded
+        is left out, with a `HearthlogWarning`, as `decode_readable` does.
 
     Raises
     ------
     LogError
-        If a log cannot be read or is damaged, if its messages are not of the type that it says, or
-        if two logs have different types on one topic.
+        If a log cannot be read or is damaged, or if two logs have different types on one topic.
     """
     logs = list(logs)
     whole = start is None and end is None
@@ -168,14 +179,15 @@ def iterate_columns(
     ------
     list of Columns
         The next span of time: one for each topic that speaks in it, or more where its channels
-        differ in type, fields or metadata. Nothing is older than what was yielded before.
+        differ in type, fields or metadata. Nothing is older than what was yielded before. What
+        cannot be decoded is left out, with a `HearthlogWarning`, as `decode_readable` does.
 
     Raises
     ------
     LogError
-        If a log cannot be read or is damaged, or if its messages are not of the type that it says.
+        If a log cannot be read or is damaged.
     """
-    pieces = iterate_pieces(logs, topics, start, end, partial(decode, fields=fields))
+    pieces = iterate_pieces(logs, topics, start, end, partial(decode_readable, fields=fields))
     return map(_joined, pieces)
 
 
@@ -202,6 +214,124 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
     return _joined([_decode(raw, fields) for raw in messages])
 
 
+def decode_readable(
+    messages: Iterable[RawMessages], fields: Collection[str] | None = None
+) -> list[Columns]:
+    """Decode messages as `decode` does, and leave out those that cannot be decoded.
+
+    Each topic that loses messages is named by a `HearthlogWarning`. In strings that are not UTF-8,
+    U+FFFD stands for what cannot be read.
+
+    Parameters
+    ----------
+    messages : iterable of RawMessages
+    fields : collection of str, optional
+        Paths of the fields to read; all by default.
+
+    Returns
+    -------
+    list of Columns
+        In the order of their first messages in `messages`; nothing for a channel of which no
+        message is left.
+    """
+    decoded = (_decode_readable(raw, fields) for raw in messages)
+    return _joined([columns for columns in decoded if columns is not None])
+
+
+def unreadable(channel: Channel, schema: Schema | None) -> str:
+    """Say why no message of a channel can be decoded; empty if its definition can be understood.
+
+    Parameters
+    ----------
+    channel : Channel
+    schema : Schema or None
+        Of the channel; None if it has none.
+    """
+    if schema is None or channel.message_encoding != "cdr":
+        return f"holds no ROS 2 messages ({channel.message_encoding!r})"
+    return definition_fault(schema.name, schema.encoding, schema.data)
+
+
+@lru_cache(_DEFINITIONS_KEPT)
+def definition_fault(name: str, encoding: str, text: bytes) -> str:
+    """Say why messages of a type cannot be decoded as it is defined; empty if they can.
+
+    Parameters
+    ----------
+    name, encoding, text
+        As of `message_type`.
+    """
+    try:
+        kind = message_type(name, encoding, text)
+        fields_of(kind)
+        kind.layout_for(defaultdict(int))
+    except LogError as error:
+        return str(error)
+    return ""
+
+
+def leave_out(topic: str, why: str) -> None:
+    """Warn that a topic is left out.
+
+    Parameters
+    ----------
+    topic : str
+    why : str
+        As `unreadable` says it.
+    """
+    text = f"{why}: left out; --topics chooses others"
+    warnings.warn(HearthlogWarning(text, topic, each=True), stacklevel=2)
+
+
+def _decode_readable(raw: RawMessages, fields: Collection[str] | None) -> Columns | None:
+    topic = raw.channel.topic
+    if why := unreadable(raw.channel, raw.schema):
+        leave_out(topic, why)
+        return None
+    try:
+        return _decode(raw, fields)
+    except LogError:
+        raw = _without_unreadable(raw)
+    if not len(raw):
+        return None
+    try:
+        return _decode(raw, fields)
+    except LogError as error:
+        text = f"U+FFFD stands for what cannot be read in texts of {topic}"
+        warnings.warn(HearthlogWarning(text, str(error)), stacklevel=2)
+    return _decode(raw, fields, "replace")
+
+
+def faults(raw: RawMessages) -> dict[int, LogError]:
+    """Say what is wrong with each message that is not of its type.
+
+    Parameters
+    ----------
+    raw : RawMessages
+        Of a channel that is not `unreadable`.
+
+    Returns
+    -------
+    dict of int to LogError
+        By place among these messages, ascending.
+    """
+    assert raw.schema is not None
+    kind = message_type(raw.schema.name, raw.schema.encoding, raw.schema.data)
+    return dict(sorted(unreadable_rows(kind, raw.buffer, raw.offsets, raw.sizes).items()))
+
+
+def _without_unreadable(raw: RawMessages) -> RawMessages:
+    """Leave out messages that are not of their type; warn of the first of them."""
+    errors = faults(raw)
+    if not errors:
+        return raw
+    topic, first = raw.channel.topic, next(iter(errors))
+    where = f"{topic} at {millisecond_text(int(raw.log_times[first]))}: {errors[first]}"
+    text = f"such messages of {topic} are left out; `hearthlog doctor` says more"
+    warnings.warn(HearthlogWarning(text, where), stacklevel=2)
+    return raw.take(np.delete(np.arange(len(raw)), list(errors)))
+
+
 def _joined(pieces: Iterable[Columns]) -> list[Columns]:
     """Join pieces of one topic, type, fields and metadata, in the order of time."""
     parts: dict[Any, list[Columns]] = {}
@@ -212,13 +342,19 @@ def _joined(pieces: Iterable[Columns]) -> list[Columns]:
     return [_in_order(join(same)) if len(same) > 1 else same[0] for same in parts.values()]
 
 
-def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
+def _decode(
+    raw: RawMessages,
+    fields: Collection[str] | None,
+    undecodable: UndecodableText = "strict",
+) -> Columns:
     topic, schema = raw.channel.topic, raw.schema
     if schema is None or raw.channel.message_encoding != "cdr":
         raise LogError(f"{topic}: holds no ROS 2 messages ({raw.channel.message_encoding!r})")
     try:
         kind = message_type(schema.name, schema.encoding, schema.data)
-        values = decode_rows(kind, raw.buffer, raw.offsets, raw.sizes, fields)
+        values = decode_rows(
+            kind, raw.buffer, raw.offsets, raw.sizes, fields, undecodable=undecodable
+        )
     except LogError as error:
         raise LogError(f"{topic}: {error}") from error
     return Columns(

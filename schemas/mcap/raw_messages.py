@@ -7,7 +7,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.arrays import Bool, Bytes, Indices, Int64, gather
 from hearthlog.schemas.mcap.formats import MESSAGE_FIXED, MESSAGE_HEAD
 
 
@@ -63,6 +63,21 @@ class RawMessages:
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
             return self
+        return self.take(rows)
+
+    def take(self, rows: slice | Indices | Bool) -> "RawMessages":
+        """Select messages by their places, or by what tells of each whether it stays.
+
+        Parameters
+        ----------
+        rows : slice or np.ndarray
+            Log times must still ascend.
+
+        Returns
+        -------
+        RawMessages
+            With the same buffer.
+        """
         return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
 
 

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]
+UndecodableText = Literal["strict", "replace"]
 _LAST_UNIT = 0xFFFF  # of UTF-16
 _TRIED = 64  # layouts, before rows are looked at one by one
 
@@ -184,12 +185,14 @@ def _same_lengths(texts: Collection[_Texts], count: int) -> list[Indices]:
     return np.split(order, np.cumsum(np.bincount(group))[:-1])
 
 
-def decode_rows(
+def decode_rows(  # noqa: PLR0913
     kind: MessageType,
     buffer: Bytes,
     offsets: Int64,
     sizes: Int64,
     fields: Collection[str] | None = None,
+    *,
+    undecodable: UndecodableText = "strict",
 ) -> Fields:
     """Decode messages of one type into one column for each field.
 
@@ -202,6 +205,9 @@ def decode_rows(
         First byte of each payload in the buffer, and its number of bytes.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
+    undecodable : str
+        What becomes of a string that is not UTF-8: "strict" raises an error, "replace" puts U+FFFD
+        in the place of what cannot be read.
 
     Returns
     -------
@@ -214,17 +220,42 @@ def decode_rows(
         If a payload is not of this type, or a string in it is not UTF-8.
     """
     parts = [
-        (rows, _decode(layout.leaves, block, fields))
+        (rows, _decode(layout.leaves, block, fields, undecodable))
         for layout, rows, block in rows_by_layout(kind, buffer, offsets, sizes)
     ]
     if not parts:
         layout = kind.layout_for(defaultdict(int))
-        return _decode(layout.leaves, np.empty(0, layout.dtype), fields)
+        return _decode(layout.leaves, np.empty(0, layout.dtype), fields, undecodable)
     return _scattered(parts, len(sizes))
 
 
-def rows_by_layout(
+def unreadable_rows(
     kind: MessageType, buffer: Bytes, offsets: Int64, sizes: Int64
+) -> dict[int, LogError]:
+    """Find the messages that are not of their type.
+
+    Parameters
+    ----------
+    kind, buffer, offsets, sizes
+        As of `decode_rows`.
+
+    Returns
+    -------
+    dict of int to LogError
+        By row, what is wrong with it.
+    """
+    errors: dict[int, LogError] = {}
+    for _ in rows_by_layout(kind, buffer, offsets, sizes, errors):
+        pass
+    return errors
+
+
+def rows_by_layout(
+    kind: MessageType,
+    buffer: Bytes,
+    offsets: Int64,
+    sizes: Int64,
+    errors: dict[int, LogError] | None = None,
 ) -> Iterator[tuple[Layout, Indices, NDArray[np.void]]]:
     """Group messages of one type by where their fields lie.
 
@@ -235,6 +266,9 @@ def rows_by_layout(
         Bytes that contain the payloads.
     offsets, sizes : np.ndarray [shape=(n,)], int64
         First byte of each payload in the buffer, and its number of bytes.
+    errors : dict of int to LogError, optional
+        Messages that are not of this type are added by row, and left out; without it, the first of
+        them raises its error.
 
     Yields
     ------
@@ -251,9 +285,12 @@ def rows_by_layout(
     """
     for size, rows in _by_size(sizes):
         payloads = gather(buffer, offsets[rows], size)
-        for layout, same in _by_layout(kind, payloads):
+        wrong: dict[int, LogError] | None = None if errors is None else {}
+        for layout, same in _by_layout(kind, payloads, wrong):
             block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
             yield layout, rows[same], block
+        if errors is not None and wrong:
+            errors |= {int(rows[row]): error for row, error in wrong.items()}
 
 
 def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
@@ -263,8 +300,10 @@ def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
     return [(size, np.flatnonzero(sizes == size)) for size in sorted(set(sizes.tolist()))]
 
 
-def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[Layout, Indices]]:
-    """Group payloads of one size by layout."""
+def _by_layout(
+    kind: MessageType, payloads: NDArray[np.void], errors: dict[int, LogError] | None
+) -> Iterator[tuple[Layout, Indices]]:
+    """Group payloads of one size by layout, without those that have none."""
     rest = np.arange(len(payloads))
     for layout in kind.layouts(payloads.dtype.itemsize)[:_TRIED]:
         fitting = layout.fits(payloads[rest].view(layout.dtype))
@@ -274,44 +313,65 @@ def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[
         if not len(rest):
             return
     for _ in range(_TRIED):
-        layout = kind.layout_of(memoryview(payloads[rest[0]].tobytes()))
-        fitting = layout.fits(payloads[rest].view(layout.dtype))
-        yield layout, rest[fitting]
-        rest = rest[~fitting]
+        found = _layout_of(kind, payloads, int(rest[0]), errors)
+        if found is None:
+            rest = rest[1:]
+        else:
+            fitting = found.fits(payloads[rest].view(found.dtype))
+            yield found, rest[fitting]
+            rest = rest[~fitting]
         if not len(rest):
             return
     rows_of: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
     for row in rest.tolist():  # so many layouts that trying them one by one would take for ever
-        layout = kind.layout_of(memoryview(payloads[row].tobytes()))
-        rows_of.setdefault(tuple(layout.fixed.items()), (layout, []))[1].append(row)
+        if (found := _layout_of(kind, payloads, row, errors)) is not None:
+            rows_of.setdefault(tuple(found.fixed.items()), (found, []))[1].append(row)
     yield from ((layout, np.array(same)) for layout, same in rows_of.values())
 
 
+def _layout_of(
+    kind: MessageType, payloads: NDArray[np.void], row: int, errors: dict[int, LogError] | None
+) -> Layout | None:
+    """Find the layout of one payload; None, and an error more, if it has none."""
+    try:
+        return kind.layout_of(memoryview(payloads[row].tobytes()))
+    except LogError as error:
+        if errors is None:
+            raise
+        errors[row] = error
+        return None
+
+
 def _decode(
-    leaves: Sequence[AnyLeaf], block: NDArray[np.void], fields: Collection[str] | None
+    leaves: Sequence[AnyLeaf],
+    block: NDArray[np.void],
+    fields: Collection[str] | None,
+    undecodable: UndecodableText,
 ) -> Fields:
     return {
-        leaf.path: _values(leaf, block) for leaf in leaves if fields is None or leaf.path in fields
+        leaf.path: _values(leaf, block, undecodable)
+        for leaf in leaves
+        if fields is None or leaf.path in fields
     }
 
 
-def _values(leaf: AnyLeaf, block: NDArray[np.void]) -> NDArray[Any]:
+def _values(leaf: AnyLeaf, block: NDArray[np.void], undecodable: UndecodableText) -> NDArray[Any]:
     if isinstance(leaf, Default):
         return np.repeat(leaf.row, len(block), axis=0)
     if isinstance(leaf, MessageArray):
-        return _messages(leaf, block)
+        return _messages(leaf, block, undecodable)
     if leaf.kind == "texts":
-        rows = [_texts(block, name) for name in leaf.names]
+        rows = [_texts(block, name, undecodable) for name in leaf.names]
         return np.stack(rows, axis=1) if rows else np.empty((len(block), 0), object)
     if leaf.kind == "text":
-        return _texts(block, leaf.path)
+        return _texts(block, leaf.path, undecodable)
     values = block[leaf.path]
     if leaf.kind == "stamp":
         return values["sec"].astype(np.int64) * NANOSECONDS + values["nanosec"]
     return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
 
 
-def _texts(block: NDArray[np.void], name: str) -> NDArray[np.object_]:
+def _texts(block: NDArray[np.void], name: str, undecodable: UndecodableText) -> NDArray[np.object_]:
     """Decode strings of one length; equal ones become one object."""
     assert block.dtype.names is not None
     texts = np.empty(len(block), object)
@@ -320,33 +380,41 @@ def _texts(block: NDArray[np.void], name: str) -> NDArray[np.object_]:
         return texts
     raw, encoding = np.ascontiguousarray(block[name]), "utf-8"
     if raw.dtype.kind == "u":  # a wstring
-        raw, encoding = _utf16(raw, name), "utf-16-le"
+        raw, encoding = _utf16(raw, name, undecodable), "utf-16-le"
     if (raw == raw[:1]).all():
-        texts.fill(_text(raw[0], name, encoding))
+        texts.fill(_text(raw[0], name, encoding, undecodable))
         return texts
     distinct, which = np.unique(raw, return_inverse=True)
-    return np.array([_text(value, name, encoding) for value in distinct], object)[which]
+    decoded = [_text(value, name, encoding, undecodable) for value in distinct]
+    return np.array(decoded, object)[which]
 
 
-def _utf16(units: NDArray[Any], name: str) -> NDArray[np.void]:
+def _utf16(units: NDArray[Any], name: str, undecodable: UndecodableText) -> NDArray[np.void]:
     """Turn each row of words of four bytes, which hold one unit each, into UTF-16."""
-    if (units > _LAST_UNIT).any():
-        raise LogError(f"{name}: a wstring is not UTF-16 in words of four bytes")
-    return units.astype("<u2").view(f"V{2 * units.shape[1]}")[:, 0]
+    wrong = units > _LAST_UNIT
+    if wrong.any():
+        if undecodable == "strict":
+            raise LogError(f"{name}: a wstring is not UTF-16 in words of four bytes")
+        units = np.where(wrong, ord("\ufffd"), units)
+    return np.ascontiguousarray(units, "<u2").view(f"V{2 * units.shape[1]}")[:, 0]
 
 
-def _text(value: np.void, name: str, encoding: str) -> str:
+def _text(value: np.void, name: str, encoding: str, undecodable: UndecodableText) -> str:
     try:
-        return value.tobytes().decode(encoding)
+        return value.tobytes().decode(encoding, undecodable)
     except UnicodeDecodeError as error:
         raise LogError(f"{name}: a string is not {error.encoding.upper()}") from error
 
 
-def _messages(array: MessageArray, block: NDArray[np.void]) -> NDArray[np.object_]:
+def _messages(
+    array: MessageArray, block: NDArray[np.void], undecodable: UndecodableText
+) -> NDArray[np.object_]:
     """Turn an array of messages into one list of dicts a row."""
     elements = []
     for leaves in array.elements:
-        columns = {leaf.path.rpartition("].")[2]: _values(leaf, block) for leaf in leaves}
+        columns = {
+            leaf.path.rpartition("].")[2]: _values(leaf, block, undecodable) for leaf in leaves
+        }
         lists = [column.tolist() for column in columns.values()]
         elements.append([dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)])
     rows = zip(*elements, strict=True) if elements else iter([()] * len(block))

@@ -38,7 +38,7 @@ class Field(NamedTuple):
     elements: Mapping[str, "Field"] = {}
 
 
-@lru_cache(64)
+@lru_cache(256)
 def fields_of(kind: MessageType) -> dict[str, Field]:
     """List all fields of a message type by path, with the fields of the messages inside it.
 
@@ -58,8 +58,10 @@ def fields_of(kind: MessageType) -> dict[str, Field]:
 def _fields(
     kind: MessageType, name: str, prefix: str, depth: int, left: Iterator[int]
 ) -> Iterator[tuple[str, Field]]:
-    if depth > _DEPTH_LIMIT or name not in kind.types:
-        raise LogError(f"{kind.name}: contains itself, or {name}, which is not defined")
+    if name not in kind.types:
+        raise LogError(f"{kind.name}: builds on {name}, which is not defined")
+    if depth > _DEPTH_LIMIT:
+        raise LogError(f"{kind.name}: contains itself")
     for field, (node, details) in kind.read_fields(name):
         if next(left, None) is None:
             raise LogError(f"{kind.name}: has too many fields")

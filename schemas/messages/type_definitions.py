@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+from rosbags.typesys.msg import normalize_msgtype
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.cdr_layout import (
@@ -24,8 +25,13 @@ from hearthlog.schemas.messages.versions import APPENDED
 _MESSAGE_LIMIT = 100 << 20  # bytes
 _DEFINITION_LIMIT = 256 << 10  # bytes of text
 _LAYOUTS_KEPT = 256
+_TYPES_KEPT = 256
+_LINE_END = re.compile(r"\r+\n?")
+# Between the files of a type stand 80 signs; some writers have fewer or more, or blanks there.
+_SEPARATOR = re.compile(r"^[ \t]*={3,}[ \t]*$\n?", re.MULTILINE)
+_FILE_NAME = re.compile(r"^[ \t]*(MSG|IDL):[ \t]*(\S+)[ \t]*$", re.MULTILINE)
 # How MCAP's registry joins the files of a type, and lines of them that rosbags does not read.
-_IDL_FILE = re.compile(r"^={80}\r?\nIDL: .*$", re.MULTILINE)
+_IDL_FILE = re.compile(r"^={80}\nIDL: .*$", re.MULTILINE)
 _INCLUDE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
 _WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")  # which rosbags does not read either
 
@@ -141,7 +147,7 @@ class MessageType:
         return self._made[key]
 
 
-@lru_cache(64)
+@lru_cache(_TYPES_KEPT)
 def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
     """Read the definition of a message type.
 
@@ -152,7 +158,7 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
     encoding : str
         `ros2msg` or `ros2idl`; empty for the definition of ROS 2 or hearthlog.
     text : bytes
-        The definition in that encoding, in UTF-8.
+        The definition in that encoding, in UTF-8; what is not may only be in comments.
 
     Raises
     ------
@@ -160,18 +166,23 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         If the encoding is another one, or the text is larger than 256 KiB or cannot be understood.
     """
     ours = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
-    if not encoding or (name in ours and text == definition(name).encode()):
+    if name in ours and (not encoding or text == definition(name).encode()):
         return MessageType(name, ours)
+    if not encoding:
+        raise LogError(f"the log does not define {name}")
+    if encoding not in {"ros2msg", "ros2idl"}:
+        raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
     if len(text) > _DEFINITION_LIMIT:
         raise LogError(f"the definition of {name} is too long")
+    name = normalize_msgtype(name)  # which is how its definition is named
+    if not text.strip():
+        if name not in ours:
+            raise LogError(f"the log does not define {name}")
+        return MessageType(name, ours)
     try:
-        if encoding == "ros2msg":
-            types = _types_from_msg(text.decode(), name)
-        elif encoding == "ros2idl":
-            types = _types_from_idl(text.decode())
-        else:
-            raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
-    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        plain = _with_usual_lines(text.decode(errors="replace"))
+        types = _types_from_msg(plain, name) if encoding == "ros2msg" else _types_from_idl(plain)
+    except (TypesysError, RecursionError, ValueError, KeyError) as error:
         raise LogError(f"the definition of {name} cannot be read") from error
     theirs = {key: fields for key, (_, fields) in types.items()}
     growth = {
@@ -180,6 +191,13 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
     }
     return MessageType(name, ours | theirs, growth)
+
+
+def _with_usual_lines(text: str) -> str:
+    """Write ends of lines, separators and names of files as rosbags reads them."""
+    text = _LINE_END.sub("\n", text.removeprefix("\ufeff"))
+    text = _SEPARATOR.sub(f"{'=' * 80}\n", text)
+    return _FILE_NAME.sub(r"\1: \2", text)
 
 
 def _types_from_msg(text: str, name: str) -> dict[str, Any]:

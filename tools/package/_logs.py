@@ -306,7 +306,7 @@ class Logs:
         if topic not in selection.channels:
             there = ", ".join(sorted(selection.channels)) or "none"
             raise LogError(f"{self.path}: no topic {topic}; there are {there}")
-        return selection.only([topic])
+        return selection.only([topic]).decodable()
 
 
 def open_logs(path: Path | str, start: int | None = None, end: int | None = None) -> Logs:

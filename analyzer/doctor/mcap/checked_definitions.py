@@ -7,12 +7,11 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Schema
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import definition_fault
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE, SCHEMA_ENCODING
 from hearthlog.schemas.mcap.definitions import Definitions
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.records import encode, parse
-from hearthlog.schemas.messages.type_definitions import message_type
 
 ROS_ENCODINGS = (SCHEMA_ENCODING, "ros2idl")
 _SIZE_LIMIT = 16 << 20  # bytes of a record that is neither chunk nor attachment
@@ -184,7 +183,5 @@ class CheckedDefinitions(Definitions):
         if not _TYPE_NAME.fullmatch(schema.name):
             what = f"schema {schema.name!r} is not named as a ROS message type"
             error("schema-name", what, RECOVER, offset=offset)
-        try:
-            message_type(schema.name, schema.encoding, schema.data)
-        except LogError as failure:
-            error("schema-definition", str(failure), RECOVER, offset=offset)
+        if fault := definition_fault(schema.name, schema.encoding, schema.data):
+            error("schema-definition", fault, "its messages can be copied only", offset=offset)
