@@ -65,15 +65,16 @@ class Exporter(NamedTuple):
     Attributes
     ----------
     save : callable
-        Writes a selection to files; raises LogError if a log is damaged, if there is no message, or
-        one that the format has no place for.
+        Writes a selection to files; returns how many messages were left out because several logs
+        hold them. Raises LogError if a log is damaged, if there is no message, or one that the
+        format has no place for.
     type : str
         The only message type that it takes; empty for any.
     fields : collection of str
         Paths of the fields that messages must have.
     """
 
-    save: Callable[[Selection, OutputFiles, Progress], None]
+    save: Callable[[Selection, OutputFiles, Progress], int | None]
     type: str = ""
     fields: Collection[str] = ()
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.arrays import Bytes, Indices, Int64, gather
 from hearthlog.schemas.mcap.formats import MESSAGE_FIXED, MESSAGE_HEAD
 
 
@@ -20,6 +21,7 @@ class RawMessages:
     buffer: Bytes  # [shape=(b,)], uint8: holds the messages, and others
     offsets: Int64  # [shape=(n,)], int64: where in the buffer the payloads begin
     heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
+    source: Path | None = None  # the log they were read from
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -45,6 +47,10 @@ class RawMessages:
         start = int(self.offsets[row])
         return self.buffer[start : start + int(self.sizes[row])].tobytes()
 
+    def take(self, rows: slice | Indices) -> "RawMessages":
+        """Return some of the messages, with the same buffer."""
+        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
+
     def between(self, start: int | None, end: int | None) -> "RawMessages":
         """Select the messages with start <= log time < end.
 
@@ -63,7 +69,7 @@ class RawMessages:
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
             return self
-        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
+        return self.take(rows)
 
 
 def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages, int]]:
