@@ -203,7 +203,7 @@ class _Log:
     def _copy_records(self, logs: Sequence[Path]) -> bool:
         """Copy metadata records and attachments; return whether there are any."""
         seen: set[Hashable] = set()
-        names: set[str] = set()
+        names: dict[str, int] = {}
         for path in logs:
             with LogFile(path) as file:
                 for place in sorted(file.record_locations, key=lambda place: place.offset):
