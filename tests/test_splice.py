@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 from logreader import LogReader
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from spliced import LOST, raw_messages, run, small_disk, write_log
 
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.selection import select
+from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import Attachment, TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import message
 from hearthlog.schemas.messages.topics import Quality, Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 INFO = Topic("/mic/info", "std_msgs/msg/String", Quality(depth=1, transient_local=True))
 FEATURES = Topic("/mic/features", message_types.FEATURES, array_names={"values": ["a", "b"]})
@@ -110,6 +113,106 @@ def test_messages_that_differ_in_anything_are_not_the_same(hearthlog, tmp_path):
     result = hearthlog("merge", tmp_path / "1.mcap", tmp_path / "3.mcap", "-o", tmp_path / "4.mcap")
     assert "4 messages left out" in result.stderr
     assert raw_messages(tmp_path / "4.mcap") == raw_messages(tmp_path / "1.mcap")
+
+
+def equal_messages(path, count=30, **options):
+    """A log of equal messages at equal times, as a simulated clock gives them."""
+    with path.open("xb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2", "somebody")
+        schema = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
+        for _ in range(2):
+            channel = writer.register_channel("/trigger", "cdr", schema, {})
+            for i in range(count):
+                writer.add_message(channel, i // 10 * 10**9, b"\0\1\0\0\0", i // 10 * 10**9)
+        writer.finish()
+    return path
+
+
+def test_equal_messages_of_one_log_are_all_kept_and_those_of_its_copy_left_out(hearthlog, tmp_path):
+    for number, options in enumerate([{}, {"chunk_size": 1}, {"use_chunking": False}]):
+        log = equal_messages(tmp_path / f"{number}.mcap", **options)
+        for verb, *form in (("merge",), ("cut",), ("export", "--format", "rosbag2")):
+            output = tmp_path / f"{number}{verb}{'' if form else '.mcap'}"
+            assert hearthlog(verb, log, "-o", output, *form)[::2] == (0, "")
+            written = output / f"{output.name}.mcap" if form else output
+            assert len(raw_messages(written)) == 60
+        copy = tmp_path / f"{number}merge.mcap"
+        more = equal_messages(tmp_path / f"more{number}.mcap", 40)  # 20 of them at a later time
+        line = "hearthlog: 120 messages left out that the logs have twice\n"
+        for verb, *form in (("merge",), ("export", "--format", "rosbag2")):
+            together = tmp_path / f"{number}{verb}-together{'' if form else '.mcap'}"
+            if not form:
+                result = hearthlog(verb, log, copy, more, "-o", together)
+                assert len(raw_messages(together)) == 80
+            else:
+                (folder := tmp_path / f"{number}all").mkdir()
+                for path in (log, copy, more):
+                    shutil.copy(path, folder)
+                result = hearthlog(verb, folder, "-o", together, *form)
+            assert (result.returncode, result.stderr) == (0, line)
+
+
+def test_a_chunk_that_a_log_holds_twice_is_merged_once(hearthlog, tmp_path):
+    log = small_log(tmp_path / "1.mcap", [FEATURES], rows=range(1, 50))
+    data = log.read_bytes()
+    (place,) = chunks_of(log)
+    chunk = data[place.chunk_start_offset :][: place.chunk_length + place.message_index_length]
+    end = place.chunk_start_offset + len(chunk)
+    twice = tmp_path / "2.mcap.active"  # without an index
+    twice.write_bytes(data[:end] + chunk)
+    result = hearthlog("merge", twice, "-o", tmp_path / "all.mcap")
+    assert "hearthlog: 49 messages left out that the logs have twice\n" in result.stderr
+    assert raw_messages(tmp_path / "all.mcap") == raw_messages(log)
+
+
+def chunks_of(path):
+    with path.open("rb") as stream:
+        return make_reader(stream).get_summary().chunk_indexes
+
+
+def test_what_is_merged_has_chunks_of_ten_seconds_as_a_recorder_writes_them(hearthlog, tmp_path):
+    rows = range(NANOSECONDS, 61 * NANOSECONDS, NANOSECONDS // 20)
+    log = small_log(tmp_path / "1.mcap", [FEATURES], rows=rows)
+    for verb in ("merge", "cut"):
+        output = tmp_path / f"{verb}.mcap"
+        hearthlog(verb, log, "-o", output)
+        spans = [(c.message_start_time, c.message_end_time) for c in chunks_of(output)]
+        assert len(spans) == 6
+        assert all(end - start < 10 * NANOSECONDS for start, end in spans)
+        part = tmp_path / f"{verb}-cut-off.mcap"
+        part.write_bytes(output.read_bytes()[: output.stat().st_size // 2])
+        assert hearthlog("recover", part, "-o", tmp_path / f"{verb}-saved.mcap").returncode == 3
+        saved = raw_messages(tmp_path / f"{verb}-saved.mcap")
+        assert 400 <= len(saved) == len(set(saved)) <= 600
+
+
+def test_what_a_log_without_messages_carries_is_kept(hearthlog, refused, tmp_path):
+    notes = [Attachment("map.pgm", "image/x-portable-graymap", b"map")]
+    silent = small_log(tmp_path / "silent.mcap", [FEATURES], about=({"node": "a"}, notes))
+    small_log(tmp_path / "spoken.mcap", [FEATURES], rows=[5], about=({"node": "b"}, ()))
+    for sources, count in (([tmp_path], 1), ([silent], 0)):
+        output = tmp_path / f"{count}" / "all.mcap"
+        output.parent.mkdir()
+        assert hearthlog("merge", *sources, "-o", output)[::2] == (0, "")
+        bag = output.with_name("bag")
+        assert not hearthlog("export", *sources, "-o", bag, "--format", "rosbag2").returncode
+        for path in (output, bag / "bag.mcap"):
+            assert LogReader(path).attachments == {"map.pgm": b"map"}
+            with path.open("rb") as stream:
+                nodes = {r.metadata.get("node") for r in make_reader(stream).iter_metadata()}
+            assert nodes >= ({"a", "b"} if count else {"a"})
+            assert len(raw_messages(path)) == count
+        with Reader(bag) as reader:
+            assert reader.message_count == count
+    message = refused("cut", silent, "-o", tmp_path / "x.mcap", "--end", "1999-01-01")
+    assert message.startswith("no message in this span of time")
+    with (tmp_path / "nothing.mcap").open("xb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    message = refused("merge", tmp_path / "nothing.mcap", "-o", tmp_path / "x.mcap")
+    assert message.startswith("no message in these logs")
 
 
 def test_a_merged_log_is_opened_by_rosbags_and_says_what_it_holds(recorded, hearthlog, tmp_path):
@@ -243,6 +346,49 @@ def test_it_is_not_repeated_where_it_is_said_at_the_start_or_is_not_wanted(heart
     hearthlog("cut", tmp_path / "1.mcap", tmp_path / "2.mcap", "-o", tmp_path / "b.mcap",
               *start, "--topics", "/mic/f*")  # fmt: skip
     assert [row[0] for row in raw_messages(tmp_path / "b.mcap")] == ["/mic/features"]
+
+
+def profile(history, depth, durability="transient_local"):
+    quality = json.loads(rosbag2.channel_metadata("", Quality())["offered_qos_profiles"])[0]
+    return quality | {"history": history, "depth": depth, "durability": durability}
+
+
+@pytest.mark.parametrize(
+    ("publishers", "held"),
+    [
+        ([[("keep_last", 10)]], [0, 1, 2, 3, 4, 5]),
+        ([[("keep_last", 2)]], [4, 5]),
+        ([[("keep_last", 1)] * 3], [3, 4, 5]),  # rosbag2 has one channel for them
+        ([[("keep_last", 1)], [("keep_last", 1)], [("keep_last", 1)]], [3, 4, 5]),
+        ([[("keep_all", 0)], [("keep_last", 1)]], [0, 2, 4, 5]),
+        ([[("keep_last", 3, "volatile")], [("keep_last", 2)]], [3, 5]),
+        ([[("unknown", 0)]], [0, 1, 2, 3, 4, 5]),
+        ([[("keep_last", 5, "volatile")]], []),
+    ],
+)
+def test_a_cut_log_begins_with_all_that_a_late_subscriber_receives(
+    hearthlog, tmp_path, publishers, held
+):
+    for number, rows in enumerate(([0, 1, 2], [3, 4, 5], [])):
+        with (tmp_path / f"{number}.mcap").open("xb") as stream:
+            writer = Writer(stream)
+            writer.start("ros2", "somebody")
+            schema = writer.register_schema("std_msgs/msg/Byte", "ros2msg", b"byte data\n")
+            qos = [json.dumps([profile(*each) for each in own]) for own in publishers]
+            channels = [
+                writer.register_channel("/tf", "cdr", schema, {"offered_qos_profiles": text})
+                for text in qos
+            ]
+            other = writer.register_channel("/other", "cdr", schema, {})
+            for row in rows:
+                data = bytes([0, 1, 0, 0, row])
+                writer.add_message(channels[row % len(channels)], 10 + row, data, 10 + row)
+            writer.add_message(other, 30 + number, b"\0\1\0\0\0", 30 + number)
+            writer.finish()
+    start = "1970-01-01T00:00:00.000000032"
+    hearthlog("cut", tmp_path, "-o", tmp_path / "cut.mcap", "--start", start)
+    found = [(row[4], row[5] - 10) for row in raw_messages(tmp_path / "cut.mcap")]
+    assert found == [*((32, row) for row in held), (32, 22)]
 
 
 def test_messages_that_expire_are_not_repeated(hearthlog, tmp_path):

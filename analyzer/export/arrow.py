@@ -1,16 +1,16 @@
 """Messages as Arrow record batches."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.export.exporter import Table
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 
@@ -24,25 +24,22 @@ _TYPES = {
 _HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
 
 
-def schema_of(topic: str, fields: Mapping[str, Field], selection: Selection) -> pa.Schema:
-    """Return the Arrow schema of a topic: log time, publish time, sequence, then its fields.
+def schema_of(table: Table, selection: Selection) -> pa.Schema:
+    """Return the Arrow schema of a table: log time, publish time, sequence, then its fields.
 
-    Its metadata are those of the channel that are equal in all logs, and the `hearthlog` records of
-    the logs as a JSON list.
+    Its metadata are those of the channels that are equal in all logs, and the `hearthlog` records
+    of the logs as a JSON list.
 
     Parameters
     ----------
-    topic : str
-        One of the selection, such as `/mic/features`.
-    fields : mapping of str to Field
-        By path, in the order of the columns.
+    table : Table
     selection : Selection
-        Whose channels and `hearthlog` records give the metadata.
+        Whose `hearthlog` records are among the metadata.
     """
-    channels = [channel for channel, _ in selection.channels[topic]]
+    channels = [channel for channel, _ in table.channels]
     agreed = set.intersection(*(set(channel.metadata.items()) for channel in channels))
-    own = {"topic": topic, "hearthlog": json.dumps(selection.metadata)}
-    columns = _HEADS | {column_name(path): type_of(field) for path, field in fields.items()}
+    own = {"topic": table.topic, "hearthlog": json.dumps(selection.metadata)}
+    columns = _HEADS | {column_name(path): type_of(field) for path, field in table.fields.items()}
     return pa.schema(columns.items(), metadata=dict(agreed) | own)
 
 
@@ -68,26 +65,46 @@ def type_of(field: Field) -> pa.DataType:
     return pa.list_(element, field.size or -1)
 
 
-def batch_of(piece: TypedColumns, schema: pa.Schema) -> pa.RecordBatch:
-    """Turn messages of one topic into a record batch.
+def batch_of(pieces: Sequence[TypedColumns], table: Table, schema: pa.Schema) -> pa.RecordBatch:
+    """Turn messages of one table into a record batch, in the order of their log times.
+
+    A field that the messages of a piece lack is null in them.
 
     Parameters
     ----------
-    piece : TypedColumns
+    pieces : sequence of TypedColumns
+        At least one.
+    table : Table
     schema : pa.Schema
-        As `schema_of` returns it for the topic.
-
-    Raises
-    ------
-    LogError
-        If the type of the messages is defined otherwise than the schema has it.
+        As `schema_of` returns it for the table.
     """
-    columns = piece.columns
-    types = [type_of(piece.fields[path]) for path in columns.fields]
-    if types != schema.types[len(_HEADS) :]:
-        raise LogError(f"{columns.topic}: {columns.type} is defined in two ways; choose one log")
-    arrays = [array_of(columns[path], piece.fields[path]) for path in columns.fields]
-    return pa.RecordBatch.from_arrays([*head_arrays(columns).values(), *arrays], schema=schema)
+    batches = [
+        pa.RecordBatch.from_arrays(
+            [*head_arrays(piece.columns).values(), *_arrays(piece, table)], schema=schema
+        )
+        for piece in pieces
+    ]
+    return in_order_of_time(batches)
+
+
+def _arrays(piece: TypedColumns, table: Table) -> list[pa.Array]:
+    """Make the columns of the fields, by name; nulls for those that the messages do not have."""
+    found = piece.columns.fields
+    return [
+        array_of(found[path], field)
+        if path in found
+        else pa.nulls(len(piece.columns), type_of(field))
+        for path, field in table.fields.items()
+    ]
+
+
+def in_order_of_time(batches: Sequence[pa.RecordBatch]) -> pa.RecordBatch:
+    """Join batches of one schema, sorted by log time."""
+    if len(batches) == 1:
+        return batches[0]
+    (joined,) = pa.Table.from_batches(batches).combine_chunks().to_batches()
+    times = joined["log_time"].cast(pa.int64()).to_numpy()
+    return joined.take(pa.array(np.argsort(times, kind="stable")))
 
 
 def head_arrays(columns: Columns) -> dict[str, pa.Array]:
@@ -122,6 +139,8 @@ def array_of(values: NDArray[Any], field: Field) -> pa.Array:
         return pa.array(values).cast(kind)
     if field.size is None:
         return pa.array(values, kind)
+    if not len(values):
+        return pa.array([], kind)
     if values.dtype == object:
         ends = np.cumsum([len(row) for row in values])
         flat = np.concatenate(list(values))

@@ -1,11 +1,12 @@
 """Segments as a label track of Audacity."""
 
+from collections.abc import Sequence
 from typing import BinaryIO
 
-from hearthlog.analyzer.export.exporter import stream_exporter
+from hearthlog.analyzer.export.exporter import Table, table_exporter
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
-from hearthlog.schemas.logs.columns import iterate_columns
+from hearthlog.schemas.logs.columns import Columns, iterate_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic as topic_of
 from hearthlog.schemas.text import printable
@@ -22,22 +23,22 @@ class LabelTrack:
     ----------
     stream : binary file
         Is written to.
-    topic : str
-        Such as `/mic/segment`.
+    table : Table
+        Such as that of `/mic/segment`.
     selection : Selection
         Has the topic.
     """
 
-    def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
+    def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:
         self._stream = stream
-        self._zero = _first_frame(topic, selection)
+        self._zero = _first_frame(table.topic, selection)
 
-    def write(self, piece: TypedColumns) -> None:
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append segments.
 
         Parameters
         ----------
-        piece : TypedColumns
+        pieces : sequence of TypedColumns
             Messages with the fields `header.stamp`, `duration` and `label`.
 
         Raises
@@ -45,7 +46,10 @@ class LabelTrack:
         LogError
             If one of these fields is missing.
         """
-        columns = piece.columns
+        for piece in pieces:
+            self._write(piece.columns)
+
+    def _write(self, columns: Columns) -> None:
         starts = columns["header.stamp"]
         if self._zero is None:
             self._zero = int(starts.min())
@@ -76,4 +80,4 @@ def _first_frame(topic: str, selection: Selection) -> int | None:
     return None if first is None else int(first[0]["header.stamp"].min())
 
 
-EXPORTER = stream_exporter(LabelTrack, message_types.SEGMENT, {"header.stamp", "duration", "label"})
+EXPORTER = table_exporter(LabelTrack, message_types.SEGMENT, {"header.stamp", "duration", "label"})

@@ -1,5 +1,6 @@
 """A topic as CSV: a column for each number, with the name that the channel gives it."""
 
+from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Any, BinaryIO
 
@@ -9,17 +10,23 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from hearthlog.analyzer.export.arrow import array_of, column_name, head_arrays, type_of
-from hearthlog.analyzer.export.exporter import stream_exporter
+from hearthlog.analyzer.export.arrow import (
+    array_of,
+    column_name,
+    head_arrays,
+    in_order_of_time,
+    type_of,
+)
+from hearthlog.analyzer.export.exporter import MOST_COLUMNS, Table, table_exporter
 from hearthlog.analyzer.export.text import json_texts
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.text_files import FORMULA, NUMBER
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.fields import DURATION, Field
 from hearthlog.schemas.times import NANOSECONDS
 
-_OPTIONS = csv.WriteOptions(quoting_style="needed")
 _CONTROLS = r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # CSV has tabs and the ends of lines alone
 _IN_THEIR_PLACE = "\ufffd"
 
@@ -28,98 +35,134 @@ class CsvFile:
     """A CSV file being written.
 
     Arrays are spread into columns, such as `mean.energy` where the channel has names for the
-    elements, otherwise `values[0]`; arrays of messages are JSON, and bytes are in base64. Stamps
-    are UTC, durations are in seconds. Control characters of texts become U+FFFD.
+    elements, otherwise `values[0]`; arrays of messages and very long ones are JSON, and bytes are
+    in base64. Stamps are UTC, durations are in seconds. Control characters of texts become U+FFFD,
+    and an apostrophe stands before a text that a spreadsheet would take for a formula.
 
     Parameters
     ----------
     stream : binary file
         Is written to.
-    topic : str
-        Such as `/mic/segment`.
+    table : Table
     selection : Selection
-        Has the topic.
+        Not used.
     """
 
-    def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
+    def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:  # noqa: ARG002
         self._stream = stream
-        self._metadata = [channel.metadata for channel, _ in selection.channels[topic]]
+        self._table = table
+        self._names: dict[str, list[str]] = {}  # of elements of arrays, in any log
+        self._widths: dict[str, int | None] = {}  # of arrays without names; None: as JSON
         self._schema: pa.Schema | None = None
-        self._writer: csv.CSVWriter | None = None
 
-    def write(self, piece: TypedColumns) -> None:
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append messages.
 
         Parameters
         ----------
-        piece : TypedColumns
-            Messages of the topic. Those of the first call decide which columns there are.
+        pieces : sequence of TypedColumns
+            Messages of the table. Those of the first call decide how many columns an array has.
 
         Raises
         ------
         LogError
             If there is no column for a value, or not one name for each element of an array.
         """
-        columns = self._columns(piece)
-        if self._writer is None:
-            self._schema = pa.schema([(name, array.type) for name, array in columns.items()])
-            self._writer = csv.CSVWriter(self._stream, self._schema, write_options=_OPTIONS)
-        assert self._schema is not None
-        more = columns.keys() - set(self._schema.names)
-        if more:
-            raise LogError(
-                f"{piece.columns.topic}: {min(more)} is not in all messages, which CSV has no "
-                "column for; choose ndjson or parquet"
-            )
-        count = len(piece.columns)
-        arrays = [
-            _harmless(columns[field.name]) if field.name in columns else pa.nulls(count, field.type)
-            for field in self._schema
-        ]
-        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        is_first = self._schema is None
+        if is_first:
+            self._measure_arrays(pieces)
+        batches = [pa.RecordBatch.from_pydict(self._columns(piece)) for piece in pieces]
+        if self._schema is None:
+            self._schema = batches[0].schema
+        batch = in_order_of_time(batches)
+        columns = [_harmless(column) for column in batch.columns]
+        text = pa.BufferOutputStream()
+        csv.write_csv(
+            pa.RecordBatch.from_arrays(columns, schema=self._schema),
+            text,
+            csv.WriteOptions(include_header=is_first, quoting_style="needed"),
+        )
+        self._stream.write(text.getvalue())
 
     def finish(self) -> None:
-        """Complete the file."""
-        if self._writer is not None:
-            self._writer.close()
+        """Complete the file, which needs nothing."""
+
+    def _measure_arrays(self, pieces: Sequence[TypedColumns]) -> None:
+        """Decide which columns the elements of each array have."""
+        for path, field in self._table.fields.items():
+            if field.size is None or field.elements or field.type == "uint8":
+                continue
+            names = (array_names(channel.metadata, path) for channel, _ in self._table.channels)
+            self._names[path] = list(dict.fromkeys(name for each in names for name in each))
+            arrays = [
+                piece.columns[path]
+                for piece in pieces
+                if path in piece.fields and not array_names(piece.columns.metadata, path)
+            ]
+            widths = [
+                array.shape[1] if array.ndim == 2 else max(map(len, array), default=0)
+                for array in arrays
+            ]
+            width = max(widths, default=0)
+            is_unknown = not arrays and not self._names[path]  # only later messages have it
+            self._widths[path] = None if is_unknown or width > MOST_COLUMNS else width
 
     def _columns(self, piece: TypedColumns) -> dict[str, pa.Array]:
         columns = piece.columns
         arrays = head_arrays(columns)
-        for path, values in columns.fields.items():
-            field = piece.fields[path]
-            name = column_name(path)
-            if field.elements or (field.size is not None and field.type == "uint8"):
-                arrays[name] = pa.array(json_texts(values, field), pa.string())
-            elif field.size is not None:
-                arrays |= self._spread(piece, path)
+        for path, field in self._table.fields.items():
+            name, values = column_name(path), columns.fields.get(path)
+            if path in self._widths:
+                arrays |= self._spread(piece, path, field)
+            elif field.elements or field.size is not None:
+                arrays[name] = _json_column(piece, path)
+            elif values is None:
+                kind = pa.float64() if field.type == DURATION else type_of(field)
+                arrays[name] = pa.nulls(len(columns), kind)
             elif field.type == DURATION:
                 arrays[name] = pa.array(values / NANOSECONDS)
             else:
                 arrays[name] = array_of(values, field)
         return arrays
 
-    def _spread(self, piece: TypedColumns, path: str) -> dict[str, pa.Array]:
+    def _spread(self, piece: TypedColumns, path: str, field: Field) -> dict[str, pa.Array]:
         """Make a column for each element of an array, and for those that only other logs have."""
-        elements = _elements(piece.columns[path], piece.fields[path])
-        own = array_names(piece.columns.metadata, path)
-        if not own:
-            return {f"{path}[{i}]": element for i, element in enumerate(elements)}
-        if len(own) != len(elements):
+        width, own = self._widths[path], array_names(piece.columns.metadata, path)
+        missing = pa.nulls(len(piece.columns), type_of(field._replace(size=None)))
+        columns = {f"{path}.{name}": missing for name in self._names[path]}
+        if width is None and not own:
+            return columns | {column_name(path): _json_column(piece, path)}
+        columns |= {f"{path}[{i}]": missing for i in range(width or 0)}
+        if path not in piece.fields:
+            return columns
+        elements = _elements(piece.columns[path], field)
+        if own and len(own) != len(elements):
             raise LogError(f"{piece.columns.topic}: {len(elements)} {path}, but {len(own)} names")
-        all_names = dict.fromkeys(
-            name for each in self._metadata for name in array_names(each, path)
-        )
-        named = dict(zip(own, elements, strict=True))
-        missing = pa.nulls(len(piece.columns), elements[0].type)
-        return {f"{path}.{name}": named.get(name, missing) for name in all_names}
+        names = [f"{path}.{name}" for name in own] or [f"{path}[{i}]" for i in range(len(elements))]
+        if not columns.keys() >= set(names):
+            raise LogError(
+                f"{piece.columns.topic}: {names[width or 0]} is not in all messages, which CSV has "
+                "no column for; choose ndjson or parquet"
+            )
+        return columns | dict(zip(names, elements, strict=True))
+
+
+def _json_column(piece: TypedColumns, path: str) -> pa.Array:
+    if path not in piece.fields:
+        return pa.nulls(len(piece.columns), pa.string())
+    return pa.array(json_texts(piece.columns[path], piece.fields[path]), pa.string())
 
 
 def _harmless(column: pa.Array) -> pa.Array:
-    """Replace control characters, which would steer a terminal."""
+    """Replace control characters, which would steer a terminal, and disarm formulas."""
     if not pa.types.is_string(column.type):
         return column
-    return pc.replace_substring_regex(column, _CONTROLS, _IN_THEIR_PLACE)
+    column = pc.replace_substring_regex(column, _CONTROLS, _IN_THEIR_PLACE)
+    is_formula = pc.match_substring_regex(column, FORMULA)
+    if not pc.any(is_formula).as_py():
+        return column
+    is_formula = pc.and_not(is_formula, pc.match_substring_regex(column, NUMBER))
+    return pc.if_else(is_formula, pc.binary_join_element_wise("'", column, ""), column)
 
 
 def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
@@ -132,4 +175,4 @@ def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
     return [pa.array(column, type_of(element)) for column in columns]
 
 
-EXPORTER = stream_exporter(CsvFile)
+EXPORTER = table_exporter(CsvFile)

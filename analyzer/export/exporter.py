@@ -1,15 +1,191 @@
-"""What the modules of export formats have in common."""
+"""What the modules of export formats have in common: the tables of topics, and their files."""
 
-from collections.abc import Callable, Collection
-from contextlib import ExitStack
+import io
+import os
+import warnings
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol, cast
+
+from numpy.typing import NDArray
 
 from hearthlog.analyzer.export.file_names import file_stem, unused_name
-from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.selection import Described, Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages.fields import (
+    DURATION,
+    TIME,
+    Field,
+    common_fields,
+    fields_of,
+    optional_fields,
+)
+from hearthlog.schemas.messages.message_types import number_type
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.text import listed
+
+MOST_COLUMNS = 4096  # of an array whose elements have no names; images have more
+_NAMED = 8  # fields, or topics, in a line
+
+
+class Table(NamedTuple):
+    """The messages of a topic that fit into one table: of one type, however often it changed.
+
+    Attributes
+    ----------
+    topic, type : str
+    number : int
+        0 for the first table of its topic.
+    fields : mapping of str to Field
+        Those that any definition of the type has, wide enough for all, by path.
+    definitions : sequence of mapping of str to Field
+        Fields of each definition.
+    channels : sequence of (Channel, Schema or None)
+        Those with such messages.
+    """
+
+    topic: str
+    type: str
+    number: int
+    fields: Mapping[str, Field]
+    definitions: Sequence[Mapping[str, Field]]
+    channels: Sequence[Described]
+
+    @property
+    def optional(self) -> list[str]:
+        """Paths of the fields that some definitions lack."""
+        return [path for path in self.fields if any(path not in d for d in self.definitions)]
+
+    @property
+    def stem(self) -> str:
+        """Name of its file, without a suffix."""
+        return file_stem(f"{self.topic} {self.type}" if self.number else self.topic)
+
+
+def tables_of(topic: str, channels: Iterable[Described]) -> list[Table]:
+    """Divide the messages of a topic into tables.
+
+    Parameters
+    ----------
+    topic : str
+    channels : iterable of (Channel, Schema or None)
+        Its channels, whose definitions can be read.
+
+    Returns
+    -------
+    list of Table
+        One, unless the topic has several types, or a field of a type changed so that no column
+        holds all of its values.
+    """
+    groups: list[tuple[str, list[Mapping[str, Field]], list[Described]]] = []
+    for channel, schema in channels:
+        assert schema is not None
+        fields = fields_of(message_type(schema.name, schema.encoding, schema.data))
+        for name, definitions, same in groups:
+            if name == schema.name and _fits(fields, definitions):
+                same.append((channel, schema))
+                break
+        else:
+            groups.append((schema.name, [fields], [(channel, schema)]))
+    return [
+        Table(topic, name, number, common_fields(definitions), definitions, same)
+        for number, (name, definitions, same) in enumerate(groups)
+    ]
+
+
+def _fits(fields: Mapping[str, Field], definitions: list[Mapping[str, Field]]) -> bool:
+    """Add a definition to others if there is one table for all of them."""
+    if any(fields == other for other in definitions):
+        return True
+    try:
+        common_fields([*definitions, fields])
+    except LogError:
+        return False
+    definitions.append(fields)
+    return True
+
+
+def table_of(piece: TypedColumns, tables: Sequence[Table]) -> Table:
+    """Find the table of decoded messages among those of their topic."""
+    if len(tables) == 1:
+        return tables[0]
+    return next(
+        table
+        for table in tables
+        if table.type == piece.columns.type and piece.fields in table.definitions
+    )
+
+
+def with_numbers(columns: Columns, table: Table, paths: Collection[str]) -> Columns:
+    """Select fields of messages, their numbers as the types that the table has.
+
+    Parameters
+    ----------
+    columns : Columns
+        Messages of the table, which have these fields.
+    table : Table
+    paths : collection of str
+        Of the fields.
+    """
+    fields: dict[str, NDArray[Any]] = {}
+    for path in paths:
+        fields[path] = columns[path]
+        field = table.fields[path]
+        if columns[path].dtype != object and field.type not in {TIME, DURATION}:
+            fields[path] = columns[path].astype(number_type(field.type), copy=False)
+    return replace(columns, fields=fields)
+
+
+def warn_of_changes(tables: Sequence[Table]) -> None:
+    """Warn where definitions differ between the messages of a topic, and say what becomes of it.
+
+    Parameters
+    ----------
+    tables : sequence of Table
+        Those of the topic.
+    """
+    for table in tables:
+        optional = optional_fields(table.definitions)
+        if optional:
+            more = [f"{len(optional) - _NAMED} more"] if len(optional) > _NAMED else []
+            text = (
+                f"{table.type} is defined in {len(table.definitions)} ways: not all messages have "
+                f"{listed(optional[:_NAMED] + more)}, where they are empty"
+            )
+            warnings.warn(HearthlogWarning(text, table.topic), stacklevel=2)
+    if len(tables) > 1:
+        text = f"{_why_apart(tables)}: there is a table for each"
+        warnings.warn(HearthlogWarning(text, tables[0].topic), stacklevel=2)
+
+
+def one_table(tables: Sequence[Table], remedy: str) -> Table:
+    """Return the only table of a topic, and warn of fields that some messages lack.
+
+    Raises
+    ------
+    LogError
+        If there are several, with the remedy.
+    """
+    if len(tables) > 1:
+        raise LogError(f"{tables[0].topic}: {_why_apart(tables)}, which is no table; {remedy}")
+    warn_of_changes(tables)
+    return tables[0]
+
+
+def _why_apart(tables: Sequence[Table]) -> str:
+    types = list(dict.fromkeys(table.type for table in tables))
+    if len(types) > 1:
+        return f"has messages of {listed(types)}"
+    try:
+        common_fields([fields for table in tables for fields in table.definitions])
+    except LogError as error:
+        return f"{types[0]} is defined in ways that differ ({error})"
+    return f"{types[0]} is defined in ways that differ"
 
 
 class OutputFiles:
@@ -30,12 +206,20 @@ class OutputFiles:
         The only file, or the folder.
     output : Path
         The name that it gets.
+    made : list of Path
+        The files of which `new` has made the names.
     """
 
     def __init__(self, path: Path, output: Path, suffix: str) -> None:
         self.path, self.output = path, output
         self._suffix = suffix
-        self._names: set[str] = set()
+        self._names: dict[str, int] = {}
+        self.made: list[Path] = []
+
+    @property
+    def remedy(self) -> str:
+        """What to do where one file is not enough."""
+        return f"name a folder, with --format {self._suffix}, for a file of each"
 
     def new(self, stem: str) -> Path:
         """Name a new file in the folder, or the only file.
@@ -50,13 +234,15 @@ class OutputFiles:
         LogError
             If there is already the only file.
         """
-        if self.path.is_dir():
-            return self.path / unused_name(f"{stem}.{self._suffix}", self._names)
-        if self.path.exists():
+        path = self.path
+        if path.is_dir():
+            path /= unused_name(f"{stem}.{self._suffix}", self._names)
+        elif path.exists():
             raise LogError(
                 f"{self.output}: there is more than one clip; name a folder, with --format wav"
             )
-        return self.path
+        self.made.append(path)
+        return path
 
 
 class Exporter(NamedTuple):
@@ -65,29 +251,30 @@ class Exporter(NamedTuple):
     Attributes
     ----------
     save : callable
-        Writes a selection to files; raises LogError if a log is damaged, if there is no message, or
-        one that the format has no place for.
+        Writes a selection to files; returns how many messages were left out because several logs
+        hold them. Raises LogError if a log is damaged, if there is no message, or one that the
+        format has no place for.
     type : str
         The only message type that it takes; empty for any.
     fields : collection of str
         Paths of the fields that messages must have.
     """
 
-    save: Callable[[Selection, OutputFiles, Progress], None]
+    save: Callable[[Selection, OutputFiles, Progress], int | None]
     type: str = ""
     fields: Collection[str] = ()
 
 
-class TopicWriter(Protocol):
-    """A file of one topic being written."""
+class TableWriter(Protocol):
+    """The files of one table being written."""
 
-    def write(self, piece: TypedColumns) -> None:
-        """Append messages of the topic.
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
+        """Append messages of the table.
 
         Parameters
         ----------
-        piece : TypedColumns
-            Messages of one definition.
+        pieces : sequence of TypedColumns
+            The messages of the next span of time, of one definition each; at least one.
 
         Raises
         ------
@@ -95,56 +282,190 @@ class TopicWriter(Protocol):
             If the format has no place for them.
         """
 
-    def finish(self) -> None:
-        """Complete what was written."""
+    def finish(self) -> bool | None:
+        """Complete what was written; return whether the messages have to be read once more.
+
+        It may raise LogError as `write` does.
+        """
 
 
-def write_topics(
-    selection: Selection, progress: Progress, opened: Callable[[str, ExitStack], TopicWriter]
+def write_tables(
+    selection: Selection,
+    files: OutputFiles,
+    progress: Progress,
+    opened: Callable[[Table], TableWriter],
+    type_: str = "",
 ) -> None:
-    """Write the messages of each topic with a writer of its own.
+    """Write the messages of each table with a writer of its own.
+
+    A topic that the format has no place for is left out, with a warning, unless there is no other.
 
     Parameters
     ----------
     selection : Selection
         Its checksums are compared first.
+    files : OutputFiles
+        What is written to.
     progress : callable
         Is told the share that is done, 0 to 1.
     opened : callable
-        Is called with a topic, at its first message, and with an `ExitStack`, to which it may
-        add what is to be closed after `finish` of the writer that it returns.
+        Is called with a table, at its first message, and returns its writer.
+    type_ : str
+        Name of the only message type that is written; empty for any.
 
     Raises
     ------
     LogError
-        If a log is damaged, if there is no message, or one that the format has no place for.
+        If a log is damaged, if there is no message, or if the format has no place for any.
     """
     selection.verify()
+    writing = _Writing(files, opened, type_)
     selection = selection.decodable()
-    writers: dict[str, TopicWriter] = {}
-    with ExitStack() as stack:
-        for batch in selection.messages(progress):
-            for piece in decode_all(batch):
-                topic = piece.columns.topic
-                if topic not in writers:
-                    writers[topic] = opened(topic, stack)
-                    stack.callback(writers[topic].finish)
-                writers[topic].write(piece)
-    if not writers:
+    again: Collection[str] = writing.read(selection, progress)
+    while again:
+        again = writing.read(selection.only(again), progress)
+    if not writing.finish():
         raise selection.nothing()
 
 
-def stream_exporter(
-    writer: Callable[[BinaryIO, str, Selection], TopicWriter],
+def by_topic(pieces: Iterable[TypedColumns]) -> dict[str, list[TypedColumns]]:
+    """Put decoded messages together by their topics."""
+    topics: dict[str, list[TypedColumns]] = {}
+    for piece in pieces:
+        topics.setdefault(piece.columns.topic, []).append(piece)
+    return topics
+
+
+class _Writing:
+    """The tables that are being written, and those that could not be."""
+
+    def __init__(
+        self, files: OutputFiles, opened: Callable[[Table], TableWriter], type_: str
+    ) -> None:
+        self._files, self._opened, self._type = files, opened, type_
+        self._tables: dict[str, list[Table]] = {}
+        self._writers: dict[tuple[str, int], TableWriter] = {}
+        self._finished: set[tuple[str, int]] = set()
+        self._made: dict[tuple[str, int], list[Path]] = {}
+        self._faults: dict[tuple[str, int], LogError] = {}
+
+    def read(self, selection: Selection, progress: Progress) -> set[str]:
+        """Write the messages of a selection; return the topics that have to be read once more."""
+        for batch in selection.messages(progress):
+            for topic, pieces in by_topic(decode_all(batch)).items():
+                self._write(topic, selection.channels[topic], pieces)
+        again: set[str] = set()
+        for key, writer in list(self._writers.items()):
+            if key not in self._finished and self._try(key, writer.finish):
+                again.add(key[0])
+                del self._writers[key]
+            else:
+                self._finished.add(key)
+        return again
+
+    def _write(
+        self, topic: str, channels: Sequence[Described], pieces: Sequence[TypedColumns]
+    ) -> None:
+        """Append messages of one topic."""
+        if topic not in self._tables:
+            same = [each for each in channels if self._type in {"", type_name(each)}]
+            self._tables[topic] = tables_of(topic, same)
+        tables = self._tables[topic]
+        of_table: dict[int, list[TypedColumns]] = {}
+        for piece in pieces:
+            if self._type in {"", piece.columns.type}:
+                of_table.setdefault(table_of(piece, tables).number, []).append(piece)
+        for number, same_table in of_table.items():
+            key = topic, number
+            if key not in self._writers and key not in self._faults:
+                self._open(tables, number)
+            if key in self._writers and key not in self._finished:
+                self._try(key, partial(self._writers[key].write, same_table))
+
+    def _open(self, tables: Sequence[Table], number: int) -> None:
+        if self._files.path.is_dir():
+            if number == 0:
+                warn_of_changes(tables)
+        else:
+            one_table(tables, self._files.remedy)
+        table = tables[number]
+        first = len(self._files.made)
+        self._writers[table.topic, number] = self._opened(table)
+        self._made[table.topic, number] = self._files.made[first:]
+
+    def _try(self, key: tuple[str, int], step: Callable[[], bool | None]) -> bool | None:
+        """Write to a table; delete it if the format has no place for what is written."""
+        first = len(self._files.made)
+        result = None
+        try:
+            result = step()
+        except LogError as error:
+            self._faults[key] = error
+            del self._writers[key]
+            for path in self._made[key] + self._files.made[first:]:
+                path.unlink(missing_ok=True)
+        self._made[key] += self._files.made[first:]
+        return result
+
+    def finish(self) -> bool:
+        """Warn of topics that are left out; return whether there are others."""
+        if self._faults and not self._writers:
+            raise next(iter(self._faults.values()))
+        for (topic, _), fault in self._faults.items():
+            text = str(fault).removeprefix(f"{topic}: ")
+            warnings.warn(HearthlogWarning(f"{text}: left out", topic, each=True), stacklevel=2)
+        return bool(self._writers)
+
+
+def type_name(described: Described) -> str:
+    """Return the name of a channel's message type."""
+    schema = described[1]
+    return "" if schema is None else schema.name
+
+
+class TableFile(io.RawIOBase):
+    """A new file that is open only while it is written to: there may be thousands.
+
+    What is written after it was deleted goes nowhere.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        self._size = 0
+        path.open("xb").close()
+
+    def writable(self) -> bool:
+        """Tell that it can be written to."""
+        return True
+
+    def tell(self) -> int:
+        """Return the bytes that were written."""
+        return self._size
+
+    def write(self, data: Any, /) -> int:
+        """Append bytes."""
+        try:
+            descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND)
+        except FileNotFoundError:
+            return len(data)
+        with open(descriptor, "ab") as stream:  # noqa: PTH123
+            count = stream.write(data)
+        self._size += count
+        return count
+
+
+def table_exporter(
+    writer: Callable[[BinaryIO, Table, Selection], TableWriter],
     type_: str = "",
     fields: Collection[str] = (),
 ) -> Exporter:
-    """Make the exporter of a format whose files are streams of one topic each.
+    """Make the exporter of a format whose files are streams of one table each.
 
     Parameters
     ----------
     writer : callable
-        Is called with a stream, a topic and the selection, and returns the writer of the topic.
+        Is called with a stream, a table and the selection, and returns the writer of the table.
     type_ : str
         Name of the only message type that the format takes; empty for any.
     fields : collection of str
@@ -152,10 +473,10 @@ def stream_exporter(
     """
 
     def save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
-        def opened(topic: str, stack: ExitStack) -> TopicWriter:
-            stream = stack.enter_context(files.new(file_stem(topic)).open("xb"))
-            return writer(stream, topic, selection)
+        def opened(table: Table) -> TableWriter:
+            stream = cast(BinaryIO, TableFile(files.new(table.stem)))
+            return writer(stream, table, selection)
 
-        write_topics(selection, progress, opened)
+        write_tables(selection, files, progress, opened, type_)
 
     return Exporter(save, type_, fields)

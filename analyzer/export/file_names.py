@@ -21,20 +21,21 @@ def file_stem(topic: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", topic).strip("_")[:_LENGTH] or "topic"
 
 
-def unused_name(name: str, taken: set[str]) -> str:
+def unused_name(name: str, taken: dict[str, int]) -> str:
     """Return a name that is not taken, with a number before its suffix if need be.
 
     Parameters
     ----------
     name : str
         The name that is wanted; becomes `name-2.suffix` and so on.
-    taken : set of str
-        Names that are taken; the returned one is added.
+    taken : dict of str to int
+        Names that are taken, and the number to try next; the returned one is added.
     """
     stem, dot, suffix = name.rpartition(".")
     before, behind = (stem, dot + suffix) if stem else (name, "")
-    unused, number = name, 2
+    unused, number = name, taken.get(name, 2)
     while unused in taken:
         unused, number = f"{before}-{number}{behind}", number + 1
-    taken.add(unused)
+    taken[name] = number
+    taken[unused] = 2
     return unused

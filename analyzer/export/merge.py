@@ -2,14 +2,16 @@
 
 import hashlib
 import json
+import math
 import sys
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
@@ -22,15 +24,20 @@ from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.new_files import new_file
+from hearthlog.schemas.times import NANOSECONDS
 
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters
 _FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
+_DEPTH = 10  # of ROS 2's default profile
+_CHUNK_SPAN = 10 * NANOSECONDS  # as a recorder's
 
 
 def merge_logs(
@@ -42,10 +49,10 @@ def merge_logs(
 ) -> int:
     """Write the messages of a selection to one log, in the order of their log times.
 
-    Messages of one time keep the order of their log. What is there twice, with the same topic,
-    times, sequence and bytes, is written once. Channels of equal topic, definition and
-    metadata become one. Metadata records and attachments of the logs are copied, equal ones
-    once; the `rosbag2` record is made anew.
+    Messages of one time keep the order of their log. What several logs hold, with the same topic,
+    times, sequence and bytes, is written once, and so is a chunk that a log holds twice. Channels
+    of equal topic, definition and metadata become one. Metadata records and attachments of the logs
+    are copied, equal ones once; the `rosbag2` record is made anew.
 
     Parameters
     ----------
@@ -55,9 +62,9 @@ def merge_logs(
     progress : callable
         Is told the share that is done, 0 to 1.
     latched : bool
-        Begin with what a late subscriber would still receive: the last message before the span
-        of each channel that is transient local without end, with the log time of the first message
-        in the span, and its own publish time.
+        Begin with what a late subscriber would still receive: of each channel that is transient
+        local without end, as many of its last messages before the span as it keeps, with the log
+        time of the first message in the span, and their own publish times.
 
     Returns
     -------
@@ -119,37 +126,46 @@ def write_log(
         have.
     """
     selection.verify()  # the copies get checksums of their own
-    batches = selection.messages(progress)
+    batches = selection.messages(progress, once=True)
     first = next(batches, None)
-    if first is None:
-        raise selection.nothing()
     log = _Log(stream, selection)
-    if latched:
-        start = min(int(messages.log_times[0]) for messages in first)
-        spoken = {m.channel.topic for m in first if m.log_times[0] == start}
-        for topic, message in _latched(selection).items():
-            if topic not in spoken:
-                log.write([_at(start, message)])
-    repeated = 0
-    for batch in chain([first], batches):
+    if first is None and (log.is_empty or selection.is_part):
+        raise selection.nothing()
+    if latched and first is not None:
+        for held in _held_messages(selection, first):
+            log.write(held)
+    repeated = _count_repeated(selection)
+    for batch in batches if first is None else chain([first], batches):
         once = without_repeats(batch)
         repeated += sum(map(len, batch)) - sum(map(len, once))
         log.write(once)
     return WrittenLog(log.finish(name), repeated)
 
 
+def _count_repeated(selection: Selection) -> int:
+    """Count the messages in chunks that a log holds twice."""
+    count = 0
+    for path in selection.logs:
+        with LogFile(path) as file:
+            chunks = file.chunks[repeated_chunks(file, file.chunks)]
+            for batch in read_in_batches(file, chunks, selection.topics):
+                count += sum(len(m.between(selection.start, selection.end)) for m in batch)
+    return count
+
+
 class _Log:
     """The log being written."""
 
     def __init__(self, stream: BinaryIO, selection: Selection) -> None:
-        self._writer = CountedWriter(stream)
+        self._writer = CountedWriter(stream, chunk_span=_CHUNK_SPAN)
         self._schemas: dict[Hashable, int] = {}
         self._channels: dict[Hashable, int] = {}
         self._described: dict[int, Described] = {}
         self._counts: Counter[int] = Counter()
         self._span = (sys.maxsize, 0)
-        self._writer.start(_profile(selection.logs), "hearthlog")
-        self._copy_records(selection.logs)
+        logs = [*selection.logs, *selection.empty]
+        self._writer.start(_profile(logs), "hearthlog")
+        self.is_empty = not self._copy_records(logs)
         for same in selection.channels.values():
             for described in same:
                 self._channel(described)
@@ -177,15 +193,17 @@ class _Log:
     def finish(self, name: str) -> Mapping[str, str] | None:
         """Complete the log; return its `rosbag2` record, if it has one."""
         topics = self._topics()
-        record = None if topics is None else rosbag2.file_metadata(name, topics, self._span)
+        span = self._span if self._counts else (0, 0)
+        record = None if topics is None else rosbag2.file_metadata(name, topics, span)
         if record is not None:
             self._writer.add_metadata(rosbag2.METADATA, record)
         self._writer.finish()
         return record
 
-    def _copy_records(self, logs: Sequence[Path]) -> None:
+    def _copy_records(self, logs: Sequence[Path]) -> bool:
+        """Copy metadata records and attachments; return whether there are any."""
         seen: set[Hashable] = set()
-        names: set[str] = set()
+        names: dict[str, int] = {}
         for path in logs:
             with LogFile(path) as file:
                 for place in sorted(file.record_locations, key=lambda place: place.offset):
@@ -200,6 +218,7 @@ class _Log:
                         own = unused_name(record.name, names)
                         times = record.create_time, record.log_time
                         self._writer.add_attachment(*times, own, record.media_type, record.data)
+        return bool(seen)
 
     def _channel(self, described: Described) -> int:
         key = identity(*described)
@@ -253,47 +272,115 @@ def _key(record: McapRecord | None) -> Hashable:
     return None
 
 
-def _latched(selection: Selection) -> dict[str, RawMessages]:
-    """Return the last message before the span of each latched topic."""
-    lasting = {
+def _held_messages(
+    selection: Selection, first: Sequence[RawMessages]
+) -> Iterator[list[RawMessages]]:
+    """Yield the messages before the span that a subscriber at its first message still receives."""
+    topics = {
         topic
         for topic, same in selection.channels.items()
-        if any(is_latched(channel) for channel, _ in same)
+        if any(held_count(channel) for channel, _ in same)
     }
-    latest: dict[str, RawMessages] = {}
+    logs = _logs_of_held(selection, topics)
+    left: Counter[Hashable] = Counter()  # up to the first message of the span
+    for batch in _earlier(logs, topics, selection):
+        for messages in batch:
+            left[_publisher(messages)] += len(messages)
+    start = min(int(messages.log_times[0]) for messages in first)
+    at_start: Counter[Hashable] = Counter()
+    for messages in first:
+        at_start[_publisher(messages)] += int((messages.log_times == start).sum())
+    for batch in _earlier(logs, topics, selection):
+        parts: dict[Hashable, list[RawMessages]] = {}
+        for messages in batch:
+            parts.setdefault(_publisher(messages), []).append(messages)
+        held = []
+        for publisher, same in parts.items():
+            kept = max(held_count(same[0].channel) - at_start[publisher], 0)
+            dropped = int(max(left[publisher] - kept, 0))
+            left[publisher] -= sum(map(len, same))
+            held += [_at(start, messages) for messages in _without_first(same, dropped)]
+        yield held
+
+
+def _without_first(parts: Sequence[RawMessages], count: int) -> list[RawMessages]:
+    """Leave out the first messages of several logs."""
+    order = np.argsort(np.concatenate([part.log_times for part in parts]), kind="stable")
+    is_kept = np.zeros(len(order), bool)
+    is_kept[order[count:]] = True
+    ends = np.cumsum([len(part) for part in parts])
+    rows = map(np.flatnonzero, np.split(is_kept, ends[:-1]))
+    return [part.take(kept) for part, kept in zip(parts, rows, strict=True) if len(kept)]
+
+
+def _earlier(
+    logs: Sequence[Path], topics: Collection[str], selection: Selection
+) -> Iterator[list[RawMessages]]:
+    return map(without_repeats, iterate_messages(logs, topics, end=selection.start, once=True))
+
+
+def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
+    """Find the logs with the messages that channels of some topics keep, from the last log on."""
+    logs: list[Path] = []
+    missing = set(topics)
+    counts: Counter[Hashable] = Counter()
     for path in selection.earlier:
-        missing = lasting - latest.keys()
         if not missing:
             break
-        last: dict[str, RawMessages] = {}
+        logs.append(path)
+        wanted: dict[str, dict[Hashable, float]] = {}
         for batch in iterate_messages([path], missing, end=selection.start):
             for messages in batch:
-                topic = messages.channel.topic
-                if topic not in last or messages.log_times[-1] >= last[topic].log_times[-1]:
-                    last[topic] = messages
-        latest |= last
-    return latest
+                publisher, topic = _publisher(messages), messages.channel.topic
+                counts[publisher] += len(messages)
+                wanted.setdefault(topic, {})[publisher] = held_count(messages.channel)
+        for topic, depths in wanted.items():
+            if any(depths.values()) and all(counts[each] >= n for each, n in depths.items()):
+                missing.remove(topic)
+    return logs
+
+
+def _publisher(messages: RawMessages) -> Hashable:
+    """Return a key of who published messages; a topic of ours has one publisher."""
+    channel, schema = messages.channel, messages.schema
+    if schema is not None and schema.name.startswith(f"{PACKAGE}/"):
+        return channel.topic
+    return channel.id, identity(channel, schema)
 
 
 def _at(time: int, messages: RawMessages) -> RawMessages:
-    """Return the last of some messages, logged at another time."""
-    heads = messages.heads[-1:].copy()
+    """Return messages as if they were logged at another time."""
+    heads = messages.heads.copy()
     heads["log_time"] = time
-    return replace(messages, offsets=messages.offsets[-1:], heads=heads)
+    return replace(messages, heads=heads)
 
 
-def is_latched(channel: Channel) -> bool:
-    """Tell whether a late subscriber still receives the last message, however old it is.
+def held_count(channel: Channel) -> float:
+    """Return how many of its last messages a late subscriber still receives, however old they are.
 
     Parameters
     ----------
     channel : Channel
-        Its metadata `offered_qos_profiles` decides; a channel with invalid ones is not latched.
+        Its metadata `offered_qos_profiles` has a profile of each publisher. A publisher that is
+        volatile, or whose messages expire, keeps none; one whose depth is not known, ten.
+
+    Returns
+    -------
+    float
+        Infinite if a publisher keeps all; 0 for a channel without valid profiles.
     """
-    return any(
-        profile["durability"] == "transient_local" and not 0 < profile["lifespan"]["sec"] < _FOREVER
+    return sum(
+        _held_by(profile)
         for profile in _profiles(channel)
+        if profile["durability"] == "transient_local"
+        and not 0 < profile["lifespan"]["sec"] < _FOREVER
     )
+
+
+def _held_by(profile: Mapping[str, Any]) -> float:
+    if profile["history"] == "keep_all":
+        return math.inf
+    return max(profile["depth"], 1) if profile["history"] == "keep_last" else _DEPTH
 
 
 def bag_metadata(channel: Channel) -> dict[str, str]:

@@ -1,67 +1,129 @@
 """A topic as NumPy arrays, in one file that loads without pickle."""
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
-from hearthlog.analyzer.export.file_names import file_stem
+from hearthlog.analyzer.export.exporter import (
+    Exporter,
+    OutputFiles,
+    Table,
+    with_numbers,
+    write_tables,
+)
 from hearthlog.analyzer.export.text import json_texts
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.messages.fields import DURATION, TIME, Field, fields_of
-from hearthlog.schemas.messages.type_definitions import message_type
+from hearthlog.schemas.logs.columns import Columns, join
+from hearthlog.schemas.messages.fields import DURATION, TIME, Field
+from hearthlog.schemas.messages.message_types import number_type
 from hearthlog.schemas.progress import Progress
 
 _TEXTS_LIMIT = 1 << 30  # bytes
+_MEMORY = 128 << 20  # bytes of all tables at once; what is larger is read alone
+_OBJECT = 100  # bytes, roughly
 
 
-def _save(selection: Selection, files: OutputFiles, _: Progress) -> None:
-    """Write an array for each field, by its path, and `log_time`, `publish_time` and `sequence`.
+class NpzFile:
+    """A table in memory, until it is written as one array for each field, by its path.
 
     Stamps are datetime64[ns], durations timedelta64[ns]. Arrays of different lengths lie one
     after the other, their lengths in `<field>.lengths`; arrays of messages are JSON. The names
-    that the channel has for the elements of an array are in `<field>_names`.
+    that the channel has for the elements of an array are in `<field>_names`. A field that some
+    messages lack has only the values of the others, and the rows of these in `<field>.rows`.
+
+    Parameters
+    ----------
+    table : Table
+    files : OutputFiles
+        In which it is written.
+    sizes : Counter
+        Bytes of the tables that are in memory, which it joins, and under None of all.
     """
-    selection.verify()
-    saved = [_save_topic(topic, selection, files) for topic in selection.channels]
-    if not any(saved):
-        raise selection.nothing()
 
+    def __init__(self, table: Table, files: OutputFiles, sizes: "Counter[NpzFile | None]") -> None:
+        self._table = table
+        self._files = files
+        self._sizes = sizes
+        self._pieces: list[Columns] | None = []  # None if it is put off
 
-def _save_topic(topic: str, selection: Selection, files: OutputFiles) -> bool:
-    """Write a file if there is a message."""
-    by_topic = read_columns(selection.logs, {topic}, selection.start, selection.end)
-    if topic not in by_topic:
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
+        """Append messages; put off the largest table if all are too large.
+
+        Parameters
+        ----------
+        pieces : sequence of TypedColumns
+            Messages of the table.
+        """
+        if self._pieces is None:
+            return
+        self._pieces += [piece.columns for piece in pieces]
+        size = sum(_size(piece.columns) for piece in pieces)
+        self._sizes[self] += size
+        self._sizes[None] += size
+        while self._sizes[None] > _MEMORY and len(self._sizes) > 2:
+            _, (largest, _) = self._sizes.most_common(2)
+            assert largest is not None
+            largest.put_off()
+
+    def put_off(self) -> None:
+        """Forget the messages, which have to be read again."""
+        self._sizes[None] -= self._sizes.pop(self)
+        self._pieces = None
+
+    def finish(self) -> bool:
+        """Write the file; return whether the messages were put off, and have to be read again."""
+        if self._pieces is None:
+            return True
+        arrays = _arrays(self._pieces, self._table)
+        self.put_off()
+        with ZipFile(self._files.new(self._table.stem), "x") as archive:
+            for key, array in arrays.items():  # np.savez has no place for a field named `file`
+                with archive.open(f"{key}.npy", "w", force_zip64=True) as part:
+                    np.lib.format.write_array(part, array, allow_pickle=False)
         return False
-    arrays = _arrays(by_topic.pop(topic), _fields(topic, selection))
-    with ZipFile(files.new(file_stem(topic)), "x") as archive:
-        for key, array in arrays.items():  # np.savez has no place for a field named `file`
-            with archive.open(f"{key}.npy", "w", force_zip64=True) as part:
-                np.lib.format.write_array(part, array, allow_pickle=False)
-    return True
 
 
-def _fields(topic: str, selection: Selection) -> dict[str, Field]:
-    kinds = {
-        message_type(schema.name, schema.encoding, schema.data)
-        for _, schema in selection.channels[topic]
-        if schema is not None
-    }
-    definitions = [fields_of(kind) for kind in kinds]
-    if any(fields != definitions[0] for fields in definitions):
-        raise LogError(f"{topic}: is defined in two ways; choose one log")
-    return definitions[0]
+def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+    sizes: Counter[NpzFile | None] = Counter()
+    write_tables(selection, files, progress, lambda table: NpzFile(table, files, sizes))
 
 
-def _arrays(columns: Columns, fields: dict[str, Field]) -> dict[str, NDArray[Any]]:
+def _size(columns: Columns) -> int:
+    size = len(columns) * 24
+    for values in columns.fields.values():
+        size += values.nbytes
+        if values.dtype == object and values.ndim == 1:
+            size += sum(getattr(value, "nbytes", _OBJECT) for value in values)
+    return size
+
+
+def _arrays(pieces: Sequence[Columns], table: Table) -> dict[str, NDArray[Any]]:
+    """Join the messages of a table, in the order of their log times."""
+    required = [path for path in table.fields if path not in table.optional]
+    columns = join([with_numbers(piece, table, required) for piece in pieces])
+    order = np.argsort(columns.log_times, kind="stable")
+    is_sorted = (np.diff(columns.log_times) >= 0).all()
+    columns = columns if is_sorted else columns.take(order)
     arrays: dict[str, NDArray[Any]] = {}
-    for path, values in columns.fields.items():
-        arrays |= _column(path, values, fields[path])
+    for path in table.fields:
+        if path in columns.fields:
+            arrays |= _column(path, columns[path], table.fields[path])
+        else:
+            has = np.concatenate([np.full(len(piece), path in piece.fields) for piece in pieces])
+            having = [piece for piece in pieces if path in piece.fields]
+            if not having:
+                continue
+            values = join([with_numbers(piece, table, [path]) for piece in having])[path]
+            values = values[(np.cumsum(has) - 1)[order[has[order]]]]
+            arrays |= _column(path, values, table.fields[path])
+            arrays[f"{path}.rows"] = np.flatnonzero(has[order])
         names = array_names(columns.metadata, path)
         if names:
             arrays[f"{path}_names"] = np.array(names)
@@ -82,7 +144,10 @@ def _column(path: str, values: NDArray[Any], field: Field) -> dict[str, NDArray[
     if field.elements or field.type == "string":
         return {path: _texts(path, np.array(json_texts(values, field), object))}
     lengths = np.array([len(row) for row in values])
-    return {path: np.concatenate(list(values)), f"{path}.lengths": lengths}
+    flat = np.concatenate(list(values))
+    if field.type not in {TIME, DURATION}:
+        flat = flat.astype(number_type(field.type), copy=False)
+    return {path: flat, f"{path}.lengths": lengths}
 
 
 def _texts(path: str, values: NDArray[Any]) -> NDArray[np.str_]:

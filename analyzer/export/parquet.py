@@ -1,12 +1,13 @@
 """A topic as a Parquet file: a column a field, arrays as lists."""
 
+from collections.abc import Sequence
 from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hearthlog.analyzer.export.arrow import batch_of, schema_of
-from hearthlog.analyzer.export.exporter import stream_exporter
+from hearthlog.analyzer.export.exporter import Table, table_exporter
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 
@@ -22,56 +23,49 @@ class ParquetFile:
     ----------
     stream : binary file
         Is written to.
-    topic : str
-        Such as `/mic/segment`.
+    table : Table
     selection : Selection
-        Has the topic.
+        Has the topic of the table.
     """
 
-    def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
+    def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:
         self._stream = stream
-        self._topic = topic
-        self._selection = selection
+        self._table = table
+        self._schema = schema_of(table, selection)
         self._writer: pq.ParquetWriter | None = None
         self._batches: list[pa.RecordBatch] = []
         self._size = 0
 
-    def write(self, piece: TypedColumns) -> None:
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append messages.
 
         Parameters
         ----------
-        piece : TypedColumns
-            Messages of the topic. The type of those of the first call decides the columns.
-
-        Raises
-        ------
-        LogError
-            If the messages are of a type that is defined otherwise.
+        pieces : sequence of TypedColumns
+            Messages of the table.
         """
-        if self._writer is None:
-            schema = schema_of(self._topic, piece.fields, self._selection)
-            texts = [field.name for field in schema if field.type == pa.string()]
-            self._writer = pq.ParquetWriter(
-                self._stream, schema, compression="zstd", use_dictionary=texts
-            )
-        batch = batch_of(piece, self._writer.schema)
+        batch = batch_of(pieces, self._table, self._schema)
         self._batches.append(batch)
         self._size += batch.nbytes
         if self._size >= _ROW_GROUP:
-            self._write_group(self._writer)
+            self._write_group()
 
     def finish(self) -> None:
         """Write what is left, and the index."""
-        if self._writer is not None:
-            self._write_group(self._writer)
-            self._writer.close()
+        self._write_group().close()
 
-    def _write_group(self, writer: pq.ParquetWriter) -> None:
+    def _write_group(self) -> pq.ParquetWriter:
+        """Write a row group; the writer is made late, for there may be thousands of tables."""
+        if self._writer is None:
+            texts = [field.name for field in self._schema if field.type == pa.string()]
+            self._writer = pq.ParquetWriter(
+                self._stream, self._schema, compression="zstd", use_dictionary=texts
+            )
         if self._batches:
-            writer.write_table(pa.Table.from_batches(self._batches))
+            self._writer.write_table(pa.Table.from_batches(self._batches))
         self._batches.clear()
         self._size = 0
+        return self._writer
 
 
-EXPORTER = stream_exporter(ParquetFile)
+EXPORTER = table_exporter(ParquetFile)

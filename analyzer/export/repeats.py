@@ -1,7 +1,6 @@
-"""Messages that are there twice: of logs that overlap, or of a chunk that a file holds twice."""
+"""Messages that several logs hold: those of a log and of its merged, cut or recovered copies."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages
 
 
 def without_repeats(batch: Sequence[RawMessages]) -> list[RawMessages]:
-    """Leave out messages that are the same as an earlier one of their topic.
+    """Leave out messages that another log holds, too.
 
     Parameters
     ----------
@@ -22,7 +21,8 @@ def without_repeats(batch: Sequence[RawMessages]) -> list[RawMessages]:
     Returns
     -------
     list of RawMessages
-        Of messages with the same topic, times, sequence and bytes, the first one stays.
+        Of messages with the same topic, times, sequence and bytes, the first ones stay: as many as
+        one log has. Equal messages of one log are no repeats.
     """
     topics: dict[tuple[str, str, str], list[int]] = {}
     for place, messages in enumerate(batch):
@@ -31,44 +31,59 @@ def without_repeats(batch: Sequence[RawMessages]) -> list[RawMessages]:
         topics.setdefault(key, []).append(place)
     kept = list(batch)
     for places in topics.values():
-        dropped = _repeated([batch[place] for place in places])
-        for place, rows in zip(places, dropped, strict=True):
+        parts = [batch[place] for place in places]
+        if len({part.source for part in parts}) == 1:
+            continue
+        for place, rows in zip(places, _repeated(parts), strict=True):
             if len(rows):
-                stay = np.delete(np.arange(len(batch[place])), rows)
-                kept[place] = _at(batch[place], stay)
+                kept[place] = batch[place].take(np.delete(np.arange(len(batch[place])), rows))
     return [messages for messages in kept if len(messages)]
 
 
-def _at(messages: RawMessages, rows: Indices) -> RawMessages:
-    return replace(messages, offsets=messages.offsets[rows], heads=messages.heads[rows])
-
-
 def _repeated(parts: Sequence[RawMessages]) -> list[Indices]:
-    """Find the rows of each part that repeat one before them, in this part or an earlier one."""
+    """Find the rows of each part that repeat one of another source, in an earlier part."""
     dropped: list[list[Indices]] = [[np.arange(0)] for _ in parts]
+    numbers = {source: number for number, source in enumerate({part.source for part in parts})}
+    sources = [numbers[part.source] for part in parts]
     records: dict[int, list[tuple[int, Indices, NDArray[np.void]]]] = {}  # by their size
-    for place, rows in enumerate(_of_one_time(parts)):
-        chosen = _at(parts[place], rows)
-        for block in message_blocks(chosen, 0):
+    for place, rows in enumerate(_of_shared_times(parts, sources)):
+        for block in message_blocks(parts[place].take(rows), 0):
             data = block.records()
             records.setdefault(data.dtype.itemsize, []).append((place, rows[block.rank], data))
     for same in records.values():
-        data = np.concatenate([data for _, _, data in same])
-        repeats = np.ones(len(data), bool)
-        repeats[np.unique(data, return_index=True)[1]] = False
-        ends = np.cumsum([len(rows) for _, rows, _ in same])
-        for (place, rows, _), again in zip(same, np.split(repeats, ends[:-1]), strict=True):
+        counts = [len(rows) for _, rows, _ in same]
+        _, equal = np.unique(np.concatenate([data for _, _, data in same]), return_inverse=True)
+        of_source = np.repeat([sources[place] for place, _, _ in same], counts)
+        repeats = np.ones(len(equal), bool)
+        number = _numbered(equal, of_source)
+        firsts = np.unique(equal * len(equal) + number, return_index=True)[1]
+        repeats[firsts] = False
+        for (place, rows, _), again in zip(
+            same, np.split(repeats, np.cumsum(counts)[:-1]), strict=True
+        ):
             dropped[place].append(rows[again])
     return [np.concatenate(rows) for rows in dropped]
 
 
-def _of_one_time(parts: Sequence[RawMessages]) -> list[Indices]:
-    """Find the rows of each part that have the log time of another row, of any part."""
+def _numbered(equal: Indices, sources: Indices) -> Indices:
+    """Count equal messages of one source: 0, 1, 2 and so on."""
+    order = np.lexsort((equal, sources))
+    new = np.ones(len(order), bool)
+    new[1:] = (np.diff(equal[order]) != 0) | (np.diff(sources[order]) != 0)
+    places = np.arange(len(order))
+    numbers = np.empty(len(order), np.intp)
+    numbers[order] = places - np.maximum.accumulate(np.where(new, places, 0))
+    return numbers
+
+
+def _of_shared_times(parts: Sequence[RawMessages], sources: Sequence[int]) -> list[Indices]:
+    """Find the rows of each part whose log time another source has as well."""
+    counts = [len(part) for part in parts]
     times = np.concatenate([part.log_times for part in parts])
+    of_source = np.repeat(sources, counts)
     order = np.argsort(times, kind="stable")
-    again = np.diff(times[order]) == 0
-    shared = np.zeros(len(times), bool)
-    shared[order[1:]] = again
-    shared[order[:-1]] |= again
-    ends = np.cumsum([len(part) for part in parts])
-    return [np.flatnonzero(rows) for rows in np.split(shared, ends[:-1])]
+    firsts = np.flatnonzero(np.diff(times[order], prepend=times[order[0]] - 1))
+    lowest, highest = (each.reduceat(of_source[order], firsts) for each in (np.minimum, np.maximum))
+    shared = np.empty(len(times), bool)
+    shared[order] = np.repeat(lowest != highest, np.diff(firsts, append=len(times)))
+    return [np.flatnonzero(rows) for rows in np.split(shared, np.cumsum(counts)[:-1])]

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
-from hearthlog.analyzer.export.merge import is_latched
+from hearthlog.analyzer.export.merge import held_count
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.log_stream import ENCODING, SCHEMA_ENCODING
@@ -102,7 +102,7 @@ class _Bag:
                 schema.name,
                 msgdef=text,
                 md5sum=digest,
-                latching=int(is_latched(channel)),
+                latching=int(held_count(channel) > 0),
             )
             self._topics[key] = _Topic(connection, types)
         return self._topics[key]

@@ -52,7 +52,7 @@ def export(
     progress: Progress = ignore_progress,
     *,
     folder: bool,
-) -> None:
+) -> int:
     """Write messages in another format.
 
     Parameters
@@ -68,6 +68,11 @@ def export(
         Make a folder with one file for each topic (WAV: for each clip); otherwise one file, of one
         topic if the format is `by_topic`.
 
+    Returns
+    -------
+    int
+        How many messages were left out because several logs hold them.
+
     Raises
     ------
     LogError
@@ -77,7 +82,7 @@ def export(
     new = new_folder if folder or format_.is_folder else new_file
     with new(output) as temporary:
         files = OutputFiles(temporary, output, format_.name)
-        _exporter(format_).save(selection, files, progress)
+        return _exporter(format_).save(selection, files, progress) or 0
 
 
 def _exporter(format_: ExportFormat) -> Exporter:

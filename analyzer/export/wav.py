@@ -1,16 +1,16 @@
 """Clips of sound as WAV files."""
 
 import wave
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from hearthlog.analyzer.export.exporter import Exporter, OutputFiles, write_topics
-from hearthlog.analyzer.export.file_names import file_stem
+from hearthlog.analyzer.export.exporter import Exporter, OutputFiles, Table, write_tables
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, Clip, clips_of
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
@@ -34,12 +34,12 @@ class WavFiles:
         self._last: Clip | None = None
         self._size = 0
 
-    def write(self, piece: TypedColumns) -> None:
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append the clips of messages; begin a new file after a hole, or where the format changes.
 
         Parameters
         ----------
-        piece : TypedColumns
+        pieces : sequence of TypedColumns
             Messages of type `RawAudio`.
 
         Raises
@@ -47,7 +47,16 @@ class WavFiles:
         LogError
             If the messages hold no sound that WAV can hold; the callable `name` may raise it too.
         """
-        for clip in clips_of(piece.columns):
+        try:
+            for piece in pieces:
+                self._write(clips_of(piece.columns))
+        except (LogError, OSError):
+            with suppress(OSError):
+                self.finish()
+            raise
+
+    def _write(self, clips: Iterable[Clip]) -> None:
+        for clip in clips:
             if self._file is None or not self._follows(clip):
                 self.finish()
                 self._file = wave.open(str(self._name(clip.start)), "wb")  # noqa: SIM115
@@ -58,9 +67,9 @@ class WavFiles:
 
     def finish(self) -> None:
         """Complete the file that is open."""
-        if self._file is not None:
-            self._file.close()
-        self._file, self._size = None, 0
+        file, self._file, self._size = self._file, None, 0
+        if file is not None:
+            file.close()
 
     def _follows(self, clip: Clip) -> bool:
         last = self._last
@@ -73,10 +82,10 @@ class WavFiles:
 
 
 def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
-    def opened(topic: str, _: ExitStack) -> WavFiles:
-        return WavFiles(lambda start: files.new(f"{file_stem(topic)}_{_moment(start)}"))
+    def opened(table: Table) -> WavFiles:
+        return WavFiles(lambda start: files.new(f"{table.stem}_{_moment(start)}"))
 
-    write_topics(selection, progress, opened)
+    write_tables(selection, files, progress, opened, RAW_AUDIO)
 
 
 def _moment(time: int) -> str:

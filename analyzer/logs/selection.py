@@ -36,7 +36,8 @@ class Selection:
     """Topics and a span of time of some logs."""
 
     logs: Sequence[Path]  # those with messages in the span
-    unfinished: Sequence[Path]  # those of `logs` that were not completed, or have no message yet
+    empty: Sequence[Path]  # those that have no message at all
+    unfinished: Sequence[Path]  # those of both that were not completed
     channels: Mapping[str, Sequence[Described]]  # by topic, equal ones once
     # the `hearthlog` records of the logs; equal ones are there once
     metadata: Sequence[Mapping[str, str]]
@@ -51,13 +52,22 @@ class Selection:
         """The logs with messages before the span, the last first."""
         return self.spans.before(0 if self.start is None else self.start)
 
-    def messages(self, progress: Progress = ignore_progress) -> Iterator[list[RawMessages]]:
+    @property
+    def is_part(self) -> bool:
+        """Whether only some topics or a span of time were asked for."""
+        return any(limit is not None for limit in (self.topics, self.start, self.end))
+
+    def messages(
+        self, progress: Progress = ignore_progress, *, once: bool = False
+    ) -> Iterator[list[RawMessages]]:
         """Read the messages of the selection, still encoded, in the order of time.
 
         Parameters
         ----------
         progress : callable, optional
             Is told the share of the time span that is done, 0 to 1.
+        once : bool
+            Leave out chunks that are byte for byte an earlier one of their log.
 
         Yields
         ------
@@ -79,7 +89,7 @@ class Selection:
                 _warn(path, error)
 
         chosen = self.topics, self.start, self.end
-        for batch in iterate_messages(self.logs, *chosen, on_damage=leave_out):
+        for batch in iterate_messages(self.logs, *chosen, on_damage=leave_out, once=once):
             yield batch
             now = max(int(messages.log_times[-1]) for messages in batch)
             progress((now - first) / max(last - first, 1))
@@ -168,8 +178,9 @@ class Selection:
 
     def nothing(self) -> LogError:
         """Make the error that says that the selection has no message."""
-        topics = "" if self.topics is None else f" of {', '.join(sorted(self.topics))}"
-        return LogError(f"no message{topics} in this span of time; `hearthlog info` shows spans")
+        topics = "" if not self.topics else f" of {', '.join(sorted(self.topics))}"
+        where = "these logs" if self.start is None and self.end is None else "this span of time"
+        return LogError(f"no message{topics} in {where}; `hearthlog info` shows what there is")
 
 
 def select(
@@ -227,16 +238,18 @@ def select(
         _warn(path, error)
     chosen = [row for row in chosen if row[2] not in damages]
     channels = _by_topic(channel for content in contents for channel in content.channels)
-    topics = _matching(patterns, channels) if patterns and contents else None
+    topics = _matching(patterns, channels) if patterns else None
     metadata: list[Mapping[str, str]] = []
     for record in (record for content in contents for record in content.metadata):
         if record not in metadata:
             metadata.append(record)
+    silent.sort(key=str)
     return Selection(
         logs=[path for _, _, path in chosen],
+        empty=silent,
         unfinished=[
             *(content.path for content in contents if not content.complete),
-            *(path for path in sorted(silent, key=str) if _is_cut(path)),
+            *(path for path in silent if _is_cut(path)),
         ],
         channels={t: same for t, same in channels.items() if topics is None or t in topics},
         metadata=metadata,
@@ -304,6 +317,8 @@ def _by_topic(channels: Iterable[Described]) -> dict[str, list[Described]]:
 
 def _matching(patterns: Sequence[str], topics: Iterable[str]) -> frozenset[str]:
     names = sorted(topics)
+    if not names:  # of logs without messages
+        return frozenset(patterns)
     matching: set[str] = set()
     for pattern in patterns:
         fitting = [topic for topic in names if fnmatchcase(topic, pattern)]

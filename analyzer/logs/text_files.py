@@ -9,6 +9,10 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.storage.small_file import read_whole
 
+# A spreadsheet takes such a text for a formula, unless it is a number; apostrophes before it
+# disarm it, and one more is written than it has, so that reading gives the same text back.
+FORMULA = r"^'*[=+\-@\t\r\n＝＋－＠]"  # noqa: RUF001  wide ones, too
+NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 _MOST_LINES = 1_000_000  # blank ones too: each takes a microsecond
 _LONGEST = 1 << 20  # characters of a record: fields take fifty times as much memory
 

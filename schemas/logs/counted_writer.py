@@ -14,7 +14,7 @@ from hearthlog.schemas.mcap.chunks import BATCH_SIZE
 from hearthlog.schemas.mcap.definitions import Definitions
 from hearthlog.schemas.mcap.formats import INDEX_ENTRIES, MESSAGE_HEAD
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk
+from hearthlog.schemas.mcap.stored_chunk import LATEST, StoredChunk
 
 
 class CountedWriter(ChunkWriter):
@@ -29,10 +29,17 @@ class CountedWriter(ChunkWriter):
         Writable, and at its beginning.
     definitions : Definitions, optional
         Of the chunks that are copied; grows with them.
+    chunk_span : int, optional
+        As of `ChunkWriter`.
     """
 
-    def __init__(self, stream: BinaryIO, definitions: Definitions | None = None) -> None:
-        super().__init__(stream)
+    def __init__(
+        self,
+        stream: BinaryIO,
+        definitions: Definitions | None = None,
+        chunk_span: int = LATEST,
+    ) -> None:
+        super().__init__(stream, chunk_span=chunk_span)
         self._copied = definitions
         self._contents: Contents | None = Contents()
         self._waiting: list[StoredChunk] = []  # one batch of a reader, so that it counts alike

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_table import not_empty
-from hearthlog.schemas.mcap.chunks import TopicChoice, is_chosen, read_chunks
+from hearthlog.schemas.mcap.chunks import TopicChoice, is_chosen, read_chunks, repeated_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
@@ -111,11 +111,14 @@ class _Query(NamedTuple):
     end: int
     every: int = 1
     on_damage: Callable[[Path, LogError], None] | None = None
+    once: bool = False  # whether chunks that repeat another one are left out
 
     def chunks(self, file: LogFile) -> NDArray[np.void]:
         """Return the chunks that may hold a message of the query."""
         chunks = not_empty(file.chunks)
         chunks = chunks[(chunks["end"] >= self.start) & (chunks["start"] < self.end)][:: self.every]
+        if self.once:
+            chunks = chunks[~repeated_chunks(file, chunks)]
         if self.topics is None:
             return chunks
         others = {
@@ -151,13 +154,14 @@ class _Batch(NamedTuple):
     finished: list[LogFile]  # of which nothing more is to be read
 
 
-def iterate_messages(
+def iterate_messages(  # noqa: PLR0913
     logs: Iterable[Path],
     topics: TopicChoice | None = None,
     start: int | None = None,
     end: int | None = None,
     *,
     on_damage: Callable[[Path, LogError], None] | None = None,
+    once: bool = False,
 ) -> Iterator[list[RawMessages]]:
     """Read the messages of some logs, still encoded.
 
@@ -171,6 +175,8 @@ def iterate_messages(
     on_damage : callable, optional
         Told of a log, and of a chunk of it that is damaged and left out, from the threads that
         read. By default the error is raised.
+    once : bool
+        Leave out chunks that are byte for byte an earlier one of their log.
 
     Yields
     ------
@@ -183,7 +189,8 @@ def iterate_messages(
     LogError
         If a log cannot be read, is no MCAP file, or is damaged.
     """
-    return _iterate(logs, _query(topics, start, end)._replace(on_damage=on_damage), list)
+    query = _query(topics, start, end)._replace(on_damage=on_damage, once=once)
+    return _iterate(logs, query, list)
 
 
 def iterate_pieces(  # noqa: PLR0913

@@ -35,11 +35,16 @@ class ChunkWriter:
         Writable, and at its beginning.
     chunk_size : int
         Bytes of records, uncompressed; the message that goes beyond them is the last of its chunk.
+    chunk_span : int, optional
+        Nanoseconds of log time that `write` puts into a chunk at most; no limit by default.
     """
 
-    def __init__(self, stream: BinaryIO, chunk_size: int = CHUNK_SIZE) -> None:
+    def __init__(
+        self, stream: BinaryIO, chunk_size: int = CHUNK_SIZE, chunk_span: int = LATEST
+    ) -> None:
         self._stream = stream
         self._chunk_size = chunk_size
+        self._chunk_span = chunk_span
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
         self._chunk_indexes = bytearray()  # as it will be written: there may be very many
@@ -341,14 +346,20 @@ class ChunkWriter:
             chunk = self._chunk
             room = self._chunk_size - len(chunk.content)
             beyond = int(np.searchsorted(ends, offset + room, side="right"))
-            last = min(beyond + 1, len(ends))
+            start = chunk.start if chunk.entries else int(times[first])
+            late = int(np.searchsorted(times, min(start + self._chunk_span, LATEST - 1)))
+            last = min(beyond + 1, late, len(ends))
+            if last <= first:
+                full.append(chunk)
+                self._chunk = ChunkBuilder()
+                continue
             part = slice(first, last)
             entries = np.empty(last - first, formats.INDEX_ENTRIES)
             entries["time"] = times[part]
             entries["offset"] = ends[part] - sizes[part] - offset + len(chunk.content)
             chunk.add_messages(data[offset : ends[last - 1]], channels[part], entries)
             first, offset = last, int(ends[last - 1])
-            if beyond < len(ends):
+            if last == beyond + 1 or last == late < len(ends):
                 full.append(chunk)
                 self._chunk = ChunkBuilder()
         for stored in prefetch(ChunkBuilder.compress, full, _COMPRESSORS):

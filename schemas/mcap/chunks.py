@@ -1,5 +1,6 @@
 """The messages of many chunks at once, still encoded, by the message indexes behind each chunk."""
 
+import hashlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
@@ -122,6 +123,39 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
     """
     for _ in read_in_batches(file, chunks, topics=()):
         pass
+
+
+def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Find the chunks that are byte for byte an earlier one of the same file.
+
+    Chunks of a single log time are none of them: a writer with one message in each chunk makes
+    equal ones of equal messages.
+
+    Parameters
+    ----------
+    file : LogFile
+        Log of the chunks.
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+        Rows of `file.chunks`.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
+    repeated = np.zeros(len(chunks), bool)
+    candidates: dict[tuple[int, ...], list[int]] = {}
+    span = chunks["end"] - chunks["start"]
+    for row in np.flatnonzero((span > 0) & (chunks["index_length"] >= 0)).tolist():
+        start, end, size, length = chunks[["start", "end", "size", "length"]][row].tolist()
+        candidates.setdefault((start, end, size, length), []).append(row)
+    for rows in candidates.values():
+        digests: set[bytes] = set()
+        for row in sorted(rows, key=chunks["offset"].__getitem__) if len(rows) > 1 else ():
+            stored = file.read(int(chunks["offset"][row]), int(chunks["length"][row]))
+            digest = hashlib.sha256(stored).digest()
+            repeated[row] = digest in digests
+            digests.add(digest)
+    return repeated
 
 
 def read_definitions(file: LogFile) -> None:
@@ -374,7 +408,7 @@ class _Batch(NamedTuple):
             order = np.argsort(heads["log_time"], kind="stable")
             offsets, heads = offsets[order], heads[order]
         schema = self.file.schemas.get(channel.schema_id)
-        return RawMessages(channel, schema, self.buffer, offsets, heads)
+        return RawMessages(channel, schema, self.buffer, offsets, heads, self.file.path)
 
     def _damaged(self, chunk: np.intp, what: str) -> LogError:
         return self.file.damaged(int(self.chunks["offset"][chunk]), what)

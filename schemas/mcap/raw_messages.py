@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -20,6 +21,7 @@ class RawMessages:
     buffer: Bytes  # [shape=(b,)], uint8: holds the messages, and others
     offsets: Int64  # [shape=(n,)], int64: where in the buffer the payloads begin
     heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
+    source: Path | None = None  # the log they were read from
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -45,6 +47,10 @@ class RawMessages:
         start = int(self.offsets[row])
         return self.buffer[start : start + int(self.sizes[row])].tobytes()
 
+    def take(self, rows: slice | Indices | Bool) -> "RawMessages":
+        """Return the messages at some places, or of a mask, with the same buffer."""
+        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
+
     def between(self, start: int | None, end: int | None) -> "RawMessages":
         """Select the messages with start <= log time < end.
 
@@ -64,21 +70,6 @@ class RawMessages:
         if rows == slice(0, len(self)):
             return self
         return self.take(rows)
-
-    def take(self, rows: slice | Indices | Bool) -> "RawMessages":
-        """Select messages by their places, or by what tells of each whether it stays.
-
-        Parameters
-        ----------
-        rows : slice or np.ndarray
-            Log times must still ascend.
-
-        Returns
-        -------
-        RawMessages
-            With the same buffer.
-        """
-        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
 
 
 def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages, int]]:

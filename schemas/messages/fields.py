@@ -1,9 +1,10 @@
 """What the fields of a message type are, and whether those of a file's definition will do."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
@@ -83,6 +84,61 @@ def _fields(
 
 def _type(base: str) -> str:
     return "string" if base in TEXTS else base
+
+
+def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field]:
+    """List the fields that any of several definitions of a type has, wide enough for all of them.
+
+    Parameters
+    ----------
+    definitions : sequence of mapping of str to Field
+        At least one, as `fields_of` returns them.
+
+    Returns
+    -------
+    dict of str to Field
+        By path: those of the first definition in its order, then those that only others have.
+
+    Raises
+    ------
+    LogError
+        If no number type holds all values of a field, or a field is not of the same kind.
+    """
+    common = dict(definitions[0])
+    for fields in definitions[1:]:
+        for path, field in fields.items():
+            common[path] = _wide(path, common[path], field) if path in common else field
+    return common
+
+
+def optional_fields(definitions: Sequence[Mapping[str, Field]]) -> list[str]:
+    """List the paths of fields that some of several definitions lack, as `points[].x` in arrays."""
+    found: list[str] = []
+    for path in dict.fromkeys(path for fields in definitions for path in fields):
+        having = [fields[path] for fields in definitions if path in fields]
+        if len(having) < len(definitions):
+            found.append(path)
+        else:
+            within = optional_fields([field.elements for field in having])
+            found += [f"{path}[].{part}" for part in within]
+    return found
+
+
+def _wide(path: str, one: Field, other: Field) -> Field:
+    """Return a field that holds all values of two."""
+    size = one.size if one.size == other.size else 0
+    if (one.size is None) != (other.size is None) or bool(one.elements) != bool(other.elements):
+        raise LogError(f"{path} is not always of the same kind")
+    if one.elements:
+        return Field("", size, common_fields([one.elements, other.elements]))
+    if _plain(one.type) == _plain(other.type):
+        return one._replace(size=size)
+    if not {one.type, other.type} & {*TEXTS, "bool", TIME, DURATION}:
+        types = np.dtype(_plain(one.type)), np.dtype(_plain(other.type))
+        wide = np.promote_types(*types)
+        if wide.kind != "f" or all(each.kind == "f" or each.itemsize < 8 for each in types):
+            return Field(wide.name, size)
+    raise LogError(f"{path} is {one.type} and {other.type}")
 
 
 def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:

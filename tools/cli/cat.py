@@ -45,11 +45,12 @@ def cat(
 
 def _print_table(selection: "Selection") -> None:
     from hearthlog.analyzer.export.csvfile import CsvFile
+    from hearthlog.analyzer.export.exporter import one_table, tables_of
     from hearthlog.analyzer.logs.typed_columns import decode_all
 
-    for topic in selection.channels:
-        table = CsvFile(sys.stdout.buffer, topic, selection)
+    for topic, channels in selection.channels.items():
+        remedy = "choose other logs, or export --format csv, which makes a file for each"
+        table = CsvFile(sys.stdout.buffer, one_table(tables_of(topic, channels), remedy), selection)
         for batch in selection.messages():
-            for piece in decode_all(batch):
-                table.write(piece)
-        table.finish()
+            if pieces := decode_all(batch):
+                table.write(pieces)

@@ -8,7 +8,7 @@ import typer
 from hearthlog.analyzer.export.formats import FORMATS
 from hearthlog.schemas.text import listed
 from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
-from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
+from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
 
 _FILES = [each.pattern for each in FORMATS.values() if not each.is_folder]
 _BY_TOPIC = [each.name for each in FORMATS.values() if each.by_topic]
@@ -76,8 +76,10 @@ def export(
         names = ", ".join(sorted(selection.channels))
         wrong_use(f"{output} is for one topic: choose one with --topics ({names})")
     with share_done("exporting") as progress:
-        save(selection, output, format_, progress, folder=not one_file)
+        repeated = save(selection, output, format_, progress, folder=not one_file)
     print(output)
+    if repeated:
+        tell(f"{number(repeated, 'message')} left out that the logs have twice")
     end_with_warnings(unfinished_lines(selection.unfinished))
 
 

@@ -10,8 +10,17 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.export.exporter import (
+    MOST_COLUMNS,
+    Table,
+    one_table,
+    table_of,
+    tables_of,
+    with_numbers,
+)
 from hearthlog.analyzer.logs.bearings import Bearings, as_vectors, mean_bearings
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -24,7 +33,8 @@ from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs import follow as growing
 from hearthlog.schemas.logs.columns import Columns, decode, join, read_columns
 from hearthlog.schemas.logs.files import is_layer
-from hearthlog.schemas.messages.fields import DURATION, TIME
+from hearthlog.schemas.messages.cdr_codec import ragged
+from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.messages.topics import microphone_of
 
@@ -124,11 +134,14 @@ class Logs:
         Returns
         -------
         pyarrow.Table
+            A field that only some definitions of the type have is null in the other messages, with
+            a `HearthlogWarning`.
 
         Raises
         ------
         LogError
-            If there is no such topic, a log is damaged, or logs define its type in two ways.
+            If there is no such topic, a log is damaged, or the topic has several types, or a field
+            of a type changed so that no column holds all of its values.
         ModuleNotFoundError
             If pyarrow is not installed.
 
@@ -142,9 +155,9 @@ class Logs:
         from hearthlog.analyzer.export.arrow import batch_of, schema_of  # noqa: PLC0415  an extra
 
         selection = self._select(topic)
-        parts = _typed_columns(selection)
-        schema = schema_of(topic, parts[0].fields, selection)
-        return table.from_batches([batch_of(part, schema) for part in parts])
+        only, batches = _read_table(selection)
+        schema = schema_of(only, selection)
+        return table.from_batches([batch_of(pieces, only, schema) for pieces in batches], schema)
 
     def pandas(self, topic: str) -> "pd.DataFrame":
         """Read a topic as a DataFrame, with a column for each element of an array.
@@ -159,7 +172,9 @@ class Logs:
         pandas.DataFrame
             One row a message; the index is the log time, of type `datetime64[ns, UTC]`. Elements of
             arrays are called as the log names them (`values.energy`, `probabilities.speech`), else
-            by number (`values.0`).
+            by number (`values.0`); an image, or another array of more than 4096 elements without
+            names, is one column. A field that only some definitions of the type have is missing in
+            the other messages, with a `HearthlogWarning`.
 
         Raises
         ------
@@ -175,20 +190,28 @@ class Logs:
         (dtype('float32'), 50)
         """
         pandas = _optional("pandas")
-        parts = _typed_columns(self._select(topic))
-        columns, fields = join([part.columns for part in parts]), parts[0].fields
+        table, batches = _read_table(self._select(topic))
+        parts = [piece.columns for pieces in batches for piece in pieces]
+        required = [path for path in table.fields if path not in table.optional]
+        columns = join([with_numbers(part, table, required) for part in parts])
         series: dict[str, Any] = {}
-        for path, values in columns.fields.items():
-            if values.ndim == 2:
-                series |= _elements(columns, path)
-            elif fields[path].size is None and fields[path].type == TIME:
-                series[path] = pandas.to_datetime(values, unit="ns", utc=True)
-            elif fields[path].size is None and fields[path].type == DURATION:
-                series[path] = pandas.to_timedelta(values, unit="ns")
-            else:
-                series[path] = values
+        for path, field in table.fields.items():
+            if path in columns.fields:
+                series |= _series(pandas, columns, path, field)
+                continue
+            having = [part for part in parts if path in part.fields]
+            rows = np.flatnonzero(np.concatenate([[path in p.fields] * len(p) for p in parts]))
+            if having:
+                some = _series(
+                    pandas, join([with_numbers(p, table, [path]) for p in having]), path, field
+                )
+                series |= {
+                    name: _with_missing(pandas.Series(values), rows, len(columns))
+                    for name, values in some.items()
+                }
         index = pandas.to_datetime(columns.log_times, unit="ns", utc=True).rename("log_time")
-        return pandas.DataFrame(series, index, copy=False)
+        frame = pandas.DataFrame(series, index, copy=False)
+        return frame if index.is_monotonic_increasing else frame.sort_index(kind="stable")
 
     def segments(self, labelling: str = "live", microphone: str | None = None) -> Labelling:
         """Read the spans of time that a recorder, a relabelling or a reviewer has labelled.
@@ -378,9 +401,42 @@ def follow(
     return growing.follow(Path(path), topics, start, stop=stop)
 
 
-def _typed_columns(selection: Selection) -> list[TypedColumns]:
-    parts = [part for batch in selection.messages() for part in decode_all(batch)]
-    return parts or decode_all(selection.no_messages())
+def _read_table(selection: Selection) -> tuple[Table, list[list[TypedColumns]]]:
+    """Read a topic whose messages fit into one table; LogError if they do not."""
+    ((topic, channels),) = selection.channels.items()
+    batches = list(filter(None, map(decode_all, selection.messages())))
+    batches = batches or [decode_all(selection.no_messages())]
+    tables = tables_of(topic, channels)
+    used = {table_of(piece, tables).number for pieces in batches for piece in pieces}
+    found = [table for table in tables if table.number in used]
+    return one_table(found, "choose other logs, or use columns or hearthlog export"), batches
+
+
+def _series(pandas: Any, columns: Columns, path: str, field: Field) -> dict[str, Any]:
+    """Make the columns of a field; those of an array are its elements, unless it is an image."""
+    values = columns[path]
+    if (
+        values.ndim == 2
+        and values.shape[1] > MOST_COLUMNS
+        and not array_names(columns.metadata, path)
+    ):
+        return {path: ragged(values)}
+    if values.ndim == 2:
+        return _elements(columns, path)
+    if field.size is None and field.type == TIME:
+        return {path: pandas.to_datetime(values, unit="ns", utc=True)}
+    if field.size is None and field.type == DURATION:
+        return {path: pandas.to_timedelta(values, unit="ns")}
+    return {path: values}
+
+
+def _with_missing(series: Any, rows: NDArray[np.intp], count: int) -> Any:
+    """Spread values over rows; the others are missing, and whole numbers stay whole."""
+    kind = series.dtype.kind
+    if kind in "iub":
+        name = {"i": "Int", "u": "UInt", "b": "boolean"}[kind]
+        series = series.astype(name if kind == "b" else f"{name}{series.dtype.itemsize * 8}")
+    return series.set_axis(rows).reindex(range(count)).array
 
 
 def _elements(columns: Columns, path: str) -> dict[str, NDArray[Any]]:
