@@ -32,11 +32,13 @@ _CLIPS = Path(__file__).parent / "data" / "household"
 class Bridged:
     """A bridge in a thread, between the log of a home and a broker."""
 
-    def __init__(self, folder: Path, broker: Broker, outputs=(), **settings):
+    def __init__(self, folder: Path, broker: Broker, outputs=(), node="home", **settings):
         self.said = []
-        place = Home(folder, "home", midday_zone())
+        place = Home(folder, node, midday_zone())
         mqtt = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
-        everybody = dict(outputs) | {"mqtt": MqttPublisher(mqtt, place, self.said.append)}
+        state = folder.parent / "bridge"
+        publisher = MqttPublisher(mqtt, place, state, self.said.append)
+        everybody = dict(outputs) | {"mqtt": publisher}
         self._following = following(place, everybody, self.said)
 
     def __enter__(self):
@@ -122,25 +124,79 @@ def test_what_is_wrong_is_a_problem_of_the_microphone_that_it_is_about(tmp_path,
     home.close()
 
 
-def test_what_an_earlier_bridge_left_at_the_broker_is_cleared(home, broker):
-    left = {
-        f"{ROOT}/mic/class/barking/on": "ON",
-        f"{ROOT}/mic/class/barking/count_today": "7",
-        f"{ROOT}/attic/listening": "online",
-    }
-    home.hears("silence")
+@pytest.mark.fast
+def test_a_microphone_that_the_newest_log_has_no_more_is_cleared_and_nobody_elses_is(
+    tmp_path, broker
+):
+    home = LiveHome(tmp_path / "logs", ("kitchen", "mic"), [*GENERAL, "barking"])
+    for microphone in ("kitchen", "mic"):
+        home.hears("barking", microphone)
+    foreign = {f"{ROOT}/mic/class/howling/on": "ON", f"{ROOT}/attic/listening": "online"}
+    kitchen = f"homeassistant/device/{device_id('home', 'kitchen')}/config"
     with Listener(broker.port) as listener:
-        for topic, value in left.items():
+        for topic, value in foreign.items():
             listener.publish(topic, value, retain=True)
         with Bridged(home.folder, broker):
-            listener.wait_for(f"{ROOT}/attic/listening", "offline")
+            listener.wait_for(f"{ROOT}/kitchen/class/barking/on", "ON")
+            listener.wait_for(f"{ROOT}/mic/class/barking/on", "ON")
+            assert listener.wait_for(kitchen)
+        home.close()
+        time.sleep(1)  # logs are named by the second
+        other = LiveHome(tmp_path / "logs", ("mic",))
+        other.hears("silence")
+        with Bridged(home.folder, broker):
             listener.wait_for(f"{ROOT}/mic/class/barking/on", "")
-            listener.wait_for(f"{ROOT}/mic/class/barking/count_today", "")
+            listener.wait_for(kitchen, "")
             gone = ('"on_barking": {"p": "binary_sensor"}', '"trigger_barking"')
             listener.wait_until(
                 lambda: all(part in listener.values.get(DISCOVERY, "") for part in gone)
             )
-    assert not any("barking/" in topic for topic in settled_values(broker.port, seconds=0.3))
+            time.sleep(1)
+            last = LiveHome(tmp_path / "logs", ("bath",))  # while the bridge runs
+            last.hears("silence", "bath")
+            listener.wait_for(DISCOVERY, "")
+            listener.wait_for(f"{ROOT}/bath/listening", "online")
+    for each in (other, last):
+        each.close()
+    kept = settled_values(broker.port, seconds=0.3)
+    assert {topic: kept[topic] for topic in foreign} == foreign
+    own = {topic for topic in kept if "/mic" in topic or "kitchen" in topic} - {*foreign}
+    assert own == set()
+
+
+@pytest.mark.parametrize(
+    "later",
+    [
+        {"node": "flat"},
+        {"topic": "house/sounds"},
+        {"discovery_topic": "ha"},
+        {"home_assistant": False},
+        {"commands": False},
+    ],
+    ids=str,
+)
+def test_what_the_configuration_names_otherwise_or_no_more_is_cleared(home, broker, later):
+    home.hears("coughing")
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker, commands=True):
+            listener.wait_for(f"{ROOT}/told/coughing", "ON")
+            listener.wait_for(COMMANDS)
+        before = settled_values(broker.port, seconds=0.3)
+        with Bridged(home.folder, broker, **({"commands": True} | later)):
+            gone = COMMANDS if later.keys() - {"topic"} else f"{ROOT}/bridge"
+            listener.wait_for(gone, "")
+            listener.wait_until(lambda: "" not in settled_values(broker.port, seconds=0.3))
+        after = settled_values(broker.port, seconds=0.3)
+    renamed = {
+        "node": lambda topic: "/home/" in topic or "hearthlog-home" in topic,
+        "topic": lambda topic: topic.startswith(ROOT),
+        "discovery_topic": lambda topic: topic.startswith("homeassistant/"),
+        "home_assistant": lambda topic: topic.startswith("homeassistant/"),
+        "commands": lambda topic: topic == COMMANDS or "/told/" in topic,
+    }[next(iter(later))]
+    assert any(map(renamed, before))
+    assert not any(map(renamed, after))
+    assert len(after) >= 1
 
 
 def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
@@ -154,7 +210,7 @@ def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
     with Listener(broker.port) as listener, Bridged(home.folder, broker, home_assistant=False):
         home.heard("coughing", 0.1)
         listener.wait_for(f"{ROOT}/mic/event")
-        assert len(listener.payloads(DISCOVERY)) == 1  # what the broker has from before
+        assert {*listener.payloads(DISCOVERY)[1:]} <= {""}  # what it was told before is cleared
 
 
 def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path, broker):
@@ -251,6 +307,81 @@ def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, 
             listener.wait_for(f"{ROOT}/told/coughing", "ON")
             home.hears("coughing")
             listener.wait_for(f"{COUGHING}/on", "ON")
+
+
+@pytest.mark.fast
+def test_what_somebody_left_at_the_broker_silences_nothing_where_no_commands_are_taken(
+    home, broker
+):
+    home.hears("coughing")
+    start = home.heard("coughing", 0.2)
+    last = json.dumps({"id": f"mic-coughing-{start}"})
+    left = {f"{ROOT}/told/{label}": "OFF" for label in ("coughing", "%23", "speech")}
+    with Listener(broker.port) as listener:
+        for topic, value in (left | {f"{ROOT}/mic/last_event": last}).items():
+            listener.publish(topic, value, retain=True)
+        with Bridged(home.folder, broker) as bridged:
+            listener.wait_for(f"{COUGHING}/on", "ON")
+            assert json.loads(listener.values[f"{ROOT}/mic/heard"])["label"] == "coughing"
+            event = json.loads(listener.wait_for(f"{ROOT}/mic/event"))
+            assert event["id"] == f"mic-coughing-{start}"
+            broker.kill()
+            broker.start()
+            home.hears("silence")
+            listener.wait_for(f"{COUGHING}/on")
+    assert not any(line.startswith("mqtt:") for line in bridged.said)
+
+
+def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_undo_it(
+    home, broker
+):
+    home.hears("coughing")
+    command = {"told": False, "label": "coughing"}
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker, commands=True):
+            listener.wait_for(f"{COUGHING}/on", "ON")
+            listener.publish(f"{ROOT}/command", json.dumps(command))
+            listener.wait_for(f"{COUGHING}/on", "OFF")
+        memory = home.folder.parent / "bridge" / "mqtt.json"
+        with Bridged(home.folder, broker) as bridged:
+            home.heard("coughing", 0.1)
+            home.heard("speech", 0.1)
+            assert json.loads(listener.wait_for(f"{ROOT}/mic/event"))["event_type"] == "speech"
+        (line,) = bridged.said
+        assert line.startswith("mqtt: the broker is not told of coughing; ")
+        assert str(memory) in line
+        content = json.loads(memory.read_text())
+        memory.write_text(json.dumps(content | {"muted": []}))
+        with Bridged(home.folder, broker) as bridged:
+            home.hears("coughing")
+            listener.wait_for(f"{COUGHING}/on", "ON")
+    assert bridged.said == []
+    assert memory.stat().st_mode & 0o77 == 0
+
+
+def test_what_earlier_versions_switched_off_is_taken_over_where_commands_are_taken(home, broker):
+    home.hears("coughing")
+    with Listener(broker.port) as listener:
+        for label in ("coughing", "speech"):
+            listener.publish(f"{ROOT}/told/{label}", "OFF", retain=True)
+        with Bridged(home.folder, broker, commands=True) as bridged:
+            listener.wait_for(f"{COUGHING}/on", "OFF")
+            listener.wait_for(f"{ROOT}/told/music", "ON")
+    assert listener.values[f"{ROOT}/told/speech"] == "OFF"
+    assert bridged.said[0].startswith("mqtt: the broker is not told of coughing, speech; ")
+
+
+def test_two_bridges_with_one_folder_clear_nothing_of_each_other(home, broker):
+    home.hears("coughing")
+    with (
+        Listener(broker.port) as listener,
+        Bridged(home.folder, broker),
+        Bridged(home.folder, broker, client_id="two", topic="other") as other,
+    ):
+        listener.wait_for(f"{COUGHING}/on")
+        listener.wait_for("other/home/mic/class/coughing/on")
+        assert "is used by another bridge" in other.said[0]
+        assert "" not in listener.values.values()
 
 
 def test_home_assistant_has_switches_and_buttons_only_where_commands_are_taken(home, broker):

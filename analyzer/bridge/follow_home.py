@@ -12,11 +12,13 @@ import numpy as np
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
+from hearthlog.analyzer.bridge.listeners import listener_of
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.logs.files import log_name
+from hearthlog.schemas.logs.files import is_layer, log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.logs.provenance import provenance_records, unknown_version
+from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
@@ -77,15 +79,17 @@ def follow_home(
             return
     state.caught_up = False
     messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
-    yielded, current = -math.inf, folder
+    yielded, current, described = -math.inf, folder, folder
     for path, batch in messages:
         if path == folder:  # all that was written has been read
+            if current != described and (names := _listeners(current)) is not None:
+                state.listeners, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
                 state.caught_up = True
                 yielded = time.monotonic()
                 yield state, []
         elif log_name(path).node == home.node:
-            if path != current:
+            if path != current and not is_layer(path):
                 current = path
                 state.begin_log()
                 _check_version(path, damaged)
@@ -112,6 +116,17 @@ def _check_version(log: Path, damaged: Callable[[LogError], None]) -> None:
         for record in provenance_records(file):
             if text := unknown_version(record):
                 damaged(LogError(f"{log}: {text}"))
+
+
+def _listeners(log: Path) -> set[str] | None:
+    """Name those who label, or hear, in a log; None if it cannot be read at this moment."""
+    with suppress(LogError), LogFile(log) as file:
+        read_definitions(file)
+        topics = [channel.topic for channel in file.channels.values()]
+        parsed = [parse_topic(topic) for topic in topics if topic != DIAGNOSTICS]
+        names = (listener_of(name) for name in parsed if name is not None)
+        return {name for name in names if name is not None}
+    return None
 
 
 def _decode(batch: list[RawMessages]) -> list[Columns]:

@@ -176,6 +176,8 @@ class HomeState:
         The last word on each thing: a microphone, the recorder, its disk …
     caught_up : bool
         Whether all that was written before has been read, so that what comes is new.
+    listeners : collection of str or None
+        Names of the states that the newest log can add to; None while that is not known.
     """
 
     def __init__(self) -> None:
@@ -183,6 +185,7 @@ class HomeState:
         self.scenarios: dict[str, MicrophoneState] = {}
         self.health: dict[str, Health] = {}
         self.caught_up = False
+        self.listeners: Collection[str] | None = None
         self._seen = -math.inf  # when anything came, by CLOCK_MONOTONIC
         self._said: set[str] = set()  # subjects of the health in the log that is read
 
@@ -193,6 +196,16 @@ class HomeState:
     def every(self) -> list[MicrophoneState]:
         """Return the states of the microphones, and those of their scenarios."""
         return [*self.microphones.values(), *self.scenarios.values()]
+
+    def is_left_out(self, name: str) -> bool:
+        """Tell whether the recorder has a microphone, or a scenario of it, no more.
+
+        Parameters
+        ----------
+        name : str
+            Of the state.
+        """
+        return self.listeners is not None and name not in self.listeners
 
     def begin_log(self) -> None:
         """Forget the health of what was spoken of in the log before the last one, and no more."""

@@ -97,7 +97,7 @@ def open_outputs(
     if (mqtt := settings.mqtt) is not None:
         from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
 
-        publisher = Reopened(lambda: MqttPublisher(mqtt, home, say), say)
+        publisher = Reopened(lambda: MqttPublisher(mqtt, home, state_folder, say), say)
         outputs["mqtt"] = publisher
     if (figures := settings.prometheus) is not None:
         from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415

@@ -76,7 +76,7 @@ class Connection:
         self._subscriptions = subscriptions
         self._received = received
         self._client_id = client_id
-        self._place = f"{settings.host}:{_port(settings)}"
+        self._place = place_of(settings)
         self._hint = ""
         self._connected: float | None = None  # since when, by CLOCK_MONOTONIC
         self._short = 0  # connections in a row that were
@@ -84,6 +84,7 @@ class Connection:
         self._unsent: dict[str, None] = {}  # topics, in order
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_QUEUED)
         self._sent: tuple[float, mqtt.MQTTMessageInfo] | None = None  # the last event, and when
+        self._last_kept: mqtt.MQTTMessageInfo | None = None  # the last value that was published
         self._delivering: dict[tuple[str, str], mqtt.MQTTMessageInfo] = {}
         self._ready_at = math.inf  # by CLOCK_MONOTONIC: when the broker has sent what it kept
         self._is_new = False  # a connection to which nothing was said yet
@@ -124,6 +125,14 @@ class Connection:
     def repeat(self) -> None:
         """Say all values again at the next `flush`."""
         self._unsent = dict.fromkeys(self._values)
+
+    def is_taken(self) -> bool:
+        """Tell whether the broker has all values."""
+        if self._unsent or self._last_kept is None:
+            return not self._unsent
+        with suppress(RuntimeError, ValueError):
+            return self._last_kept.is_published()
+        return False
 
     def flush(self) -> None:
         """Hand what there is to say to the connection, if there is one."""
@@ -207,7 +216,9 @@ class Connection:
         if not retain:
             properties.MessageExpiryInterval = round(_TIMELY_SECONDS)
         info = self._client.publish(topic, payload, _QOS, retain=retain, properties=properties)
-        if not retain:
+        if retain:
+            self._last_kept = info
+        else:
             self._sent = time.monotonic(), info
         return info.rc in {mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_NO_CONN}  # the second is queued
 
@@ -271,6 +282,11 @@ class Connection:
         for reason in reasons:
             if reason.is_failure:
                 self._say(f"{self._place}: may not read some topics: {reason}")
+
+
+def place_of(settings: MqttSettings) -> str:
+    """Return host and port of a broker."""
+    return f"{settings.host}:{_port(settings)}"
 
 
 def _port(settings: MqttSettings) -> int:

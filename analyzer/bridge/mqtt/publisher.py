@@ -4,6 +4,7 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
@@ -13,14 +14,14 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
-from hearthlog.analyzer.bridge.mqtt.connection import Connection
+from hearthlog.analyzer.bridge.mqtt.announced import Announced, Place
+from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
 from hearthlog.analyzer.bridge.mqtt.discovery import (
     command_discovery,
     device_id,
     discovery,
     home_id,
 )
-from hearthlog.analyzer.bridge.mqtt.held_values import HeldValues
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
+_CONFIG, _TOLD = "config", "told"  # kinds of topics
 _BORN = b"online"  # of Home Assistant
 _MOST_ASKED = 20  # commands that wait
 _MOST_BEGUN = 1000
@@ -45,6 +47,8 @@ class MqttPublisher:
     ----------
     settings : MqttSettings
     home : Home
+    state_folder : Path
+        Of what the bridge remembers.
     say : callable
         Told what is wrong, in a line.
 
@@ -54,50 +58,68 @@ class MqttPublisher:
         If a file of the settings cannot be used.
     """
 
-    def __init__(self, settings: MqttSettings, home: Home, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, settings: MqttSettings, home: Home, state_folder: Path, say: Callable[[str], None]
+    ) -> None:
         self._settings = settings
         self._home = home
         self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
         # Those that there are switches of, and those of which no more.
         self._switches: tuple[list[str], list[str]] | None = None
-        self._held = HeldValues(topics)
         # Events that were not told of yet.
         self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)
         self._ended: deque[Event] = deque(maxlen=_MOST_BEGUN)
         self._is_born = False
-        subscriptions = self._held.subscriptions
-        if settings.home_assistant:
-            subscriptions.append(self._birth_topic)
+        subscriptions = [self._birth_topic] if settings.home_assistant else []
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
+        self._say = say
+        self._announced = Announced(state_folder, place_of(settings), say)
+        self._forgotten: set[str] = set()  # topics that the broker is just told to forget
+        self._has_said_muted = False
+        # Earlier versions left it to the broker to remember what is switched off.
+        self._reads_back = settings.commands and self._announced.is_new
         if settings.commands:
             subscriptions.append(self._command_topic)
+            if self._reads_back:
+                subscriptions.append(topics.told_filter)
         client_id = settings.client_id or f"hearthlog-{home.node}"
-        self._connection = Connection(
-            settings,
-            client_id,
-            topics.of_home("bridge"),
-            say,
-            subscriptions=subscriptions,
-            received=self._take,
-        )
+        try:
+            self._connection = Connection(
+                settings,
+                client_id,
+                topics.of_home("bridge"),
+                say,
+                subscriptions=subscriptions,
+                received=self._take,
+            )
+        except BaseException:
+            self._announced.close()
+            raise
+        self._announced.add(topics.of_home("bridge"), Place("bridge"))
         self._commands = self._take_commands() if settings.commands else None
 
     def update(self, news: News) -> None:
         """Say what is new."""
-        self._connection.keep(self._topics.of_home("recorder"), _ONLINE[news.state.is_recording()])
+        self._keep(Place("recorder"), _ONLINE[news.state.is_recording()])
         for each in news.state.every():
+            if news.state.is_left_out(each.name):
+                self._classes.pop(each.name, None)
+                continue
             if each.classes != self._classes.get(each.name, []):
                 self._describe(each)
             self._say_state(each, news)
-        for microphone in news.state.microphones.values():
-            self._say_problem(microphone, news.state)
-        self._clear_others(news.state)
+            if each.name in news.state.microphones:
+                self._say_problem(each, news.state)
+        self._clear_gone(news.state)
         self._describe_switches()
         self._begun += news.begun
         self._ended += news.ended
         if self._connection.is_ready():
+            self._reads_back = False
+            self._announced.save()  # before anything is published that is to be cleared one day
+            self._say_muted()
             self._tell_begun(news)
             self._send_events("event_ended", self._recent(self._ended, news), news)
         self._obey(news.state)
@@ -105,14 +127,18 @@ class MqttPublisher:
             self._is_born = False
             self._connection.repeat()
         self._connection.flush()
+        if not self._reads_back:
+            self._announced.save()
 
     def _tell_begun(self, news: News) -> None:
         """Tell of the events that began, but for those that an earlier bridge told of."""
-        events = self._held.new_events(self._recent(self._begun, news))
+        events = self._announced.new_events(self._recent(self._begun, news))
         self._send_events("event", events, news)
-        for event in (each for each in events if self._held.is_told(each.label)):
-            topic = self._topics.of_microphone(event.microphone, "last_event")
-            self._connection.keep(topic, json.dumps(event_fields(event, news)))
+        for event in events:
+            self._announced.note_event(event)
+            if self._announced.is_told(event.label):
+                place = Place("last_event", event.microphone)
+                self._keep(place, json.dumps(event_fields(event, news)))
 
     def _recent(self, waiting: deque[Event], news: News) -> list[Event]:
         """Take the events that waited for a broker, but for those that are no news any more."""
@@ -121,7 +147,7 @@ class MqttPublisher:
         return recent
 
     def _send_events(self, kind: str, events: Sequence[Event], news: News) -> None:
-        for event in (each for each in events if self._held.is_told(each.label)):
+        for event in (each for each in events if self._announced.is_told(each.label)):
             topic = self._topics.of_microphone(event.microphone, kind)
             self._connection.send(topic, json.dumps(event_fields(event, news)))
 
@@ -146,13 +172,14 @@ class MqttPublisher:
         if self._commands is not None:
             self._commands.close()
         self._connection.close()
+        self._announced.close()
 
     def _take_commands(self) -> "Commands":
         # Imported here: who commands nothing needs nothing that corrects logs.
         from hearthlog.analyzer.bridge.mqtt.commands import Commands  # noqa: PLC0415
 
         home = self._home
-        return Commands(home.folder, home.node, self._held.switch, self._answers.append)
+        return Commands(home.folder, home.node, self._announced.switch, self._answers.append)
 
     def _obey(self, state: HomeState) -> None:
         """Have the commands carried out that came, and answer those that are."""
@@ -179,72 +206,112 @@ class MqttPublisher:
         elif message.topic == self._command_topic:
             if not message.retain:  # else it was meant for whoever was there then
                 self._asked.append(bytes(message.payload))
-        else:
-            self._held.take(message)
+        elif self._reads_back and message.retain and message.payload == b"OFF":
+            label = self._topics.parse_told(message.topic)
+            if label is not None:
+                self._announced.switch(label, is_told=False)
+
+    def _say_muted(self) -> None:
+        """Say once which classes the broker is not told of, and how to change that."""
+        muted = self._announced.muted()
+        if muted and not self._has_said_muted:
+            remedy = (
+                f'a command such as {{"told": true, "label": "{muted[0]}"}} changes that'
+                if self._settings.commands
+                else "that was a command, and commands are not taken now: to change it, take them "
+                f"out of the list `muted` in {self._announced.path}, and start the bridge again"
+            )
+            self._say(f"mqtt: the broker is not told of {', '.join(muted)}; {remedy}")
+        self._has_said_muted = True
+
+    def _topic(self, place: Place) -> str:
+        """Name the topic that is about something."""
+        kind, microphone, label = place
+        node = self._topics.node
+        if kind == _CONFIG:
+            device = device_id(node, microphone) if microphone else home_id(node)
+            return f"{self._settings.discovery_topic}/device/{device}/config"
+        if kind == _TOLD:
+            return self._topics.of_told(label)
+        if label:
+            return self._topics.of_class(microphone, label, kind)
+        if microphone:
+            return self._topics.of_microphone(microphone, kind)
+        return self._topics.of_home(kind)
+
+    def _keep(self, place: Place, value: str) -> None:
+        """Publish a value that the broker keeps, and remember that it does."""
+        topic = self._topic(place)
+        self._announced.add(topic, place)
+        self._forgotten.discard(topic)
+        self._connection.keep(topic, value)
 
     def _describe(self, microphone: MicrophoneState) -> None:
         """Tell Home Assistant of the classes of a microphone, before the first value of one."""
         name, classes = microphone.name, microphone.classes
         self._classes[name] = list(classes)
-        self._held.add_classes(name, classes)
-        self._tell_home_assistant(name)
-
-    def _tell_home_assistant(self, microphone: str, gone: tuple[str, ...] = ()) -> None:
         if self._settings.home_assistant:
-            topic = self._config_topic(device_id(self._topics.node, microphone))
-            config = discovery(self._topics, microphone, self._classes[microphone], gone)
-            self._connection.keep(topic, json.dumps(config))
+            gone = sorted(self._announced.labels(name).difference(classes))
+            config = discovery(self._topics, name, classes, gone)
+            self._keep(Place(_CONFIG, name), json.dumps(config))
 
     def _describe_switches(self) -> None:
         """Tell Home Assistant what it may command; nothing where it may not."""
-        if not self._settings.home_assistant:
-            return
-        topic = self._config_topic(home_id(self._topics.node))
-        if not self._settings.commands:
-            self._connection.forget(topic)
+        if not (self._settings.home_assistant and self._settings.commands):
             return
         classes = sorted({name for names in self._classes.values() for name in names})
-        switches = classes, self._held.other_switches(classes)
+        switches = classes, sorted(self._announced.labels("").difference(classes))
         if switches != self._switches:
             self._switches = switches
             config = command_discovery(self._topics, *switches)
-            self._connection.keep(topic, json.dumps(config))
+            self._keep(Place(_CONFIG), json.dumps(config))
 
-    def _config_topic(self, device: str) -> str:
-        return f"{self._settings.discovery_topic}/device/{device}/config"
+    def _clear_gone(self, state: HomeState) -> None:
+        """Have the broker forget what this bridge, or an earlier one, gave it and is no more."""
+        if self._forgotten and self._connection.is_taken():
+            self._announced.remove(self._forgotten)
+            self._forgotten.clear()
+        known = {each.name for each in state.every()}
+        for topic, place in list(self._announced.topics.items()):
+            if self._is_gone(topic, place, state):
+                self._connection.forget(topic)
+                self._forgotten.add(topic)
+            elif place.kind == "listening" and place.microphone not in known:
+                self._connection.keep(topic, _ONLINE[False])  # nothing of late is known of it
 
-    def _clear_others(self, state: HomeState) -> None:
-        """Have the broker forget the classes that earlier models had."""
-        for name in self._held.other_microphones([each.name for each in state.every()]):
-            self._connection.keep(self._topics.of_microphone(name, "listening"), _ONLINE[False])
-        for name, classes in self._classes.items():
-            gone = self._held.other_classes(name, classes)
-            if gone:
-                self._tell_home_assistant(name, tuple(gone))
-            for label in gone:
-                for kind in ("on", "count_today", "count_night", "last_heard"):
-                    self._connection.forget(self._topics.of_class(name, label, kind))
+    def _is_gone(self, topic: str, place: Place, state: HomeState) -> bool:
+        kind, microphone, label = place
+        if topic != self._topic(place):  # the recorder, or a topic, has another name now
+            return True
+        if kind == _CONFIG and not self._settings.home_assistant:
+            return True
+        if not microphone:
+            return kind in {_CONFIG, _TOLD} and not self._settings.commands
+        if state.is_left_out(microphone):
+            return True
+        classes = self._classes.get(microphone)
+        return bool(label) and classes is not None and label not in classes
 
     def _say_state(self, microphone: MicrophoneState, news: News) -> None:
         def say(kind: str, value: str) -> None:
-            self._connection.keep(self._topics.of_microphone(microphone.name, kind), value)
+            self._keep(Place(kind, microphone.name), value)
 
         say("listening", _ONLINE[microphone.is_listening()])
         if not microphone.label:
             return
         confidence = round(microphone.confidence, 3)
-        label = microphone.label if self._held.is_told(microphone.label) else UNKNOWN
+        label = microphone.label if self._announced.is_told(microphone.label) else UNKNOWN
         say("heard", json.dumps({"label": label, "confidence": confidence}))
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             say("level", f"{microphone.level_dbfs:.1f}")
         for label in (each for each in microphone.classes if each != SILENCE):
-            is_told = self._held.is_told(label)
+            is_told = self._announced.is_told(label)
             if self._settings.commands:
-                self._connection.keep(self._topics.of_told(label), _ON[is_told])
+                self._keep(Place(_TOLD, label=label), _ON[is_told])
             for kind, value in class_values(microphone, label, news):
-                topic = self._topics.of_class(microphone.name, label, kind)
-                self._connection.keep(topic, value if is_told or kind != "on" else _ON[False])
+                shown = value if is_told or kind != "on" else _ON[False]
+                self._keep(Place(kind, microphone.name, label), shown)
 
     def _say_problem(self, microphone: MicrophoneState, state: HomeState) -> None:
         others = state.microphones.keys() - {microphone.name}
@@ -254,8 +321,7 @@ class MqttPublisher:
             if health.level and subject.partition(" ")[0] not in others
         ]
         value = {"state": _ON[bool(bad)], "text": shortened("; ".join(bad), _LONGEST)}
-        topic = self._topics.of_microphone(microphone.name, "problem")
-        self._connection.keep(topic, json.dumps(value))
+        self._keep(Place("problem", microphone.name), json.dumps(value))
 
 
 def class_values(microphone: MicrophoneState, label: str, news: News) -> Iterator[tuple[str, str]]:

@@ -52,21 +52,15 @@ class Topics(NamedTuple):
         """Name the topic that says whether a class is told of."""
         return f"{self.root}/told/{_part(label)}"
 
-    def parse_class(self, topic: str, kind: str) -> tuple[str, str] | None:
-        """Return the microphone and the class of a topic; None if it is no such topic."""
-        form = rf"{re.escape(self.root)}/([^/]+){_CLASS_PART}([^/]+)/{kind}"
-        match = re.fullmatch(form, topic)
-        return None if match is None else (match[1], unquote(match[2]))
+    @property
+    def told_filter(self) -> str:
+        """What all names of `of_told` match."""
+        return f"{self.root}/told/+"
 
     def parse_told(self, topic: str) -> str | None:
         """Return the class of a topic that says whether it is told of; None of another one."""
         name = topic.removeprefix(f"{self.root}/told/")
         return None if name == topic else unquote(name)
-
-    def parse_microphone(self, topic: str, kind: str) -> str | None:
-        """Return the microphone of a topic; None if it is no such topic."""
-        match = re.fullmatch(rf"{re.escape(self.root)}/([^/]+)/{kind}", topic)
-        return None if match is None else match[1]
 
 
 def _part(label: str) -> str:

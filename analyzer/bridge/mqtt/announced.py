@@ -1,0 +1,185 @@
+"""What a broker was given to keep, and what it is not told of: remembered between two starts.
+
+Nothing of this is read back from the broker: whoever may write there could change it.
+"""
+
+import fcntl
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from threading import Lock
+from typing import NamedTuple
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.small_file import read_whole
+
+_FILE, _LOCK = "mqtt.json", ".mqtt.lock"
+_LIMIT = 4 << 20  # bytes
+
+
+class Place(NamedTuple):
+    """What a topic is about; parts that do not apply are empty."""
+
+    kind: str
+    microphone: str = ""
+    label: str = ""
+
+
+class _Content(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    broker: str = ""
+    topics: dict[str, Place] = {}
+    muted: list[str] = []
+    last_events: dict[str, str] = {}  # id of the last event that was told of, by microphone
+
+
+class Announced:
+    """The topics that a broker keeps of this bridge, classes it is not told of, events it knows.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the state of the bridge; two bridges cannot share one.
+    broker : str
+        Host and port. What another broker was given is forgotten.
+    say : callable
+        Told what is wrong, in a line.
+
+    Attributes
+    ----------
+    topics : dict of str to Place
+    is_new : bool
+        Whether nothing was remembered.
+    """
+
+    def __init__(self, folder: Path, broker: str, say: Callable[[str], None]) -> None:
+        self.path = folder / _FILE
+        self._say = say
+        self._lock = Lock()
+        self._is_changed = False
+        self._descriptor = self._take_lock(folder)
+        self.is_new = self._descriptor is None or not self.path.exists()
+        content = _Content() if self.is_new else self._load()
+        self._broker = broker
+        self.topics = content.topics if content.broker == broker else {}
+        self._muted = set(content.muted)
+        self._last_events = content.last_events
+
+    def add(self, topic: str, place: Place) -> None:
+        """Note a topic to which a value is published that the broker keeps."""
+        with self._lock:
+            if self.topics.get(topic) != place:
+                self.topics[topic] = place
+                self._is_changed = True
+
+    def remove(self, topics: Iterable[str]) -> None:
+        """Note that the broker has forgotten topics."""
+        with self._lock:
+            for topic in topics:
+                self._is_changed |= self.topics.pop(topic, None) is not None
+
+    def microphones(self) -> set[str]:
+        """Return the microphones that the broker knows."""
+        return {place.microphone for place in self.topics.values() if place.microphone}
+
+    def labels(self, microphone: str) -> set[str]:
+        """Return the classes of a microphone that the broker knows; of none, the switches."""
+        places = list(self.topics.values())
+        return {each.label for each in places if each.label and each.microphone == microphone}
+
+    def muted(self) -> list[str]:
+        """Return the classes that the broker is not told of."""
+        with self._lock:
+            return sorted(self._muted)
+
+    def is_told(self, label: str) -> bool:
+        """Tell whether the broker is told when a class is heard."""
+        with self._lock:
+            return label not in self._muted
+
+    def switch(self, label: str, is_told: bool) -> None:  # noqa: FBT001  it is handed over
+        """Have the broker told of a class or not."""
+        with self._lock:
+            (self._muted.discard if is_told else self._muted.add)(label)
+            self._is_changed = True
+
+    def new_events(self, events: Sequence[Event]) -> list[Event]:
+        """Return the events that no earlier bridge has told of.
+
+        Parameters
+        ----------
+        events : sequence of Event
+            In the order in which they began; those before the last one that was told of were told
+            of, too.
+        """
+        last = {
+            event.microphone: number
+            for number, event in enumerate(events)
+            if self._last_events.get(event.microphone) == event.id
+        }
+        return [e for n, e in enumerate(events) if n > last.get(e.microphone, -1)]
+
+    def note_event(self, event: Event) -> None:
+        """Note that an event was told of."""
+        with self._lock:
+            self._last_events[event.microphone] = event.id
+            self._is_changed = True
+
+    def save(self) -> None:
+        """Write down what has changed; it is on the disk on return."""
+        with self._lock:
+            if self._descriptor is None or not (self._is_changed or self.is_new):
+                return
+            content = _Content(
+                broker=self._broker,
+                topics=self.topics,
+                muted=sorted(self._muted),
+                last_events=self._last_events,
+            )
+            self._is_changed = self.is_new = False
+            try:
+                with replaced_file(self.path) as temporary:
+                    temporary.touch(0o600)
+                    temporary.write_text(content.model_dump_json(), "utf-8")
+            except (LogError, OSError) as error:
+                self._say(f"mqtt: {error}; topics that go are not cleared after the next start")
+
+    def close(self) -> None:
+        """Write down what has changed, and let another bridge use the folder."""
+        self.save()
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _take_lock(self, folder: Path) -> int | None:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            self._say(f"mqtt: {folder}: cannot be used ({error.strerror}); nothing is remembered")
+            return None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            self._say(
+                f"mqtt: {folder}: is used by another bridge; nothing is remembered: give each one "
+                "a `state` of its own in [bridge]"
+            )
+            return None
+        return descriptor
+
+    def _load(self) -> _Content:
+        try:
+            data = read_whole(self.path, "memory of what was published", _LIMIT, LogError)
+            return _Content.model_validate_json(data)
+        except (HearthlogError, ValidationError):
+            self._say(
+                f"mqtt: {self.path}: cannot be read, and begins anew; all classes are told of"
+            )
+            return _Content()
