@@ -1,17 +1,17 @@
 """The state of the recorders of a folder now: whether they run, hear, write, and what to do."""
 
-import fcntl
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
 from hearthlog.recorder.rest import paused_until
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import find_logs, log_name
+from hearthlog.schemas.logs.files import find_logs, is_active, log_name
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
@@ -70,31 +70,68 @@ def examine_live(folder: Path) -> list[State]:
     """
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; name the one that the recorder writes to")
-    locks = sorted(folder.glob(".*.lock"))
-    states = [state for lock in locks for state in _recorder(folder, lock)]
-    if not locks:
+    locks = node_locks(folder)
+    logs: dict[str, list[Path]] = {lock.node: [] for lock in locks}
+    with suppress(LogError):
+        for log in find_logs(folder):
+            name = log_name(log)
+            if name.node in logs and not name.layer:
+                logs[name.node].append(log)
+    states = [state for lock in locks for state in _recorder(lock, locks, logs)]
+    if not states:
         states.append(State("error", "recorder", f"nothing was ever recorded in {folder}"))
     return [*states, *_folder(folder)]
 
 
-def _recorder(folder: Path, lock: Path) -> Iterator[State]:
-    node = lock.name.removeprefix(".").removesuffix(".lock")
-    process = _holder(lock)
-    statuses = _last_statuses(folder, node)
+def _recorder(
+    lock: NodeLock, locks: Sequence[NodeLock], logs: Mapping[str, Sequence[Path]]
+) -> Iterator[State]:
+    node, own = lock.node, logs[lock.node]
+    if not (lock.is_held or lock.process or own):
+        return  # no recorder has used it
+    statuses = _last_statuses(own, node)
     newest = max((status.time for status in statuses), default=None)
-    if process is None:
-        since = "" if newest is None else f" since {_moment(newest)}"
-        text = f"{node} does not run{since}: start it, or see `journalctl -u hearthlog` for why"
-        yield State("error", "recorder", text)
-        return
-    yield State("ok", "recorder", f"{node} runs (process {process})")
     silent = None if newest is None else time.time() - newest / NANOSECONDS
-    if silent is None or abs(silent) > _SPEAKS_SECONDS:
+    speaks = silent is not None and abs(silent) <= _SPEAKS_SECONDS
+    if lock.is_held is False or (lock.is_held is None and not speaks):
+        yield _stopped(lock, newest, locks, logs)
+        return
+    process = f"process {lock.process}" if lock.process else "its lock may not be read by you"
+    yield State("ok", "recorder", f"{node} runs ({process})")
+    if not speaks:
         since = "nothing yet" if silent is None else f"nothing for {abs(silent):.0f} s"
         text = f"{node} wrote {since}: see the disk below, or restart it"
         yield State("error", "recorder", text)
     for status in statuses:
         yield from _of_status(status)
+
+
+def _stopped(
+    lock: NodeLock,
+    newest: int | None,
+    locks: Sequence[NodeLock],
+    logs: Mapping[str, Sequence[Path]],
+) -> State:
+    """Describe a recorder that does not run.
+
+    One that completed its last log, and after which another one of the folder has recorded, was
+    stopped or renamed: that is no alarm. One that was killed leaves its log unfinished.
+    """
+    since = "" if newest is None else f" since {_moment(newest)}"
+    others = [other for other in locks if other.node != lock.node]
+    end = _last_start(logs[lock.node])
+    is_followed = any(other.is_held or _last_start(logs[other.node]) > end for other in others)
+    is_complete = not any(is_active(log) for log in logs[lock.node])
+    gone = f"delete {lock.path} if no recorder has this name any more"
+    if is_followed and is_complete:
+        text = f"{lock.node} was stopped{since}, others record here: start it, or {gone}"
+        return State("warning", "recorder", text)
+    text = f"{lock.node} does not run{since}: start it, or see `journalctl -u hearthlog` for why"
+    return State("error", "recorder", f"{text}; {gone}" if is_followed else text)
+
+
+def _last_start(logs: Sequence[Path]) -> str:
+    return max((log_name(log).time for log in logs), default="")
 
 
 def _of_status(status: _Status) -> Iterator[State]:
@@ -108,34 +145,14 @@ def _of_status(status: _Status) -> Iterator[State]:
         yield State("warning", "clock", text)
 
 
-def _holder(lock: Path) -> int | None:
-    """Return the process that holds a lock; None if nobody does."""
-    try:
-        descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        with suppress(ValueError):
-            return int(os.pread(descriptor, 20, 0))
-        return 0
-    else:
-        return None
-    finally:
-        os.close(descriptor)
-
-
-def _last_statuses(folder: Path, node: str) -> list[_Status]:
+def _last_statuses(logs: Sequence[Path], node: str) -> list[_Status]:
     """Return the last word on each thing in the newest log of a recorder that says anything."""
-    with suppress(LogError):
-        logs = [log for log in find_logs(folder) if log_name(log).node == node]
-        for log in reversed(logs[-3:]):  # the newest may have been begun this moment
-            with suppress(LogError):
-                columns = read_columns([log], [DIAGNOSTICS], fields=["status"]).values()
-                told = [status for each in columns for status in _statuses(each, node)]
-                if last := {each.subject: each for each in told}:
-                    return [last[subject] for subject in sorted(last)]
+    for log in reversed(logs[-3:]):  # the newest may have been begun this moment
+        with suppress(LogError):
+            columns = read_columns([log], [DIAGNOSTICS], fields=["status"]).values()
+            statuses = [status for each in columns for status in _statuses(each, node)]
+            if last := {each.subject: each for each in statuses}:
+                return [last[subject] for subject in sorted(last)]
     return []
 
 

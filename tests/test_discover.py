@@ -32,6 +32,7 @@ from hearthlog.analyzer.discover.hours import usual_hours
 from hearthlog.analyzer.discover.read_sounds import read_sounds
 from hearthlog.analyzer.discover.summary_file import summary_path
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.live import examine_live
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write_marks
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
@@ -100,6 +101,12 @@ def run(hearthlog, *arguments):
 
 def as_json(hearthlog, *arguments):
     return json.loads(run(hearthlog, *arguments, "--json").stdout)
+
+
+def test_the_lock_of_the_groups_is_not_taken_for_a_recorder(grouped_home):
+    assert (grouped_home / ".groups.safetensors.lock").exists()
+    told = [state.text for state in examine_live(grouped_home) if state.subject == "recorder"]
+    assert told == [f"nothing was ever recorded in {grouped_home}"]
 
 
 def test_each_sound_that_recurs_is_a_group_of_its_own(two_days):

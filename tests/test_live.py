@@ -1,6 +1,7 @@
 """`hearthlog doctor --live` says what is wrong with a recorder now, and what to do."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,8 @@ from test_swap import wait_for
 
 from hearthlog.analyzer import ping
 from hearthlog.analyzer.live import examine_live
+from hearthlog.recorder.log.folder_lock import FolderLock
+from hearthlog.schemas.logs.files import active_path, find_logs, log_path
 
 __all__ = ["small_disk"]
 
@@ -98,6 +101,51 @@ def test_a_folder_into_which_files_were_recorded_has_no_recorder(recorded, tmp_p
     logs = tmp_path / "logs"
     shutil.copytree(recorded, logs)
     assert states(logs)["recorder"][0] == "error"
+
+
+def recorders(logs):
+    return [(s.level, s.text) for s in examine_live(logs) if s.subject == "recorder"]
+
+
+def add_node(logs, node, start, *, unfinished=False):
+    """Copy a log of `home` to another node, with the lock that such a recorder leaves."""
+    path = log_path(logs, node, start)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    log = next(log for log in find_logs(logs) if log.name.startswith("home_"))
+    shutil.copy(log, active_path(path) if unfinished else path)
+    (logs / f".{node}.lock").write_text("4194305\n")
+
+
+def test_a_file_that_ends_in_lock_is_a_recorder_only_if_one_has_written_it(recorded, tmp_path):
+    logs = tmp_path / "logs"
+    shutil.copytree(recorded, logs)
+    for name in (".groups.safetensors.lock", ".voices.safetensors.lock", ".empty.lock"):
+        (logs / name).touch()
+    (logs / ".text.lock").write_text("not a process")
+    (logs / ".folder.lock").mkdir()
+    os.mkfifo(logs / ".pipe.lock")
+    (logs / ".link.lock").symlink_to(logs / ".home.lock")
+    with FolderLock(logs, "home"):
+        found = recorders(logs)
+        assert found[0] == ("ok", f"home runs (process {os.getpid()})")
+        assert all(text.startswith("home ") for _, text in found)
+
+
+def test_a_recorder_that_was_renamed_is_no_alarm_and_one_that_was_killed_is(recorded, tmp_path):
+    logs = tmp_path / "logs"
+    shutil.copytree(recorded, logs)
+    add_node(logs, "former", 1_700_000_000 * 10**9)
+    add_node(logs, "killed", 1_700_000_000 * 10**9, unfinished=True)
+    with FolderLock(logs, "home"):
+        found = {text.split()[0]: (level, text) for level, text in recorders(logs)}
+    level, text = found["former"]
+    assert level == "warning"
+    assert text.endswith(f"or delete {logs}/.former.lock if no recorder has this name any more")
+    level, text = found["killed"]
+    assert (level, text.startswith("killed does not run since 20")) == ("error", True)
+    (logs / ".former.lock").unlink()
+    assert all("former" not in text for _, text in recorders(logs))
+    assert ("error", "home does not run") in [(lv, text[:17]) for lv, text in recorders(logs)]
 
 
 def test_a_folder_that_others_may_look_into_is_a_warning(tmp_path):

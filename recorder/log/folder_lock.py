@@ -3,15 +3,21 @@
 import errno
 import fcntl
 import os
+import re
+import stat
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import is_node_name
 
 # With these a disk may be used again later; the recorder waits for that.
 _PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
+_NUMBER = re.compile(rb"([1-9]\d{0,9})\n?")
+_NUMBER_SIZE = 20  # bytes
 
 
 class FolderLock:
@@ -108,7 +114,7 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        process = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
+        process = os.pread(descriptor, _NUMBER_SIZE, 0).decode("ascii", "replace").strip()
         raise LogError(
             f"{folder}: is recorded by {node!r} already (process {process or 'unknown'}); stop "
             "that one, or give this one another --node or --output"
@@ -119,3 +125,64 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
     except OSError as error:
         if error.errno not in _PASSING:
             raise LogError(f"{folder}: cannot be written ({error.strerror})") from error
+
+
+class NodeLock(NamedTuple):
+    """The lock of a node, as it was found in a folder.
+
+    Attributes
+    ----------
+    path : Path
+    node : str
+    process : int
+        The last one that held it; 0 if the file does not name one.
+    is_held : bool or None
+        None if the file may not be read by this account.
+    """
+
+    path: Path
+    node: str
+    process: int
+    is_held: bool | None
+
+
+def node_locks(folder: Path) -> list[NodeLock]:
+    """List the locks of recorders in a folder, by name; other files that end in `.lock` are none.
+
+    A lock is a regular file, no link, has the name that `FolderLock` gives it, and holds the number
+    of a process or nothing.
+    """
+    return list(_node_locks(folder))
+
+
+def _node_locks(folder: Path) -> Iterator[NodeLock]:
+    for path in sorted(folder.glob(".*.lock")):
+        node = path.name.removeprefix(".").removesuffix(".lock")
+        if not is_node_name(node):
+            continue
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        except PermissionError:
+            if stat.S_ISREG(path.lstat().st_mode):
+                yield NodeLock(path, node, 0, None)
+            continue
+        except OSError:  # a link, or gone
+            continue
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                continue
+            content = os.pread(descriptor, _NUMBER_SIZE, 0)
+            number = _NUMBER.fullmatch(content)
+            if number or not content:
+                process = int(number[1]) if number else 0
+                yield NodeLock(path, node, process, _is_held(descriptor))
+        finally:
+            os.close(descriptor)
+
+
+def _is_held(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False

@@ -39,12 +39,17 @@ def check_node_name(name: str) -> str:
     LogError
         If the name has another form.
     """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+    if not is_node_name(name):
         raise LogError(
             f"node name {name!r} cannot be part of a file name: use at most 64 letters, digits, "
             "'-' and '_'"
         )
     return name
+
+
+def is_node_name(name: str) -> bool:
+    """Return whether `check_node_name` takes a name."""
+    return re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name) is not None
 
 
 def log_path(root: Path, node: str, start: int) -> Path:
