@@ -63,10 +63,10 @@ check: $(VENV)/.dev build/checked/hearthlog
 
 # The folders under the name they are installed by, for the linters, which follow no finder of
 # setuptools: links, so they are what is edited. Point the type checker of an editor here too.
-build/checked/hearthlog: Makefile $(wildcard tools/package/*.py)
+build/checked/hearthlog: Makefile $(wildcard tools/package/hearthlog/*.py)
 	mkdir -p $@
 	ln -sfn $(addprefix $(CURDIR)/,analyzer models recorder schemas tools) $@
-	ln -sfn $(filter-out %/__pycache__,$(wildcard $(CURDIR)/tools/package/*)) $@
+	ln -sfn $(filter-out %/__pycache__,$(wildcard $(CURDIR)/tools/package/hearthlog/*)) $@
 	touch $@
 
 # The documentation site, from docs/ and the docstrings of the public API.

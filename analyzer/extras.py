@@ -1,5 +1,17 @@
 """What to install where a package is missing that the recorder alone does without."""
 
+import json
+import os
+import shlex
+import sys
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.text import listed
+
 _CLUSTER = ("dask", "distributed", "fsspec", "s3fs", "upath")
 _EXTRAS = {
     "rerun": "viewer",
@@ -9,16 +21,84 @@ _EXTRAS = {
     "onnxruntime": "onnx",
     "paho": "bridge",
     "apprise": "bridge",
+    "prometheus_client": "bridge",
 } | dict.fromkeys(_CLUSTER, "cluster")
+_NAMES = {"sklearn": "scikit-learn", "paho": "paho-mqtt", "rerun": "Rerun", "rerun_cli": "Rerun"}
 
 
-def remedy(module: str) -> str:
-    """Say what to do where a module cannot be imported.
+def require(*modules: str) -> None:
+    """Check that modules of an extra can be imported, before any work is done that needs them.
 
     Parameters
     ----------
-    module : str
-        Its import name, such as `sklearn`, or that of a part of it.
+    *modules : str
+        Their import names.
+
+    Raises
+    ------
+    HearthlogError
+        If one is not installed.
     """
-    extra = _EXTRAS.get(module.partition(".")[0], "analyzer")
-    return f"try: pip install '.[{extra}]' in a clone of hearthlog"
+    absent = [module for module in modules if find_spec(module) is None]
+    if absent:
+        raise HearthlogError(missing(*absent))
+
+
+def missing(*modules: str) -> str:
+    """Say that modules are not installed, and what to do.
+
+    Parameters
+    ----------
+    *modules : str
+        Their import names, such as `sklearn`, or those of parts of them.
+    """
+    tops = [module.partition(".")[0] for module in modules]
+    names = list(dict.fromkeys(_NAMES.get(top, top) for top in tops))
+    are = "is" if len(names) == 1 else "are"
+    return f"{listed(names, 'and')} {are} not installed; {remedy(*tops)}"
+
+
+def remedy(*modules: str) -> str:
+    """Say how to install the extras of modules, in the way in which hearthlog was installed.
+
+    Parameters
+    ----------
+    *modules : str
+        Their import names, such as `sklearn`, or those of parts of them.
+    """
+    extra = ",".join(
+        dict.fromkeys(_EXTRAS.get(module.partition(".")[0], "headless") for module in modules)
+    )
+    given, options = _origin()
+    name, _, address = given.partition(" @ ")
+    what = f"{name}[{extra}]" + (f" @ {address}" if address else "")
+    where = " in a clone of hearthlog" if given == "." else ""
+    return f"try: {_installer()} {options}{shlex.quote(what)}{where}"
+
+
+def _installer() -> str:
+    prefix, program = Path(sys.prefix), Path(sys.executable)
+    if (prefix / "pipx_metadata.json").exists():
+        return "pipx install --force"
+    if find_spec("pip") is None:
+        command = f"uv pip install --python {shlex.quote(sys.executable)}"
+    elif (pip := program.with_name("pip")).exists():
+        command = f"{shlex.quote(str(pip))} install"
+    else:
+        command = f"{shlex.quote(str(program))} -m pip install"
+    return command if os.access(prefix, os.W_OK) else f"sudo {command}"
+
+
+def _origin() -> tuple[str, str]:
+    """Return what pip was given (PEP 610), `.` if that is not known, and its options."""
+    try:
+        record = json.loads(distribution("hearthlog").read_text("direct_url.json") or "{}")
+        url = urlsplit(record["url"])
+        vcs = record.get("vcs_info", {}).get("vcs")
+        editable = record.get("dir_info", {}).get("editable")
+    except (PackageNotFoundError, ValueError, KeyError, AttributeError, OSError):
+        return ".", ""
+    path = unquote(url.path)
+    if url.scheme != "file":
+        return f"hearthlog @ {f'{vcs}+' if vcs else ''}{url.geturl()}", ""
+    return (path, "--editable " if editable else "") if Path(path).exists() else (".", "")

@@ -133,7 +133,8 @@ def _install(machine):
         f"/opt/source/{name}" for name in ("analyzer", "models", "recorder", "schemas", "tools")
     )
     inner = (
-        f"/opt/source/tools/package/{path.name}" for path in (ROOT / "tools/package").glob("*.py")
+        f"/opt/source/tools/package/hearthlog/{path.name}"
+        for path in (ROOT / "tools/package/hearthlog").glob("*.py")
     )
     machine.run("ln", "-s", *parts, *inner, f"{site}/hearthlog")
     script = f"#!{PREFIX}/bin/python\nfrom hearthlog.tools.cli.main import main\nmain()\n"

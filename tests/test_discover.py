@@ -224,7 +224,7 @@ def test_a_box_without_the_analyzer_names_what_another_one_has_grouped(grouped_h
     for asked, status, says in (
         (["--name", "1=dish"], 0, "marks of dish"),
         (["--undo", "1"], 0, "marks taken back"),
-        ([], 1, "sklearn is not installed; try: pip install"),
+        ([], 1, "scikit-learn is not installed; try: "),
     ):
         arguments = [sys.executable, "-c", _WITHOUT, "discover", grouped_home, *asked]
         done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False)

@@ -15,7 +15,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
-DATA = {"py.typed", "page.html", "page.css", "page.js", "voice_space.safetensors"}
+PACKAGE = PurePosixPath("tools/package/hearthlog")
+DATA = {"page.html", "page.css", "page.js", "voice_space.safetensors"}
 APART = {("tools", "bench"), ("tools", "month"), ("tools", "ros")}  # measured, or built, by itself
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"
@@ -28,15 +29,17 @@ def installed_as(path):
     path = PurePosixPath(path)
     if path.parts[0] not in FOLDERS or path.parts[:2] in APART:
         return None
+    if path.parts[:2] == ("tools", "package"):
+        own = path.is_relative_to(PACKAGE)
+        return f"hearthlog/{path.relative_to(PACKAGE)}" if own else None
     kept = path.name in DATA or path.is_relative_to(CLIPS) or path.is_relative_to(STARTERS)
     if path.suffix not in {".py", ".msg", ".toml", ".service"} and not kept:
         return None
-    inner = path.relative_to("tools/package") if path.parts[1] == "package" else path
-    return f"hearthlog/{inner}"
+    return f"hearthlog/{path}"
 
 
 def build(kind, source, folder):
-    code = f"from setuptools import build_meta; print(build_meta.build_{kind}({str(folder)!r}))"
+    code = f"from hatchling import build; print(build.build_{kind}({str(folder)!r}))"
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False
     )
@@ -57,7 +60,10 @@ def tracked():
 def sdist(tracked, tmp_path_factory):
     """The sdist, unpacked, of a checkout in which somebody has worked."""
     folder = tmp_path_factory.mktemp("sdist")
-    litter = ["tests/typescript/node_modules/a/b.js", "tests/__pycache__/c.pyc", "demo/day.rrd"]
+    litter = [
+        *("tests/typescript/node_modules/a/b.js", "tests/__pycache__/c.pyc", "demo/day.rrd"),
+        *("models/home-1.safetensors", "models/.champion.json", "ten.txt", "logs/a.mcap"),
+    ]
     for name in [*tracked, *litter]:
         target = folder / "checkout" / name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -85,16 +91,13 @@ def files(folder):
 
 def test_every_folder_with_code_is_a_package_but_what_stands_apart():
     every = {path.parent for name in FOLDERS for path in (ROOT / name).rglob("*.py")}
-    folders = {folder.relative_to(ROOT).parts for folder in every}
-    inside = {parts for parts in folders if parts[:2] not in APART | {("tools", "package")}}
-    names = {".".join(("hearthlog", *parts)) for parts in inside} | {"hearthlog"}
-    assert set(CONFIGURATION["tool"]["setuptools"]["packages"]) == names
+    apart = APART | {("tools", "package")}
+    inside = {folder for folder in every if folder.relative_to(ROOT).parts[:2] not in apart}
+    assert {folder for folder in inside if not (folder / "__init__.py").exists()} == set()
 
 
 def test_the_sdist_holds_what_its_tests_need_and_no_litter(sdist, tracked):
-    made = {"PKG-INFO", "setup.cfg"}
-    names = {name for name in files(sdist) if not name.startswith("hearthlog.egg-info/")}
-    assert names - made == tracked - {".gitignore"}
+    assert files(sdist) - {"PKG-INFO"} == tracked
 
 
 def test_the_wheel_holds_one_name_and_all_that_is_under_it(wheel, tracked):
@@ -119,6 +122,28 @@ def test_the_modules_of_the_wheel_find_each_other_under_its_name_alone(wheel, tm
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert set(result.stdout.splitlines()) == {str(path) for path in wheel.rglob("*.py")}
+
+
+def test_a_script_beside_a_clone_that_is_named_hearthlog_imports_the_package(
+    sdist, tmp_path, tmp_path_factory
+):
+    clone = shutil.copytree(sdist, tmp_path / "hearthlog")
+    with zipfile.ZipFile(build("editable", clone, tmp_path_factory.mktemp("editable"))) as file:
+        (pth,) = (name for name in file.namelist() if name.endswith(".pth"))
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "e"], check=True)
+        (site,) = tmp_path.glob("e/lib/python*/site-packages")
+        file.extract(pth, site)
+    (clone / "analyzer/later").mkdir()  # by `git pull`
+    (clone / "analyzer/later/__init__.py").touch()
+    (tmp_path / "snip.py").write_text(
+        "import hearthlog, hearthlog.analyzer.later\n"
+        "print(issubclass(hearthlog.HearthlogError, Exception), hearthlog.__version__)\n"
+    )
+    result = subprocess.run(
+        [tmp_path / "e/bin/python", "snip.py"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (result.stderr, result.stdout.split()[0]) == ("", "True")
 
 
 BOX = ("schemas", "models", "recorder")

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaincinv
 
-from hearthlog.analyzer.accuracy.count_range import FEWEST, CheckedRates, checked_rates
+from hearthlog.analyzer.accuracy.count_range import FEWEST, CheckedRates, beta_quantile, checked_rates
 from hearthlog.analyzer.accuracy.events import (
     AROUND,
     MINUTE,
@@ -74,7 +73,7 @@ def _interval(some: float, whole: float) -> tuple[float, float] | None:
     """Return the central 90 % of a beta distribution, with the prior of Jeffreys."""
     if not whole:
         return None
-    low, high = betaincinv(some + 0.5, whole - some + 0.5, (0.05, 0.95)).tolist()
+    low, high = (beta_quantile(some + 0.5, whole - some + 0.5, share) for share in (0.05, 0.95))
     return low, high
 
 

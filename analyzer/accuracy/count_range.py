@@ -1,6 +1,7 @@
 """From minutes that were checked to the range that a count of events lies in."""
 
 from dataclasses import dataclass
+from math import exp, lgamma, log, log1p
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -16,6 +17,7 @@ _ENDS = (5.0, 95.0)  # percentiles: nine times in ten the count is between them
 _MISSED_IN_QUIET = (0.5, 60.0)  # of all classes together
 _MISSED_IN_SOUND = (1.0, 5.0)  # of all classes together
 _RIGHT, _WRONG = 0.3, 0.7
+_PRECISION = 1e-15  # of a share of a beta distribution
 
 
 class Strata(NamedTuple):
@@ -131,3 +133,44 @@ def checked_rates(
         missed[:, each] = rng.gamma(unlabelled + events * share) / (checked + minutes)
     right = rng.beta(total(matched) + _RIGHT, total(labelled - matched) + _WRONG)
     return CheckedRates(right, missed, len(labelled), bool(true.any()))
+
+
+def beta_quantile(a: float, b: float, share: float) -> float:
+    """Return a quantile of a beta distribution, as `scipy.special.betaincinv` does.
+
+    The recorder's machine reads how right its labels are, and has no scipy.
+
+    Parameters
+    ----------
+    a, b : float
+        Of the distribution, more than 0.
+    share : float
+        Of the distribution below the quantile, 0 to 1.
+    """
+    low, high = 0.0, 1.0
+    while low < (middle := (low + high) / 2) < high:
+        if _beta_share(a, b, middle) < share:
+            low = middle
+        else:
+            high = middle
+    return middle
+
+
+def _beta_share(a: float, b: float, x: float) -> float:
+    """Return the share of a beta distribution below x, between 0 and 1 (the continued fraction)."""
+    if x > (a + 1) / (a + b + 2):  # where it converges slowly
+        return 1 - _beta_share(b, a, 1 - x)
+    density = exp(lgamma(a + b) - lgamma(a) - lgamma(b) + a * log(x) + b * log1p(-x))
+    numerator, denominator = 1.0, 1 / (1 - (a + b) * x / (a + 1))
+    fraction, step, m = denominator, 0.0, 0
+    while abs(step - 1) > _PRECISION:
+        m += 1
+        for term in (
+            m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
+            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1)),
+        ):
+            denominator = 1 / (1 + term * denominator)
+            numerator = 1 + term / numerator
+            step = numerator * denominator
+            fraction *= step
+    return density * fraction / a

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -213,6 +211,9 @@ def _matches(reference: Events, predicted: Events) -> int:
     count = np.searchsorted(predicted.starts, reference.starts + COLLAR, "right") - first
     if count.sum() > _MOST_PAIRS:
         raise DataError("too many events start within 0.2 s of each other; this is no labelling")
+    from scipy.sparse import coo_array  # noqa: PLC0415  which most readers of events do without
+    from scipy.sparse.csgraph import maximum_bipartite_matching  # noqa: PLC0415
+
     row, column = ranges(first, count)
     tolerance = np.maximum(COLLAR, _PART_OF_LENGTH * (reference.ends - reference.starts))
     near = np.abs(reference.ends[row] - predicted.ends[column]) <= tolerance[row]

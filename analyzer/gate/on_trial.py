@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.special import betaincinv
 
+from hearthlog.analyzer.accuracy.count_range import beta_quantile
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_labellings
@@ -122,7 +122,7 @@ def gain_interval(right: Right) -> tuple[float, float]:
     ----------
     right : Right
     """
-    low, high = betaincinv(right.gained + 0.5, right.lost + 0.5, _ENDS).tolist()
+    low, high = (beta_quantile(right.gained + 0.5, right.lost + 0.5, share) for share in _ENDS)
     return low, high
 
 

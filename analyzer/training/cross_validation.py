@@ -5,7 +5,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from joblib import delayed
 
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.workers.parallel import in_parallel
@@ -41,6 +40,8 @@ def cross_validate(
     np.ndarray [shape=(len(methods), n, C)], float64
         Decision values; -inf for a class that was not learned, NaN for segments that no fold tests.
     """
+    from joblib import delayed  # noqa: PLC0415  part of the extra `headless`
+
     folds = list(folds)
     decisions = np.full((len(methods), len(examples.target), classes), np.nan)
     tasks = list(product(range(len(methods)), folds))

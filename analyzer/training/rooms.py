@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import low_power
@@ -173,6 +172,8 @@ def reverberated(
     np.ndarray [shape=(n,)], float64
         Of the same power.
     """
+    from scipy.signal import fftconvolve  # noqa: PLC0415  what reads a home needs no rooms
+
     time = np.arange(int(seconds * SAMPLE_RATE)) / SAMPLE_RATE
     response = rng.standard_normal(len(time)) * 10.0 ** (-3.0 * time / seconds)
     response[:_DIRECT_SAMPLES] = 0.0

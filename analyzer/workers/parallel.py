@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
-import joblib
-
 from hearthlog.analyzer.workers.cluster import Cluster, connected
 
 _MOST_THREADS = 4
@@ -34,6 +32,8 @@ def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
     if cluster is not None:
         yield from _on(cluster, calls)
         return
+    import joblib  # noqa: PLC0415  part of the extra `headless`
+
     threads = min(os.cpu_count() or 1, _MOST_THREADS)
     yield from joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
 

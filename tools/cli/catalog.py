@@ -43,6 +43,9 @@ def catalog(
     Files that have not changed since the last catalogue are not read again. Exit status 3: a file
     is unfinished or damaged.
     """
+    from hearthlog.analyzer.extras import require
+
+    require("pyarrow")
     from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, UNFINISHED
     from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts, scenario_amounts
 

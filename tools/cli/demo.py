@@ -24,6 +24,9 @@ def demo(
     ] = 24.0,
 ) -> None:
     """Compose a day of a home, record it with the starter model, and draw the result."""
+    from hearthlog.analyzer.extras import require
+
+    require("scipy", "rerun", "rerun_cli")
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import save_timeline
     from hearthlog.analyzer.review.viewer.process import hidden_options

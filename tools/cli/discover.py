@@ -115,6 +115,9 @@ def _group(
     home: "HomeLogs", file: Path, looked: "Looked", least: int, zone: "tzinfo"
 ) -> tuple["HomeSummary", list[str]]:
     """Group what is heard, and keep the groups and their summary."""
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy")
     from hearthlog.analyzer.discover.discover import discover as find_groups
     from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
     from hearthlog.analyzer.discover.read_sounds import read_sounds

@@ -95,6 +95,9 @@ def evaluate_log(
 
     Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
     """
+    from hearthlog.analyzer.extras import require
+
+    require("scipy", "matplotlib")
     from hearthlog.analyzer.evaluation.evaluate_log import (
         evaluate_labelling,
         read_labelling,
@@ -146,6 +149,9 @@ def evaluate_model(
     as_json: Json = False,
 ) -> None:
     """Score a model on labelled clips."""
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation import evaluate_model as evaluation
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
@@ -201,6 +207,9 @@ def evaluate_method(
     as_json: Json = False,
 ) -> None:
     """Cross-validate a way to learn: learn from a part of the clips, and try it on the rest."""
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method as cross_validate
 
     check_output("--plot", plot, ".png", "a picture")
@@ -236,6 +245,9 @@ def search(
     as_json: Json = False,
 ) -> None:
     """Cross-validate a way to learn with other costs and gammas, and list the best first."""
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib")
     from hearthlog.analyzer.evaluation import grid_search
 
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
@@ -267,6 +279,9 @@ def adaptation(
 
     Each collection of the clips stands for a home once, and the others are learned from.
     """
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib")
     from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
 
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):

@@ -31,6 +31,9 @@ def paper(
     as_json: Json = False,
 ) -> None:
     """Put the figures of the paper beside those of its method and of ours, on these clips."""
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib")
     from hearthlog.analyzer.evaluation.paper import PAPER_F1, reproduce
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import LABELS

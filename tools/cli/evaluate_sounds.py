@@ -47,6 +47,9 @@ def scenes(
 
     Exit status 3: a class has no clip, or the model has learned from some of the clips.
     """
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation.evaluate_scenes import (
         SceneOptions,
         alarms_per_hour,
@@ -114,6 +117,9 @@ def robustness(
 
     Exit status 3: the model has learned from some of the clips.
     """
+    from hearthlog.analyzer.extras import require
+
+    require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation import robustness as evaluation
 
     check_output("--plot", plot, ".png", "a picture")

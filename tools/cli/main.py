@@ -121,9 +121,9 @@ def _usage_text(error: typer.TyperException) -> str:
 
 def _message(error: Exception) -> str:
     if isinstance(error, ModuleNotFoundError):
-        from hearthlog.analyzer.extras import remedy
+        from hearthlog.analyzer.extras import missing
 
-        return f"{error.name} is not installed; {remedy(error.name or '')}"
+        return missing(error.name or "")
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return str(error)

@@ -45,6 +45,9 @@ def report(
         wrong_use("--day and --week exclude each other")
     if output is not None and output.suffix != ".html":
         wrong_use(f"--output {output}: a page is named *.html")
+    from hearthlog.analyzer.extras import require
+
+    require("jinja2", "matplotlib")
     first = None if day is None and week is None else _first_day(day, week)
 
     from hearthlog.analyzer.logs.home_logs import find_home_logs

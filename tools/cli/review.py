@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperCommand
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.text import printable
 from hearthlog.schemas.times import NANOSECONDS, time_text
 from hearthlog.tools.cli.browser import print_recording, show_page
@@ -100,10 +101,10 @@ def review(
         wrong_use("--save makes a file: --web and --port go without it")
     if day is not None and (start or end):
         wrong_use("--day is a span of its own: leave out --start and --end")
+    from hearthlog.analyzer.extras import require
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-    from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
 
     limits = parse_span(start, end) if day is None else _day(logs, day, timezone)
 
@@ -120,7 +121,15 @@ def review(
     if save is not None and queue is not None:
         _save_queue(save, logs, chosen)
         return
+    try:
+        require("rerun", "rerun_cli")
+    except HearthlogError as error:
+        if queue is None:
+            raise
+        raise HearthlogError(f"{error}; or without a viewer, as a text file: --save ten.txt") from error
     if save is not None:
+        from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
+
         check_output(save)
         timeline = read()
         save_timeline(timeline, save, checked_classes(timeline, find_home_logs(logs)))

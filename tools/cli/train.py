@@ -84,9 +84,11 @@ def train(
     One of a home is judged there; whatever is found, it is written, and the exit status is 0.
     `hearthlog models promote` ends with 1 if it may not label.
     """
+    from hearthlog.analyzer.extras import require
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
     from hearthlog.schemas.messages.topics import check_scenario_name
 
+    require("sklearn", "scipy", "joblib")
     speakers = scenario == _SPEAKERS
     if speakers or data:
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Self
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.extras import missing
 from hearthlog.analyzer.ports import free_port, hidden_address
 
 _WAIT_SECONDS = 60
@@ -38,7 +38,7 @@ def program() -> Path:
     spec = find_spec("rerun_cli")
     path = Path(spec.origin).with_name("rerun") if spec and spec.origin else None
     if path is None or not path.exists():
-        raise DataError(f"Rerun's viewer is not installed; {remedy('rerun_cli')}")
+        raise DataError(missing("rerun_cli"))
     return path
 
 

@@ -5,6 +5,7 @@ are imported when they are used: `import hearthlog` costs a recorder nothing.
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hearthlog._version import __version__
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     )
     from hearthlog._training import Comparison, compare, train
     from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
+
+if not Path(__file__).with_name("schemas").is_dir():  # a clone, installed to be edited
+    __path__.append(str(Path(__file__).parents[3]))
 
 __all__ = [
     "Bearings",
