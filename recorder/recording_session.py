@@ -46,6 +46,7 @@ class RecordingSummary:
     frames_lost: int = 0
     gaps: int = 0  # while it was running
     models_refused: int = 0  # files that could not be used
+    labels: int = 0  # frames that have one
 
 
 class RecordingSession:
@@ -146,6 +147,8 @@ class RecordingSession:
         notices = self._clips.before(stream.pipeline.microphone, event)
         self._log.write(stream.pipeline.push(event))
         labels = stream.pipeline.last_labels
+        if isinstance(event, Frames) and labels is not None:
+            self.summary.labels += len(labels.frames)
         notices += self._clips.after(stream.pipeline.microphone, event, labels)
         self._now = event_time(event)
         self._log.write(self._clip_messages(stream, notices))

@@ -39,7 +39,8 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.progress import Progress, ignore_progress

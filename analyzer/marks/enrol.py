@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,8 @@ from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.recorder.sources.decoding import audio_seconds
 from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -50,6 +50,7 @@ class Enrolled:
 
     log: Path
     seconds: float
+    warning: str = ""  # what is missing of the file
 
 
 def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
@@ -87,8 +88,10 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     length = audio_seconds(audio)
     if seconds is not None:
         length = min(length, seconds)
-    source: SoundSource = FileSource([audio], _free_start(home, label, length))
-    return _enrol(home, label, source, length, threading.Event())
+    source = FileSource([audio], _free_start(home, label, length))
+    enrolled = _enrol(home, label, source, length, threading.Event())
+    warning = "; ".join(source.warnings)
+    return [replace(each, warning=warning) for each in enrolled]
 
 
 def enrol_microphone(

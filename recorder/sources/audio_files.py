@@ -1,19 +1,23 @@
 """Audio files in place of a microphone."""
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Event as Flag
+from typing import NamedTuple
 
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import OK, Event, SourceHealth
-from hearthlog.recorder.sources.decoding import audio_seconds, check_channels, read_audio
+from hearthlog.recorder.events import OK, Event, Gap, SourceHealth
+from hearthlog.recorder.sources.decoding import check_channels, read_audio
+from hearthlog.recorder.sources.file_times import FileTime
 from hearthlog.recorder.sources.framing import frames_of
+from hearthlog.recorder.sources.open_audio import audio_seconds, is_audio
 from hearthlog.recorder.sources.wall_clock import check_times
-from hearthlog.schemas.arrays import Float32, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -31,6 +35,9 @@ class FileSource:
     paths : sequence of Path
     start : int
         Time of the first sample in nanoseconds of UTC.
+    times : sequence of (FileTime or None), optional
+        When each file begins, as of `arrange`; None, or no sequence: where the one before it ends.
+        A later start makes a gap; an earlier one is not possible, and the file follows.
     realtime : bool
         Whether to yield each frame only once as much time has passed since the first one.
     channels : int or None
@@ -41,6 +48,10 @@ class FileSource:
     Attributes
     ----------
     realtime : bool
+    frames : int
+        Number of frames that were yielded.
+    warnings : list of str
+        What of the files was not heard or not at its time, as far as they were read.
 
     Raises
     ------
@@ -49,20 +60,26 @@ class FileSource:
         recorded, or other channels than the array; if a log cannot have their times.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         paths: Sequence[Path],
         start: int,
         *,
+        times: Sequence[FileTime | None] = (),
         realtime: bool = False,
         channels: int | None = None,
         progress: Progress = ignore_progress,
     ) -> None:
         for path in paths:
             check_channels(path, channels)
-        self._seconds = sum(audio_seconds(path) for path in paths)
-        check_times(start, start + int(self._seconds * NANOSECONDS))
+        lengths = [audio_seconds(path) for path in paths]
+        self._seconds = sum(lengths)
+        self._times = list(times) or [None] * len(paths)
+        last = max((time.start for time in self._times if time), default=start)
+        check_times(start, last + int(self._seconds * NANOSECONDS))
         self.device = _name(paths)
+        self.frames = 0
+        self.warnings: list[str] = []
         self._paths = paths
         self._start = start
         self.realtime = realtime
@@ -70,7 +87,9 @@ class FileSource:
         self._progress = progress
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield the frames, and the health of the source every ten seconds of sound.
+        """Yield the frames, the gaps between files, and the health of the source.
+
+        The health comes every ten seconds of sound.
 
         Parameters
         ----------
@@ -80,41 +99,59 @@ class FileSource:
         Yields
         ------
         Event
-            `Frames` and `SourceHealth`, in the order of time.
+            `Frames`, `Gap` and `SourceHealth`, in the order of time.
 
         Raises
         ------
         SourceError
-            If a file turns out to be damaged, or if all together are shorter than a frame.
+            If a file cannot be opened any more, or if all together are shorter than a frame.
         """
         began = time.monotonic()
-        first = 0
-        for samples in self._frames():
-            frames = frames_of(first, samples, self._stamps(first, len(samples)))
+        next_frame, end, report = 0, self._start, 0
+        for item in self._frames():
+            if isinstance(item, _Pause):
+                lost = max(round((item.until - end) / FRAME_NANOSECONDS), 1)
+                yield Gap(end, item.until, item.reason, lost)
+                next_frame, end = next_frame + lost, item.until
+                continue
+            stamps = end + np.arange(len(item)) * FRAME_NANOSECONDS
+            frames = frames_of(next_frame, item, stamps)
             if self.realtime:
-                due = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
+                due = began + (self.frames + len(item)) * FRAME_NANOSECONDS / NANOSECONDS
                 stop.wait(max(due - time.monotonic(), 0.0))
             if stop.is_set():
                 return
-            if first % _HEALTH_FRAMES == 0:
-                yield SourceHealth(int(frames.stamps[0]), OK, "reading", {"device": self.device})
+            if self.frames >= report:
+                yield SourceHealth(int(stamps[0]), OK, "reading", {"device": self.device})
+                report = self.frames + _HEALTH_FRAMES
             yield frames
-            first += len(samples)
-            self._progress(first * FRAME_NANOSECONDS / NANOSECONDS / self._seconds)
-        if first == 0:
+            next_frame += len(item)
+            end += len(item) * FRAME_NANOSECONDS
+            self.frames += len(item)
+            self._progress(min(self.frames * FRAME_NANOSECONDS / NANOSECONDS / self._seconds, 1.0))
+        if not self.frames:
             files = ", ".join(str(path) for path in self._paths)
-            raise SourceError(f"{files}: shorter than one frame of 50 ms")
+            raise SourceError(
+                "; ".join(self.warnings) or f"{files}: shorter than one frame of 50 ms"
+            )
 
-    def _stamps(self, first: int, count: int) -> Int64:
-        return self._start + np.arange(first, first + count) * FRAME_NANOSECONDS
-
-    def _frames(self) -> Iterator[Float32]:
+    def _frames(self) -> Iterator["Float32 | _Pause"]:
         """Yield blocks of frames whose number divides the interval of the health reports."""
         size = (_REALTIME_FRAMES if self.realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
         shape = () if self._channels is None else (self._channels,)
         held = np.empty((0, *shape), np.float32)
-        for path in self._paths:
-            for block in read_audio(path, channels=self._channels):
+        samples, begin, before = 0, self._start, ""  # since the last gap
+        for path, moment in zip(self._paths, self._times, strict=True):
+            end = begin + samples * NANOSECONDS // SAMPLE_RATE
+            if before and moment is not None and self._is_later(path, moment, end):
+                rest = len(held) - len(held) % FRAME_SAMPLES
+                if rest:
+                    yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
+                yield _Pause(moment.start, f"between the files {before} and {path.name}")
+                held, samples, begin = held[:0], 0, moment.start
+            before = path.name
+            for block in read_audio(path, channels=self._channels, incomplete=self.warnings.append):
+                samples += len(block)
                 held = np.concatenate([held, block])
                 whole = len(held) - len(held) % size
                 for start in range(0, whole, size):
@@ -123,6 +160,84 @@ class FileSource:
         rest = len(held) - len(held) % FRAME_SAMPLES
         if rest:
             yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
+
+    def _is_later(self, path: Path, moment: FileTime, end: int) -> bool:
+        """Whether a file begins after the end of those before it, as far as it says."""
+        late = moment.start - end
+        step = max(moment.step, FRAME_NANOSECONDS)
+        if late <= -step:
+            self.warnings.append(
+                f"{path}: begins {-late / NANOSECONDS:.2f} s before the end of the file before it; "
+                "it is logged behind that, with later times"
+            )
+        return late >= step
+
+
+class _Pause(NamedTuple):
+    """A time between two files that no file is of."""
+
+    until: int  # in nanoseconds of UTC
+    reason: str
+
+
+def find_audio(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Replace folders by the audio files in them and in their folders.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files, which are taken as they are, and folders.
+
+    Returns
+    -------
+    list of Path
+        Those of a folder in the order of their names, without hidden ones.
+    list of str
+        Why others of a folder were left out, in a line each.
+
+    Raises
+    ------
+    SourceError
+        If no audio that can be read is in a folder.
+    """
+    found: list[Path] = []
+    refused: list[str] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = []
+        for file in filter(lambda file: is_audio(file.name), files_below(path)):
+            try:
+                check_channels(file, None)
+                inside.append(file)
+            except SourceError as error:
+                refused.append(f"left out: {error}")
+        if not inside:
+            more = f" ({refused[-1]})" if refused else ", such as a.wav or a.flac"
+            raise SourceError(f"{path}: no audio file in this folder that can be read{more}")
+        found += inside
+    return found, refused
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Yield all files in a folder and its folders, also those behind links, sorted by folder.
+
+    Hidden folders are left out.
+
+    Parameters
+    ----------
+    folder : Path
+    """
+    seen: set[tuple[int, int]] = set()
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        status = Path(parent).stat()
+        if (status.st_dev, status.st_ino) in seen:  # a link that leads back
+            folders.clear()
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (Path(parent, name) for name in sorted(names))
 
 
 def _name(paths: Sequence[Path]) -> str:

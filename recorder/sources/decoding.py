@@ -1,26 +1,27 @@
 """Audio files as one stream of samples at 16 kHz: mono, or those of an array of microphones."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import soundfile
 import soxr
 from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.sources.open_audio import BLOCK_SECONDS, RATES, open_audio
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import SAMPLE_RATE
 
-_BLOCK_SECONDS = 10.0
-_RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
-
 
 def read_audio(
-    path: Path, start: float = 0.0, end: float = math.inf, *, channels: int | None = None
+    path: Path,
+    start: float = 0.0,
+    end: float = math.inf,
+    *,
+    channels: int | None = None,
+    incomplete: Callable[[str], object] = str,
 ) -> Iterator[Float32]:
     """Read an audio file of any rate and channel count, block by block.
 
@@ -33,6 +34,9 @@ def read_audio(
         The part to read, in seconds, as far as the file goes.
     channels : int or None
         Those of an array, as `check_channels` takes them, which are kept apart.
+    incomplete : callable
+        Told in a sentence that the file is damaged or cut short, if that is so; what is there was
+        yielded then.
 
     Yields
     ------
@@ -46,12 +50,13 @@ def read_audio(
         768 kHz.
     """
     mix = _mono if channels is None else _finite
-    with _opened(path) as audio:
-        first, last = (round(min(time * audio.samplerate, audio.frames)) for time in (start, end))
-        if first:
-            audio.seek(first)
-        blocks = (mix(block) for block in _blocks(audio, last - first))
-        yield from _resampled(blocks, audio.samplerate, channels)
+    with open_audio(path) as audio:
+        first = round(start * audio.rate)
+        last = math.inf if math.isinf(end) else round(end * audio.rate)
+        blocks = (mix(block) for block in audio.blocks(first, last))
+        yield from _resampled(blocks, audio.rate, channels)
+        if fault := audio.fault():
+            incomplete(f"{path}: {fault}; what is there was read")
 
 
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
@@ -77,27 +82,14 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
     sound = np.asarray(sound)
     if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
         raise SourceError(f"sound of shape {sound.shape} and type {sound.dtype} cannot be heard")
-    if rate not in _RATES:
+    if rate not in RATES:
         raise SourceError(f"a sample rate of {rate} Hz cannot be recorded")
     scale = np.float32(1 << 8 * sound.itemsize - 1) if sound.dtype.kind == "i" else np.float32(1)
-    size = int(rate * _BLOCK_SECONDS)
+    size = int(rate * BLOCK_SECONDS)
     starts = range(0, len(sound), size)
     rows = sound if sound.ndim == 2 else sound[:, np.newaxis]
     blocks = (_mono(rows[start : start + size].astype(np.float32) / scale) for start in starts)
     return np.concatenate([np.empty(0, np.float32), *_resampled(blocks, rate)])
-
-
-def audio_seconds(path: Path) -> float:
-    """Return the length of an audio file in seconds, as its header says.
-
-    Raises
-    ------
-    SourceError
-        If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
-        768 kHz.
-    """
-    with _opened(path) as audio:
-        return float(audio.frames / audio.samplerate)
 
 
 def check_channels(path: Path, channels: int | None) -> None:
@@ -112,40 +104,14 @@ def check_channels(path: Path, channels: int | None) -> None:
     Raises
     ------
     SourceError
-        If it has more or fewer; as `audio_seconds`.
+        If it has more or fewer; as `open_audio`.
     """
-    with _opened(path) as audio:
+    with open_audio(path) as audio:
         if channels not in {None, audio.channels}:
             raise SourceError(
                 f"{path}: has {audio.channels} channels, and `array` names places for {channels}: "
                 "name one for each channel of the file, or leave `array` out"
             )
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
-    if not path.exists():
-        raise SourceError(f"{path}: no such file")
-    if not path.is_file():
-        raise SourceError(f"{path}: cannot be read as audio (Not a regular file)")
-    try:
-        with soundfile.SoundFile(path) as audio:
-            if audio.samplerate not in _RATES:
-                message = f"{path}: a sample rate of {audio.samplerate} Hz cannot be recorded"
-                raise SourceError(message)
-            if audio.frames == 0:
-                raise SourceError(f"{path}: holds no audio")
-            yield audio
-    except soundfile.LibsndfileError as error:
-        reason = error.error_string.rstrip(".")
-        raise SourceError(f"{path}: cannot be read as audio ({reason})") from error
-
-
-def _blocks(audio: soundfile.SoundFile, frames: int) -> Iterator[Float32]:
-    size = int(audio.samplerate * _BLOCK_SECONDS)
-    while len(block := audio.read(min(size, frames), dtype="float32", always_2d=True)):
-        frames -= len(block)
-        yield block
 
 
 def _mono(block: Float32) -> Float32:

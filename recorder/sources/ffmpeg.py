@@ -1,11 +1,19 @@
-"""ffmpeg, which reads sound from the network: how it is started, and what it means when it ends."""
+"""ffmpeg, which reads sound from the network, and audio files that libsndfile cannot read."""
 
 import ctypes
+import os
 import re
 import resource
+import select
 import shutil
 import signal
+import struct
 import subprocess
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
 from urllib.parse import urlsplit
 
 from hearthlog.recorder.addresses import public_name
@@ -17,7 +25,17 @@ _MOST_BYTES = 256_000_000  # of memory, whatever a server sends
 _PROTOCOLS = {"rtsp": "tcp", "http": "http,https,tls,tcp", "https": "http,https,tls,tcp"}
 # No playlists: those lead to other addresses, and to files.
 _FORMATS = "rtsp,sdp,wav,w64,aiff,au,mp3,aac,flac,ogg,matroska,mov,mpegts"
+# Of files. No playlists either, nor what makes one file of several.
+_FILE_FORMATS = (
+    "w64,wav,aiff,au,caf,voc,mp3,aac,ac3,eac3,flac,ogg,matroska,mov,mpeg,mpegts,asf,amr,amrnb,"
+    "amrwb,avi,flv,wv,tta,ape,dsf"
+)
+_FILE_SECONDS = 30.0  # after which a file without more sound is given up
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+_AU = struct.Struct(">4s5I")  # magic, where the samples begin, their bytes, kind, rate, channels
+_AU_FLOAT = 6
+_KEPT_BYTES = 4000  # of what it writes to standard error
+_SAMPLE_BYTES = 4
 
 # The first that is found in what ffmpeg says: what it means, and what to do.
 _MEANINGS = {
@@ -51,6 +69,163 @@ def check_ffmpeg() -> None:
             "ffmpeg is missing, which reads sound from the network: "
             "install it (Debian: apt install ffmpeg)"
         )
+
+
+def has_ffmpeg() -> bool:
+    """Whether there is an ffmpeg."""
+    return shutil.which("ffmpeg") is not None
+
+
+class FileDecoder:
+    """The first sound of a file, decoded by ffmpeg, which may open this file only.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    rate, channels : int
+
+    Raises
+    ------
+    SourceError
+        If ffmpeg finds no sound in it; its text is the reason alone, empty if ffmpeg does not know
+        the format.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.rate = self.channels = 0
+        self._messages = b""
+        self._held = b""
+        self._process = _start_decoding(path)
+        try:
+            reason = self._read_header()
+        except SourceError:
+            self.close()
+            raise
+        if reason:
+            self.close()
+            raise SourceError("" if reason == _NO_SOUND else reason)
+
+    def _read_header(self) -> str:
+        """Read up to the first sample; return why there is none."""
+        head = self._read(_AU.size)
+        if len(head) == _AU.size:
+            _, place, _, kind, self.rate, self.channels = _AU.unpack(head)
+            self._read(place - _AU.size)
+            if kind == _AU_FLOAT and self.channels:
+                self._held = self._read(_SAMPLE_BYTES * self.channels)
+        return "" if self._held else self.fault() or _NO_SOUND
+
+    def read(self, frames: int) -> bytes:
+        """Return the next samples as big-endian float32, fewer at the end.
+
+        Parameters
+        ----------
+        frames : int
+            Samples of each channel.
+
+        Raises
+        ------
+        SourceError
+            If ffmpeg does not go on.
+        """
+        size = _SAMPLE_BYTES * self.channels
+        data = self._read(frames * size)
+        return data[: len(data) // size * size]
+
+    def fault(self) -> str:
+        """Say why the sound ended before the file did; empty if it did not."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        self._drain()
+        text = self._messages.decode(errors="replace")
+        if not text.strip() and not self._process.returncode:
+            return ""
+        found = (meaning for known, meaning in _FILE_MEANINGS.items() if re.search(known, text))
+        return next(found, _NO_SOUND)
+
+    def close(self) -> None:
+        """End ffmpeg."""
+        self._process.kill()
+        self._process.communicate()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _read(self, size: int) -> bytes:
+        """Return so many bytes, or what is left."""
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        sound, messages = self._process.stdout.fileno(), self._process.stderr.fileno()
+        parts = [self._held]
+        length, self._held = len(self._held), b""
+        until = time.monotonic() + _FILE_SECONDS
+        while length < size:
+            left = max(until - time.monotonic(), 0.0)
+            ready = select.select([sound, messages], [], [], left)[0]
+            if not ready:
+                raise SourceError(f"ffmpeg finds no more sound in it within {_FILE_SECONDS:.0f} s")
+            if sound in ready:
+                if not (part := os.read(sound, min(size - length, 1 << 20))):
+                    break
+                parts.append(part)
+                length += len(part)
+                until = time.monotonic() + _FILE_SECONDS
+            elif not self._drain():
+                break
+        return b"".join(parts)
+
+    def _drain(self) -> bool:
+        """Keep the first bytes of standard error; return whether there may be more."""
+        assert self._process.stderr is not None
+        os.set_blocking(self._process.stderr.fileno(), False)
+        with suppress(BlockingIOError):
+            while part := os.read(self._process.stderr.fileno(), 1 << 16):
+                self._messages = (self._messages + part)[:_KEPT_BYTES]
+            return False
+        return True
+
+
+_NO_SOUND = "ffmpeg finds no sound in it"
+_FILE_MEANINGS = {
+    "matches no streams|does not contain any stream": "there is no sound in it",
+    "moov atom not found": "it was not completed: the table at its end is missing (moov)",
+    "[Dd]ecoder .*not found|[Uu]nknown decoder|Decoding requested, but no decoder": (
+        "this ffmpeg cannot decode its sound"
+    ),
+    "Cannot allocate memory": "ffmpeg needs too much memory for it",
+}
+
+
+def _start_decoding(path: Path) -> subprocess.Popen[bytes]:
+    process = subprocess.Popen(  # noqa: S603
+        [
+            *("ffmpeg", "-nostdin", "-hide_banner", "-nostats", "-loglevel", "error"),
+            *("-protocol_whitelist", "file,pipe", "-format_whitelist", _FILE_FORMATS),
+            *("-threads", "1", "-i", f"file:{path.absolute()}", "-map", "0:a:0"),
+            *("-c:a", "pcm_f32be", "-f", "au", "pipe:1"),
+        ],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=0,
+        env=os.environ | {"LC_ALL": "C"},
+        start_new_session=True,  # Ctrl-C is for the recorder
+    )
+    with suppress(ProcessLookupError):  # which has threads, so that nothing runs before the start
+        resource.prlimit(process.pid, resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (0, 0))
+    return process
 
 
 def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:

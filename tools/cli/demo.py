@@ -37,7 +37,7 @@ def demo(
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.errors import HearthlogError
     from hearthlog.tools.cli.info import info
-    from hearthlog.tools.cli.record import start_time
+    from hearthlog.tools.cli.options import parse_time
     from hearthlog.tools.home.simulate import write_day
 
     if output.exists():
@@ -51,7 +51,7 @@ def demo(
 
     _say(f"2. hearthlog record {day} --model {GENERAL} --output {logs} --start {_START}")
     settings = load_settings(None, {"output": logs, "model": Path(GENERAL)}, {})
-    start = start_time(_START, day)
+    start = parse_time(_START, "--start")
     began = time.perf_counter()
     record_files(settings, FileSource([day], start), Flag())
     took = time.perf_counter() - began

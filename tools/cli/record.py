@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from hearthlog.recorder.config import Settings
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
     from hearthlog.recorder.recording_session import RecordingSummary
+    from hearthlog.recorder.sources.audio_files import FileSource
+    from hearthlog.schemas.progress import Progress
 
 _HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # from others, by `readable_by`
 
@@ -35,7 +37,10 @@ _HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # from others, by `rea
 def record(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Audio files, one after the other; without any, the microphone."),
+        typer.Argument(
+            help="Audio files, or folders of them, in the order of time; without any, the "
+            "microphone."
+        ),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder of logs.", show_default="logs")
@@ -74,7 +79,15 @@ def record(
         typer.Option(
             help="Time of the files' first sample, as 2026-03-01T07:00:00 (UTC unless it says "
             "otherwise).",
-            show_default="the first file's modification time",
+            show_default="what their names or metadata say, else a guess",
+        ),
+    ] = None,
+    start_pattern: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATTERN",
+            help="How the names of files say when they begin, as %d-%m-%Y_%Hh%M (of strptime).",
+            show_default="known ones, such as 20260301_070000",
         ),
     ] = None,
     realtime: Annotated[
@@ -105,12 +118,11 @@ def record(
     """Record sound to a labelled log, from a microphone or from files.
 
     SIGINT (Ctrl-C) and SIGTERM complete the log; SIGHUP starts again if the configuration has
-    changed. Exit status 3: there were gaps, or a log
-    left by an earlier recorder was damaged, or a new model was refused.
+    changed. Exit status 3: there were gaps, or a file was damaged, left out, or began before the
+    end of another, or a log left by an earlier recorder was damaged, or a new model was refused.
     """
-    from hearthlog.recorder.config import load_settings
+    from hearthlog.recorder.config import NO_MODEL, load_settings
     from hearthlog.recorder.recording import record_files, record_microphones
-    from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.tools.cli.progress import share_done
 
     given = {
@@ -131,6 +143,7 @@ def record(
     configured = load()
     settings = with_model(configured)
     os.umask(_HIDDEN[settings.readable_by])
+    losses: list[str] = []
     stop = Flag()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda *_: stop.set())
@@ -138,15 +151,18 @@ def record(
     if files:
         if len(settings.microphone) > 1:
             wrong_use("files take the place of one microphone; the configuration has several")
-        begin = start_time(start, files[0])
         with share_done("recording") as progress:
-            channels = settings.microphone[0].channels
-            source = FileSource(
-                files, begin, realtime=realtime, channels=channels, progress=progress
+            source, doubts, refused = _open_files(
+                files, start, start_pattern, settings, realtime, progress
             )
             recording = record_files(settings, source, stop, reload_requests)
-    elif start is not None or realtime:
-        wrong_use("--start and --realtime go with files")
+        losses = [*refused, *source.warnings]
+        if not recording.labels and settings.model != NO_MODEL:
+            doubts.append("the sound is too short for a label; a model needs a second of it")
+        for line in [*doubts, *losses]:
+            tell(line)
+    elif start is not None or realtime or start_pattern is not None:
+        wrong_use("--start, --start-pattern and --realtime go with files")
     else:
         if sys.stderr.isatty():
             tell("listening; Ctrl-C completes the log")
@@ -154,7 +170,7 @@ def record(
         if reload_requests.restart:
             tell("the configuration was changed; starting again with it")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  as this process was started
-    _say(recording)
+    _say(recording, losses)
 
 
 def with_model(settings: "Settings") -> "Settings":
@@ -171,7 +187,7 @@ def with_model(settings: "Settings") -> "Settings":
     return settings.model_copy(update={"model": model})
 
 
-def _say(recording: "RecordingSummary") -> None:
+def _say(recording: "RecordingSummary", losses: list[str]) -> None:
     """Print what was recorded, and end with status 3 if something was lost or refused."""
     for log in recording.logs:
         print(log)
@@ -184,7 +200,7 @@ def _say(recording: "RecordingSummary") -> None:
     if recording.gaps:
         gaps, frames = number(recording.gaps, "gap"), number(recording.frames_lost, "frame")
         tell(f"{gaps}, {frames} not heard")
-    if damaged or recording.gaps or recording.models_refused:
+    if damaged or recording.gaps or recording.models_refused or losses:
         raise typer.Exit(3)
 
 
@@ -222,8 +238,32 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in options.items() if value is not None}
 
 
-def start_time(text: str | None, file: Path) -> int:
-    """Read the time of a file's first sample, in nanoseconds of UTC."""
-    if text is None:
-        return file.stat().st_mtime_ns if file.exists() else 0
-    return parse_time(text, "--start")
+def _open_files(
+    files: list[Path],
+    start: str | None,
+    pattern: str | None,
+    settings: "Settings",
+    realtime: bool,
+    progress: "Progress",
+) -> tuple["FileSource", list[str], list[str]]:
+    """Open audio files in the order of time; return doubts about it, and what was left out."""
+    from hearthlog.recorder.sources.audio_files import FileSource, find_audio
+    from hearthlog.recorder.sources.file_times import arrange, check_pattern, doubts
+    from hearthlog.recorder.timezone import time_zone
+
+    if pattern is not None:
+        check_pattern(pattern)
+    begin = None if start is None else parse_time(start, "--start")
+    paths, refused = find_audio(files)
+    paths, times = arrange(paths, time_zone(settings.timezone), pattern or "", begin)
+    first = times[0]
+    assert first is not None
+    source = FileSource(
+        paths,
+        first.start,
+        times=times,
+        realtime=realtime,
+        channels=settings.microphone[0].channels,
+        progress=progress,
+    )
+    return source, doubts(paths, times) if start is None else [], refused

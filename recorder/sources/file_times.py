@@ -1,0 +1,424 @@
+"""When audio files begin: as their names say, or their metadata, or as a guess."""
+
+import re
+import struct
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from hearthlog.recorder.errors import ConfigurationError, SourceError
+from hearthlog.recorder.sources.open_audio import audio_seconds, text_fields
+from hearthlog.schemas.times import NANOSECONDS, millisecond_text, read_time
+
+NAME, METADATA, GUESS = "its name", "its metadata", "a guess"
+
+# Date and time as recorders, telephones and other programs write them. BirdNET-Pi puts its name
+# between them, macOS and WhatsApp "at", Song Meter a dollar sign.
+_IN_NAME = re.compile(
+    r"""(?<!\d)
+    (?P<year>\d{4})(?P<dash>[-_.]?)(?P<month>\d\d)(?P=dash)(?P<day>\d\d)
+    (?P<between>T|[ _$-]{1,3}|[ _-]at[ _-]|-birdnet-(?:[A-Za-z]\w{0,40}-)?|(?<=\d{8}))
+    (?P<hour>\d\d|\d(?=[-_.:]\d\d[-_.:]))
+    (?:(?P<colon>[-_.:]?)(?P<minute>\d\d)(?:(?P=colon)(?P<second>\d\d))?
+      |h(?P<minute_h>\d\d)m(?P<second_h>\d\d)s?)
+    (?!\d)
+    (?:[.,](?P<fraction>\d{1,9})(?![0-9A-Za-z]|$)|[.,](?P<fraction_z>\d{1,9})(?=Z|$))?
+    (?:[ _\u202f]?(?P<half>[AaPp])[Mm](?![0-9A-Za-z])
+      |(?P<zone>Z|[ _]?(?:UTC|GMT)(?:[+-]\d\d?(?::?\d\d)?)?|[+-]\d\d:?\d\d|\+\d\d)
+       (?![0-9A-Za-z]))?
+    """,
+    re.VERBOSE | re.ASCII,
+)
+_HEXADECIMAL = re.compile(r"[0-9A-F]{8}")  # of old AudioMoths: seconds since 1970
+_AUDIOMOTH = re.compile(
+    r"Recorded at (\d\d:\d\d:\d\d(?:\.\d{3})?) (\d\d)/(\d\d)/(\d{4}) "
+    r"\(UTC(?:([+-])(\d{1,2})(?::(\d\d))?)?\)"
+)
+_GUANO = re.compile(r"^Timestamp: *(\S{19,40})", re.MULTILINE)
+_FIRST_YEAR = 1990  # a clock that was not set says 1970 or 1980
+_UNSET = (2000, 1, 1)  # or this day
+_FIRST_AUDIOMOTH = 1_388_534_400  # 2014
+_DAY = 86_400
+_MOST_CHUNKS = 1000
+_MOST_BYTES = 65_536  # of a chunk
+_DIRECTIVES = {
+    "Y": r"\d{4}",
+    "m": r"\d\d",
+    "d": r"\d\d",
+    "H": r"\d\d",
+    "M": r"\d\d",
+    "S": r"\d\d",
+    "y": r"\d\d",
+    "I": r"\d\d",
+    "j": r"\d{3}",
+    "f": r"\d{1,6}",
+    "p": "[AaPp][Mm]",
+    "b": "[A-Za-z]{3}",
+    "B": "[A-Za-z]{3,9}",
+    "z": r"(?:Z|[+-]\d\d:?\d\d)",
+    "%": "%",
+}
+
+
+class FileTime(NamedTuple):
+    """When an audio file begins.
+
+    Attributes
+    ----------
+    start : int
+        Nanoseconds of UTC.
+    step : int
+        To which this is known, in nanoseconds.
+    origin : str
+        `NAME`, `METADATA` or `GUESS`.
+    remark : str
+        Why the start may be wrong; empty if nothing speaks for that.
+    """
+
+    start: int
+    step: int
+    origin: str
+    remark: str = ""
+
+
+class _Moment(NamedTuple):
+    """A time that a text says."""
+
+    time: datetime  # without a zone where the text has none
+    step: int  # ns
+
+
+def file_time(path: Path, zone: tzinfo, pattern: str = "") -> FileTime:
+    """Find out when an audio file begins.
+
+    By the name of the file, else by its metadata (AudioMoth's comment, GUANO, Broadcast Wave), else
+    its modification time less its length: recorders close a file at its end.
+
+    Parameters
+    ----------
+    path : Path
+    zone : tzinfo
+        Of the times that say none.
+    pattern : str
+        How the name says it, as of `strptime`; empty for the ways that are known.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read, or its name does not fit the pattern.
+    """
+    if pattern:
+        return _placed(path, _by_pattern(path, pattern), zone, NAME)
+    refused: list[str] = []
+    moments = _in_name(path, refused)
+    if moments:
+        return _by_name(path, moments, zone)
+    for moment in _in_metadata(path):
+        if reason := _implausible(path, moment.time):
+            refused.append(f"{moment.time:%Y-%m-%d %H:%M:%S} in its metadata {reason}")
+        else:
+            return _placed(path, moment, zone, METADATA)
+    length = int(audio_seconds(path) * NANOSECONDS)
+    start = max(path.stat().st_mtime_ns - length, 0)
+    why = "; ".join(refused) or "neither its name nor its metadata say when it begins"
+    return FileTime(start, 0, GUESS, why)
+
+
+def arrange(
+    paths: Sequence[Path], zone: tzinfo, pattern: str = "", start: int | None = None
+) -> tuple[list[Path], list[FileTime | None]]:
+    """Put audio files into the order of time.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    zone : tzinfo
+        Of the times that say none.
+    pattern : str
+        As of `file_time`.
+    start : int or None
+        When the first of them begins, in nanoseconds of UTC, whatever it says itself; all others
+        keep their distance from it.
+
+    Returns
+    -------
+    list of Path
+    list of (FileTime or None)
+        When each begins; None: where the one before it ends.
+
+    Raises
+    ------
+    SourceError
+        As `file_time`.
+    """
+    placed: list[tuple[FileTime, list[Path]]] = []
+    if start is not None and len(paths) == 1:
+        return list(paths), [FileTime(start, 0, GUESS)]
+    for path in paths:
+        found = file_time(path, zone, pattern)
+        if found.origin == GUESS and placed:
+            placed[-1][1].append(path)  # it follows the one that was named before it
+        else:
+            placed.append((found, [path]))
+    placed.sort(key=lambda one: one[0].start)
+    shift = 0 if start is None else start - placed[0][0].start
+    ordered: list[Path] = []
+    times: list[FileTime | None] = []
+    for found, group in placed:
+        ordered += group
+        times += [found._replace(start=found.start + shift), *[None] * (len(group) - 1)]
+    return ordered, times
+
+
+def check_pattern(pattern: str) -> None:
+    """Check that a pattern says a date and a time of day.
+
+    Raises
+    ------
+    ConfigurationError
+        If it does not.
+    """
+    used = set(re.findall("%(.)", pattern))
+    unknown = sorted(used - _DIRECTIVES.keys())
+    dated = used & {"Y", "y"} and ((used & {"m", "b", "B"} and "d" in used) or "j" in used)
+    timed = "M" in used and ("H" in used or {"I", "p"} <= used)
+    if unknown or pattern.replace("%%", "").endswith("%"):
+        known = ", ".join(f"%{name}" for name in _DIRECTIVES)
+        raise ConfigurationError(f"{pattern[:80]!r}: a pattern of names has {known}")
+    if not (dated and timed):
+        raise ConfigurationError(
+            f"{pattern[:80]!r}: a pattern of names says date and time, as %Y%m%d_%H%M%S"
+        )
+
+
+def _by_pattern(path: Path, pattern: str) -> _Moment:
+    """Read the time in a name by a pattern, which a part of the name fits."""
+    places = re.split("(%.)", pattern)
+    text = "".join(
+        _DIRECTIVES[part[1]] if part.startswith("%") else re.escape(part) for part in places
+    )
+    folders = pattern.count("/")
+    name = "/".join(path.absolute().parts[-1 - folders :])
+    refusal = SourceError(
+        f"{path}: its name does not fit {pattern[:80]!r}, by which it should say when it begins"
+    )
+    refusal = SourceError(
+        f"{path}: its name does not fit {pattern[:80]!r}, by which it should say when it begins"
+    )
+    edges = (rf"(?<!\d){text}(?!\d)", text)
+    found = next(filter(None, (re.search(each, name, re.ASCII) for each in edges)), None)
+    if found is None:
+        raise refusal
+    try:
+        moment = datetime.strptime(found.group(), pattern)  # noqa: DTZ007  the zone is added
+    except ValueError as error:
+        raise refusal from error
+    step = NANOSECONDS if "%S" in pattern else 60 * NANOSECONDS
+    return _Moment(moment, 1_000_000 if "%f" in pattern else step)
+
+
+def _in_name(path: Path, refused: list[str]) -> list[_Moment]:
+    """Read the different times in a name; what looks like one, and is none, is refused."""
+    moments: list[_Moment] = []
+    for found in _IN_NAME.finditer(path.name):
+        with_seconds = found["second"] or found["second_h"]
+        if not with_seconds and found["between"] != "T" and found["colon"] != ":":
+            refused.append(f"{found.group()!r} in its name may be a time, or a number")
+            continue
+        moment = _moment(found)
+        reason = "is no date" if moment is None else _implausible(path, moment.time)
+        if moment is None or reason:
+            refused.append(f"{found.group()!r} in its name {reason}")
+        elif moment not in moments:
+            moments.append(moment)
+    if not moments and _HEXADECIMAL.fullmatch(path.stem) and not path.stem.isdecimal():
+        seconds = int(path.stem, 16)
+        moment = _Moment(datetime.fromtimestamp(seconds, UTC), NANOSECONDS)
+        if seconds >= _FIRST_AUDIOMOTH and not _implausible(path, moment.time):
+            moments.append(moment)
+    return moments
+
+
+def _moment(found: re.Match[str]) -> _Moment | None:
+    """Return the time that was found; None if no calendar and no clock has it."""
+    hour = int(found["hour"])
+    if half := found["half"]:
+        if not 1 <= hour <= 12:
+            return None
+        hour = hour % 12 + (12 if half in "pP" else 0)
+    minute = found["minute"] or found["minute_h"]
+    second = found["second"] or found["second_h"]
+    fraction = found["fraction"] or found["fraction_z"] or ""
+    try:
+        moment = datetime(  # noqa: DTZ001  the zone is added
+            int(found["year"]),
+            int(found["month"]),
+            int(found["day"]),
+            hour,
+            int(minute),
+            int(second or 0),
+            int(fraction.ljust(6, "0")[:6]) if fraction else 0,
+        )
+    except ValueError:
+        return None
+    step = NANOSECONDS // 10 ** len(fraction) if second else 60 * NANOSECONDS
+    return _Moment(moment.replace(tzinfo=_offset(found["zone"])), step)
+
+
+def _offset(text: str | None) -> tzinfo | None:
+    """Read a zone; None if it is none, such as the number of a part."""
+    if not text:
+        return None
+    found = re.search(r"([+-])(\d\d?):?(\d\d)?$", text)
+    if found is None:
+        return UTC
+    minutes = int(found[2]) * 60 + int(found[3] or 0)
+    if minutes > 14 * 60 or minutes % 15:
+        return None
+    return timezone(timedelta(minutes=-minutes if found[1] == "-" else minutes))
+
+
+def _by_name(path: Path, moments: list[_Moment], zone: tzinfo) -> FileTime:
+    """Choose the first time of a name; the metadata may say in which zone it is."""
+    moment, *others = moments
+    remark = ""
+    if moment.time.tzinfo is None:
+        same = (
+            one.time
+            for one in _in_metadata(path)
+            if one.time.tzinfo is not None
+            and one.time.replace(tzinfo=None, microsecond=0) == moment.time.replace(microsecond=0)
+        )
+        found = next(same, None)
+        moment = (
+            moment
+            if found is None
+            else moment._replace(time=moment.time.replace(tzinfo=found.tzinfo))
+        )
+    if others and not _is_end(path, moment, others):
+        remark = "its name has several times, of which the first was taken"
+    elif _HEXADECIMAL.fullmatch(path.stem) and not any(
+        "AudioMoth" in text for text in text_fields(path)
+    ):
+        remark = "its name was read as those of old AudioMoths, seconds in hexadecimal digits"
+    placed = _placed(path, moment, zone, NAME)
+    return placed._replace(remark=placed.remark or remark)
+
+
+def _is_end(path: Path, moment: _Moment, others: list[_Moment]) -> bool:
+    """Whether the second of two times is the end of the file."""
+    if len(others) > 1 or (moment.time.tzinfo is None) != (others[0].time.tzinfo is None):
+        return False
+    seconds = (others[0].time - moment.time).total_seconds()
+    return abs(seconds - audio_seconds(path)) < 2
+
+
+def _implausible(path: Path, moment: datetime) -> str:
+    """Say why no recording can be of a time; empty if one can."""
+    if moment.year < _FIRST_YEAR or moment.timetuple()[:3] == _UNSET:
+        return "is of a clock that was not set"
+    written = path.stat().st_mtime if path.exists() else 0.0  # this clock may be wrong, too
+    try:
+        seconds = moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
+    except (OverflowError, ValueError):
+        seconds = float("inf")
+    return "is in the future" if seconds > max(time.time(), written) + _DAY else ""
+
+
+def _placed(path: Path, moment: _Moment, zone: tzinfo, origin: str) -> FileTime:
+    """Return the time of a file, in a zone if it says none."""
+    remark = ""
+    local = moment.time
+    if local.tzinfo is None:
+        both = [local.replace(tzinfo=zone, fold=fold) for fold in (0, 1)]
+        local = both[0]
+        if both[0].utcoffset() != both[1].utcoffset() and _exists(both[0]):
+            local, remark = _of_twice(path, both)
+    start = read_time(local.astimezone(UTC).isoformat())
+    return FileTime(start, moment.step, origin, remark)
+
+
+def _exists(local: datetime) -> bool:
+    """Whether the clocks of its zone show a time."""
+    there = local.astimezone(UTC).astimezone(local.tzinfo)
+    return there.replace(tzinfo=None) == local.replace(tzinfo=None)
+
+
+def _of_twice(path: Path, both: list[datetime]) -> tuple[datetime, str]:
+    """Choose one of two times that a clock shows alike, when it is put back."""
+    ends = path.stat().st_mtime - audio_seconds(path)
+    near = [each for each in both if abs(each.timestamp() - ends) < 300]
+    if near:
+        return near[0], ""
+    return both[0], f"its clock showed {both[0]:%H:%M} twice that day; the first was taken"
+
+
+def _in_metadata(path: Path) -> Iterator[_Moment]:
+    """Yield the times that a file says in it, the most trusted first."""
+    for text in text_fields(path):
+        if found := _AUDIOMOTH.search(text):
+            clock, day, month, year, sign, hours, minutes = found.groups()
+            offset = timedelta(hours=int(hours or 0), minutes=int(minutes or 0))
+            with suppress(ValueError):
+                moment = datetime.fromisoformat(f"{year}-{month}-{day}T{clock}")
+                place = timezone(-offset if sign == "-" else offset)
+                yield _Moment(moment.replace(tzinfo=place), NANOSECONDS)
+    for name, content in _chunks(path):
+        if name == b"guan" and (found := _GUANO.search(content.decode("utf-8", "replace"))):
+            with suppress(ValueError):
+                yield _Moment(datetime.fromisoformat(found[1]), NANOSECONDS)
+        elif name == b"bext" and len(content) >= 338:
+            date = re.sub(r"\D", "-", content[320:330].decode("latin-1"))
+            clock = re.sub(r"\D", ":", content[330:338].decode("latin-1"))
+            with suppress(ValueError):
+                yield _Moment(datetime.fromisoformat(f"{date}T{clock}"), NANOSECONDS)
+
+
+def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the chunks of a WAV file that say when it begins."""
+    with suppress(OSError, struct.error), path.open("rb") as file:
+        head = file.read(12)
+        if head[:4] in {b"RIFF", b"RF64", b"BW64"} and head[8:] == b"WAVE":
+            yield from _wav_chunks(file)
+
+
+def _wav_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
+    for _ in range(_MOST_CHUNKS):
+        name, size = struct.unpack("<4sI", file.read(8))
+        end = file.tell() + size + size % 2
+        if name in {b"guan", b"bext"}:
+            yield name, file.read(min(size, _MOST_BYTES))
+        file.seek(end)
+
+
+def doubts(paths: Sequence[Path], times: Sequence[FileTime | None]) -> list[str]:
+    """Say in lines which starts may be wrong, and what to do.
+
+    Parameters
+    ----------
+    paths, times
+        As `arrange` returns them, without a start that was given.
+    """
+    lines: dict[str, list[tuple[Path, str]]] = {}
+    follows = 0
+    for path, found in zip(paths, times, strict=True):
+        if found is None:
+            follows += 1
+        elif found.origin == GUESS:
+            text = (
+                f"the start {millisecond_text(found.start)} is a guess, the time of its last "
+                f"change less its length, for {found.remark}; say --start or --start-pattern"
+            )
+            lines.setdefault(GUESS, []).append((path, text))
+        elif found.remark:
+            lines.setdefault(found.remark, []).append((path, f"{found.remark}; say --start"))
+    said = []
+    for (first, text), *others in lines.values():
+        more = f" (and so of {len(others)} more)" if others else ""
+        said.append(f"{first}: {text}{more}")
+    if follows:
+        said.append(f"{follows} of {len(paths)} files say no time: they follow without a gap")
+    return said

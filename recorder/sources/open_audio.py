@@ -1,0 +1,359 @@
+"""Audio files opened: by libsndfile, or by ffmpeg where libsndfile cannot read them."""
+
+import math
+import mmap
+import os
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import RLock
+from typing import NamedTuple
+
+import numpy as np
+import soundfile
+
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.sources.ffmpeg import FileDecoder, has_ffmpeg
+from hearthlog.schemas.arrays import Float32
+
+BLOCK_SECONDS = 10.0
+RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
+
+_SUFFIXES = frozenset(
+    {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf"}
+    | {".w64", ".rf64", ".voc"}
+    | {".m4a", ".m4b", ".aac", ".mp4", ".m4v", ".mov", ".3gp", ".3g2", ".amr", ".awb", ".webm"}
+    | {".mka", ".mkv", ".wma", ".wmv", ".asf", ".avi", ".mp2", ".mpga", ".ac3", ".wv", ".tta"}
+)
+_NO_LENGTH = 1 << 62  # libsndfile says more frames where a header has no length
+_MOST_BYTES = 0x7FFF_0000  # a header that claims more has no length
+_LEAST_BYTES = 1600  # less is missing where programs count or pad in their own way
+_CLAIMED = re.compile(r"^ *(?:data|SSND|Data Size|riff) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
+_CLAIMED_RF64 = re.compile(r"frame count (\d+) does not match value from 'ds64' chunk of (\d+)")
+_NOT_MP3 = {b"RIFF", b"RF64", b"riff", b"fLaC", b"OggS", b"FORM", b"caff", b".snd"}  # begin so
+_OF_MPG123 = re.compile(rb"\[[^]]*mpg123|(?:Note|Warning): |mpg123|\s*$")
+_BROKEN_MP3 = re.compile(rb"error:|Xing stream size off|resync")
+_OGG_PAGE = 65_307  # bytes, at most
+_OGG_END = 4  # flag of the last page
+_STDERR = 2
+_MOST_COMPLAINTS = 10  # that are kept
+_REDIRECTED = RLock()
+
+
+class OpenAudio(NamedTuple):
+    """An audio file that can be read.
+
+    Attributes
+    ----------
+    rate, channels : int
+    frames : int or None
+        Samples of each channel, as the header says; None if it does not.
+    blocks : callable
+        `blocks(first, last)` yields the samples from one number to another, as float32 of shape
+        (n, channels), as far as they can be read. To be called once.
+    fault : callable
+        Once the blocks were read, says why they end before the sound does; empty if they do not.
+    """
+
+    rate: int
+    channels: int
+    frames: int | None
+    blocks: Callable[[int, float], Iterator[Float32]]
+    fault: Callable[[], str]
+
+
+@contextmanager
+def open_audio(path: Path) -> Iterator[OpenAudio]:
+    """Open an audio file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
+        768 kHz.
+    """
+    _check_file(path)
+    reason = ""
+    complaints: list[bytes] = []
+    try:
+        sound = _opened(path, complaints)
+    except soundfile.LibsndfileError as error:
+        sound, reason = None, error.error_string.rstrip(".") or "it is damaged"
+    if sound is not None and sound.frames:
+        with sound:
+            yield _by_libsndfile(path, sound, complaints)
+        return
+    if sound is not None:
+        sound.close()
+    with _decoder(path, reason) as decoder:
+        yield _by_ffmpeg(path, decoder)
+
+
+def audio_seconds(path: Path) -> float:
+    """Return the length of an audio file in seconds, as its header says.
+
+    Where it says none, all of the file is decoded.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        As `open_audio`.
+    """
+    with open_audio(path) as audio:
+        frames = audio.frames
+        if frames is None:
+            frames = sum(len(block) for block in audio.blocks(0, math.inf))
+        return float(frames / audio.rate)
+
+
+def is_audio(name: str) -> bool:
+    """Whether a file is named as audio that can be read.
+
+    Parameters
+    ----------
+    name : str
+    """
+    suffix = os.path.splitext(name)[1].lower()  # noqa: PTH122
+    return suffix in _SUFFIXES and not name.startswith(".")
+
+
+def text_fields(path: Path) -> list[str]:
+    """Return the texts that libsndfile finds in an audio file, such as a comment.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If there is no such file, or nothing can be read of it.
+    """
+    _check_file(path)
+    with suppress(soundfile.LibsndfileError), _opened(path, []) as sound:
+        return list(sound.copy_metadata().values())
+    return []
+
+
+class _Unseekable(soundfile.SoundFile):  # type: ignore[misc]  # soundfile has no types
+    """A file without a length, in which libsndfile cannot seek, though it says so."""
+
+    def seekable(self) -> bool:
+        return False
+
+
+def _check_file(path: Path) -> None:
+    if not path.exists():
+        raise SourceError(f"{path}: no such file")
+    if path.is_dir():
+        raise SourceError(f"{path}: is a folder; name the audio files in it")
+    if not path.is_file():
+        raise SourceError(f"{path}: cannot be read as audio (Not a regular file)")
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+    if not path.stat().st_size:
+        raise SourceError(f"{path}: holds no audio; the file is empty")
+
+
+def _check_rate(path: Path, rate: int) -> None:
+    if rate not in RATES:
+        raise SourceError(f"{path}: a sample rate of {rate} Hz cannot be recorded")
+
+
+def _opened(path: Path, complaints: list[bytes]) -> soundfile.SoundFile:
+    with _without_mpg123(path, complaints):
+        sound = soundfile.SoundFile(path)
+    if sound.frames >= _NO_LENGTH:
+        sound.close()
+        return _Unseekable(path)
+    if sound.frames == 0 and (mended := _mended_wav(path)) is not None:
+        sound.close()
+        return soundfile.SoundFile(mended)
+    return sound
+
+
+class _View(mmap.mmap):
+    """The bytes of a file, which can be changed without changing the file."""
+
+    def seek(self, pos: int, whence: int = os.SEEK_SET) -> None:
+        """Go to a place, or the end if that lies beyond it, as libsndfile expects."""
+        base = (0, self.tell(), len(self))[whence]
+        super().seek(min(max(base + pos, 0), len(self)))
+
+
+def _mended_wav(path: Path) -> _View | None:
+    """Return a WAV file whose header claims no sound, with one that claims all of the rest.
+
+    A recorder that was switched off leaves it so. Nothing is written to the file.
+    """
+    with path.open("rb") as file:
+        view = _View(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    place = 12
+    while view[:4] == b"RIFF" and place + 8 < len(view):
+        name, size = view[place : place + 4], int.from_bytes(view[place + 4 : place + 8], "little")
+        if name == b"data" and size == 0 and not _is_chunk(view, place + 8):
+            view[place + 4 : place + 8] = b"\xff" * 4
+            return view
+        place += 8 + size + size % 2
+    view.close()
+    return None
+
+
+def _is_chunk(view: _View, place: int) -> bool:
+    size = int.from_bytes(view[place + 4 : place + 8], "little")
+    return view[place : place + 4].isalnum() and place + 8 + size <= len(view)
+
+
+def _by_libsndfile(path: Path, sound: soundfile.SoundFile, complaints: list[bytes]) -> OpenAudio:
+    _check_rate(path, sound.samplerate)
+    frames = None if isinstance(sound, _Unseekable) else sound.frames
+    place, end, is_broken = 0, 0.0, False
+
+    def blocks(first: int, last: float) -> Iterator[Float32]:
+        nonlocal place, end, is_broken
+        end = last
+        if frames is not None and first:
+            place = sound.seek(min(first, frames))
+        size = int(sound.samplerate * BLOCK_SECONDS)
+        while not is_broken and (count := int(min(size, last - place))) > 0:
+            block = np.full((count, sound.channels), np.nan, np.float32)
+            try:
+                with _without_mpg123(path, complaints):
+                    block = sound.read(count, out=block)
+            except soundfile.LibsndfileError:
+                is_broken = True
+                block = block[: _filled(block)]
+            if not len(block):
+                return
+            place += len(block)
+            skipped = max(first - (place - len(block)), 0)  # where nothing can be sought
+            if skipped < len(block):
+                yield block[skipped:]
+
+    def fault() -> str:
+        if place >= end:  # no more was wanted
+            return ""
+        is_mp3 = sound.format == "MP3"  # its length may be an estimate
+        is_short = frames is not None and place < frames and not is_mp3
+        if is_broken or is_short or (is_mp3 and any(map(_BROKEN_MP3.search, complaints))):
+            return f"is damaged or cut short after {place / sound.samplerate:.2f} s"
+        is_cut = _claims_more(sound.extra_info) or (sound.format == "OGG" and not _is_ended(path))
+        return f"is cut short: its sound ends at {place / sound.samplerate:.2f} s" if is_cut else ""
+
+    return OpenAudio(sound.samplerate, sound.channels, frames, blocks, fault)
+
+
+def _filled(block: Float32) -> int:
+    """Return how many samples were read into a block of NaN, for libsndfile does not say."""
+    filled = np.flatnonzero(~np.isnan(block).all(axis=1))
+    return int(filled[-1]) + 1 if len(filled) else 0
+
+
+def _claims_more(log: str) -> bool:
+    """Whether the header of a file claims more sound than there is, by libsndfile's log of it."""
+    for claimed, found in _CLAIMED.findall(log):
+        if int(claimed) - int(found) >= _LEAST_BYTES and int(claimed) < _MOST_BYTES:
+            return True
+    return any(int(claimed) > int(found) for found, claimed in _CLAIMED_RF64.findall(log))
+
+
+def _is_ended(path: Path) -> bool:
+    """Whether the last page of an Ogg file says that it is the last one."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - _OGG_PAGE, 0))
+        tail = file.read()
+    place = tail.rfind(b"OggS")
+    return place >= 0 and bool(tail[place + 5 : place + 6] and tail[place + 5] & _OGG_END)
+
+
+@contextmanager
+def _without_mpg123(path: Path, complaints: list[bytes]) -> Iterator[None]:
+    """Keep from standard error what libmpg123 writes there; it knows no other way."""
+    with path.open("rb") as file:
+        if file.read(4) in _NOT_MP3:
+            yield
+            return
+    with _REDIRECTED, tempfile.TemporaryFile() as kept:
+        sys.stderr.flush()
+        original = os.dup(_STDERR)
+        os.dup2(kept.fileno(), _STDERR)
+        try:
+            yield
+        finally:
+            os.dup2(original, _STDERR)
+            kept.seek(0)
+            for line in kept:
+                if _OF_MPG123.match(line):
+                    complaints[:] = [*complaints, line][-_MOST_COMPLAINTS:]
+                else:  # of another thread
+                    os.write(_STDERR, line)
+            os.close(original)
+
+
+@contextmanager
+def _decoder(path: Path, reason: str) -> Iterator[FileDecoder]:
+    """Start ffmpeg for a file that libsndfile cannot read, or finds nothing in."""
+    unreadable = f"{path}: cannot be read as audio"
+    if not has_ffmpeg():
+        target = f"{path.stem}{'-2' if path.suffix.lower() == '.wav' else ''}.wav"
+        raise SourceError(
+            f"{unreadable} ({reason}); install ffmpeg (Debian: apt install ffmpeg), or convert it "
+            f"elsewhere: ffmpeg -i {shlex.quote(path.name)} {shlex.quote(target)}"
+            if reason
+            else f"{path}: holds no audio"
+        )
+    try:
+        decoder = FileDecoder(path)
+    except SourceError as error:
+        raise SourceError(
+            f"{unreadable} ({str(error) or f'{reason}; not by ffmpeg either'})"
+            if reason
+            else f"{path}: holds no audio"
+        ) from error
+    with decoder:
+        yield decoder
+
+
+def _by_ffmpeg(path: Path, decoder: FileDecoder) -> OpenAudio:
+    _check_rate(path, decoder.rate)
+    place, end, reason = 0, 0.0, ""
+
+    def blocks(first: int, last: float) -> Iterator[Float32]:
+        nonlocal place, end, reason
+        end = last
+        size = int(decoder.rate * BLOCK_SECONDS)
+        while (count := int(min(size, last - place))) > 0:
+            try:
+                data = decoder.read(count)
+            except SourceError as error:
+                reason = str(error)
+                return
+            block = np.frombuffer(data, ">f4").astype(np.float32).reshape(-1, decoder.channels)
+            if not len(block):
+                return
+            place += len(block)
+            skipped = max(first - (place - len(block)), 0)
+            if skipped < len(block):
+                yield block[skipped:]
+
+    def fault() -> str:
+        if place >= end or not (reason or decoder.fault()):
+            return ""
+        return f"is damaged or cut short after {place / decoder.rate:.2f} s"
+
+    return OpenAudio(decoder.rate, decoder.channels, None, blocks, fault)
