@@ -6,6 +6,7 @@ import shlex
 import signal
 import subprocess
 import time
+from collections import Counter
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -26,6 +27,15 @@ def next_domain():
     return next(_domains)
 
 
+class _Process(subprocess.Popen):
+    """A process that a test which fails does not wait for."""
+
+    def __exit__(self, kind, *error):
+        if kind is not None:
+            self.kill()
+        super().__exit__(kind, *error)
+
+
 class Ros:
     """One distribution, in a domain of its own."""
 
@@ -43,7 +53,7 @@ class Ros:
         line = f". {shlex.quote(str(self.setup))} && exec {shlex.join(map(str, command))}"
         environment = self.environment | options.pop("env", {})
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} | options
-        return subprocess.Popen(["bash", "-c", line], env=environment, text=True, **pipes)
+        return _Process(["bash", "-c", line], env=environment, text=True, **pipes)
 
     def node(self, executable, *, remap=(), env=None, **parameters):
         """Start a node of hearthlog."""
@@ -58,20 +68,37 @@ class Ros:
         )
 
 
-def wait_until_running(process):
-    """Wait until a node has taken the place of the shell that finds it, which loses signals."""
-    deadline = time.monotonic() + 30
-    while Path(f"/proc/{process.pid}/cmdline").read_bytes().startswith(b"bash"):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    time.sleep(1.0)  # until Python has begun
+def wait_for(reached, seconds=120):
+    """Poll until a condition holds; a busy machine may take its time."""
+    deadline = time.monotonic() + seconds
+    while not (result := reached()):
+        assert time.monotonic() < deadline, "waited for nothing"
+        time.sleep(0.1)
+    return result
+
+
+def wait_until_handled(process, number=signal.SIGTERM):
+    """Wait until a process has a handler of a signal, or has ended.
+
+    Before that the shell that finds a node, or Python while it starts, would take the signal.
+    """
+    status = Path(f"/proc/{process.pid}/status")
+
+    def handled():
+        if process.poll() is not None:
+            return True
+        caught = status.read_text().partition("SigCgt:")[2].split()
+        return not caught or int(caught[0], 16) >> (number - 1) & 1
+
+    wait_for(handled)
 
 
 def end(process, number=signal.SIGTERM):
     """Ask a process to end; give what it has printed."""
+    wait_until_handled(process)
     process.send_signal(number)
     try:
-        return process.communicate(timeout=20)[0]
+        return process.communicate(timeout=120)[0]
     finally:
         process.kill()
         process.stdout.close()
@@ -94,14 +121,27 @@ def listener(ros, output, topics, depth="1000"):
 
 def arrived(output):
     """Give rows of topic, monotonic and wall time of arrival, and bytes."""
-    rows = [json.loads(line) for line in output.read_text().splitlines()]
+    written = output.read_text().rpartition("\n")[0]
+    rows = [json.loads(line) for line in written.splitlines()]
     return [(topic, mono, wall, bytes.fromhex(data)) for topic, mono, wall, data in rows]
 
 
 def logged(folder):
     """Give rows of topic, log time and bytes, padded as they are on the wire."""
+    if not list(folder.rglob("*.mcap*")):
+        return []
     return [
         (item.topic, item.log_time, item.data + bytes(-len(item.data) % 4))
         for log in find_logs(folder)
         for item in LogReader(log).messages()
     ]
+
+
+def wait_until_logged(folder, **counts):
+    """Wait until a folder holds at least so many messages of each kind (`features`, `gap` …)."""
+
+    def reached():
+        found = Counter(topic.rpartition("/")[2] for topic, *_ in logged(folder))
+        return all(found[kind] >= count for kind, count in counts.items())
+
+    wait_for(reached)

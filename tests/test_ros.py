@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 from conftest import HEARTHLOG
+from logs import read
 from rosgraph import (
     DISTRIBUTIONS,
     Ros,
@@ -16,7 +17,9 @@ from rosgraph import (
     listener,
     logged,
     next_domain,
-    wait_until_running,
+    wait_for,
+    wait_until_handled,
+    wait_until_logged,
 )
 
 from hearthlog.schemas.logs.files import relabel_path
@@ -53,6 +56,19 @@ def microphone_recorder(labmic, logs, *more, model="general"):
             process.kill()
 
 
+def lose_microphone(labmic, logs):
+    """Unplug the microphone of a recorder after eight seconds, and plug it in again."""
+    wait_until_logged(logs, features=160)
+    labmic.unplug()
+    time.sleep(5)
+    labmic.restore()
+
+
+def of_the_log(output):
+    """Give what arrived, without the lines of the node itself."""
+    return [row for row in arrived(output) if b"\0hearthlog_live\0" not in row[-1]]
+
+
 def test_every_message_of_a_log_reaches_the_graph_once_and_in_order(ros, labmic, tmp_path):
     logs, output, at_sensor = tmp_path / "logs", tmp_path / "all", tmp_path / "sensor"
     labels = {"/mic/label": TOPICS["/mic/label"]}
@@ -63,32 +79,29 @@ def test_every_message_of_a_log_reaches_the_graph_once_and_in_order(ros, labmic,
         ):
             assert "is not there yet; waiting for a recorder" in node.stdout.readline()
             with microphone_recorder(labmic, logs) as recorder:
-                time.sleep(8)
-                labmic.unplug()
-                time.sleep(5)
-                labmic.restore()
-                time.sleep(8)
-                finished = min(logs.rglob("*.mcap"))
+                lose_microphone(labmic, logs)
+                wait_until_logged(logs, features=320, gap=1, segment=1)
+                finished = wait_for(lambda: min(logs.rglob("*.mcap"), default=None))
                 layer = relabel_path(finished, "other")  # speaks of what was heard before
                 shutil.copy(finished, layer)
-                time.sleep(5)
+                wait_until_logged(logs, features=len(read(logs, "features")) + 100)
                 recorder.send_signal(signal.SIGTERM)
                 recorder.wait()
-            time.sleep(2)
+            layer.unlink()
+            log = logged(logs)
+            wait_for(lambda: len(of_the_log(output)) >= len(log))
         assert end(node) == ""
-    layer.unlink()
     assert len(list(logs.rglob("*.mcap"))) > 1
-    rows, log = arrived(output), logged(logs)
-    rows = [row for row in rows if b"\0hearthlog_live\0" not in row[-1]]  # its own lines
+    rows = of_the_log(output)
     for topic in TOPICS:
         got = [data for name, _, _, data in rows if name == topic]
         assert got == [data for name, _, data in log if name == topic], topic
     assert {name for name, *_ in rows} == TOPICS.keys()
     expected = {topic: type_hash(name) for topic, name in TOPICS.items()}
     assert {topic: ends[0][0] for topic, ends in everything.hashes.items()} == expected
-    # Who keeps five messages loses most of a burst of twelve; a busy machine may still lose a few.
+    # Who keeps five messages loses seven of a burst of twelve; a busy machine may still lose a few.
     steady = [data for *_, data in arrived(at_sensor)]
-    assert len(steady) > 0.9 * sum(name == "/mic/label" for name, *_ in log)
+    assert len(steady) > 0.6 * sum(name == "/mic/label" for name, *_ in log)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -96,7 +109,7 @@ def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_p
     with microphone_recorder(labmic, tmp_path / "logs"):
         for seconds in (0.0, 0.5, 2.0):
             with ros.node("live", folder=tmp_path / "logs", delay=0.0) as node:
-                wait_until_running(node)
+                wait_until_handled(node)
                 time.sleep(seconds)
                 said = end(node, number)
                 assert node.returncode == 0, said
@@ -115,7 +128,7 @@ def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_p
 )
 def test_what_is_wrong_is_said_in_one_line(ros, executable, parameters, environment, line):
     with ros.node(executable, env=environment, **parameters) as node:
-        said = node.communicate(timeout=30)[0]
+        said = node.communicate(timeout=120)[0]
     assert said.startswith("hearthlog_ros: ")
     assert line in said
     assert said.count("\n") == 1
@@ -130,7 +143,7 @@ def test_features_of_another_set_are_not_labelled(ros, labmic, tmp_path):
         ros.node("live", folder=tmp_path / "logs") as live,
         ros.node("label", model="general") as label,
     ):
-        said = label.communicate(timeout=60)[0]
+        said = label.communicate(timeout=120)[0]
         end(live)
     assert "general is for feature set home33; /mic/features has auros21" in said
     assert label.returncode == 1
@@ -142,7 +155,7 @@ def test_a_microphone_is_labelled_under_one_name_only_once(ros, labmic, tmp_path
         ros.node("live", folder=tmp_path / "logs") as live,
         ros.node("label", model="general") as label,
     ):
-        said = label.communicate(timeout=60)[0]
+        said = label.communicate(timeout=120)[0]
         end(live)
     assert "/mic/label is published by hearthlog_live already" in said
     assert label.returncode == 1
@@ -162,16 +175,15 @@ def test_features_are_labelled_elsewhere_on_the_graph_as_the_recorder_labels_the
         assert "waiting for a recorder" in live.stdout.readline()
         with listener(ros, output, elsewhere | {"/mic/label_info": TOPICS["/mic/info"]}):
             with microphone_recorder(labmic, logs) as recorder:
-                time.sleep(6)
-                labmic.unplug()
-                time.sleep(5)
-                labmic.restore()
-                time.sleep(6)
+                lose_microphone(labmic, logs)
+                wait_until_logged(logs, features=320, gap=1, segment=1)
                 recorder.send_signal(signal.SIGTERM)
                 recorder.wait()
-            time.sleep(7)
+            log = logged(logs)
+            wanted = sum(name in topics for name, *_ in log)
+            wait_for(lambda: sum(row[0] in elsewhere for row in arrived(output)) >= wanted)
         assert (end(label), end(live)) == ("", "")
-    rows, log = arrived(output), logged(logs)
+    rows = arrived(output)
     for topic in topics:
         got = [data for name, _, _, data in rows if name == f"/elsewhere{topic}"]
         assert got == [data for name, _, data in log if name == topic], topic

@@ -11,7 +11,7 @@ import pytest
 import soundfile
 from conftest import HEARTHLOG
 from logs import features, read
-from rosgraph import DISTRIBUTIONS, Ros, end, next_domain
+from rosgraph import DISTRIBUTIONS, Ros, end, next_domain, wait_until_logged
 
 from hearthlog.analyzer.doctor import examine
 
@@ -63,15 +63,6 @@ def speaking(ros, name, path, milliseconds=20, left_out=()):
             robot.kill()
 
 
-def wait_for_frames(logs, count):
-    deadline = time.monotonic() + 60
-    while True:
-        if list(logs.rglob("*.mcap*")) and len(features(logs)[0]) >= count:
-            return
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
-
-
 @pytest.mark.parametrize(
     "case", [(RAW, 20), (STAMPED, 32), (DATA, 64)], ids=["raw", "stamped", "data"]
 )
@@ -80,7 +71,7 @@ def test_a_topic_has_the_features_of_its_sound(ros, case, sound, tmp_path):
     path, logs = sound(), tmp_path / "logs"
     robot = speaking(ros, name, path, milliseconds)
     with robot, topic_recorder(ros, logs, "ros2:///robot/audio") as recorder:
-        wait_for_frames(logs, 120)
+        wait_until_logged(logs, features=120)
         said = end(recorder)
     assert recorder.returncode == 0, said
     command = [*HEARTHLOG, "record", str(path), "-o", str(tmp_path / "file"), "--model", "none"]
@@ -104,7 +95,7 @@ def test_the_first_channel_of_an_array_is_heard_at_its_own_rate(ros, sound, tmp_
     with speaking(ros, DATA, path):
         address = "ros2:///robot/audio?rate=48000&channels=4"
         with topic_recorder(ros, logs, address) as recorder:
-            wait_for_frames(logs, 120)
+            wait_until_logged(logs, features=120)
             end(recorder)
     frames, stamps, values = features(logs)
     assert np.array_equal(frames, np.arange(len(frames)))
@@ -116,7 +107,7 @@ def test_messages_that_are_lost_are_a_gap(ros, sound, tmp_path):
     logs = tmp_path / "logs"
     robot = speaking(ros, RAW, sound(), 100, left_out=range(20, 27))
     with robot, topic_recorder(ros, logs, "ros2:///robot/audio") as recorder:
-        wait_for_frames(logs, 120)
+        wait_until_logged(logs, features=120)
         end(recorder)
     frames, stamps, _ = features(logs)
     (gap,) = read(logs, "gap")
@@ -131,7 +122,7 @@ def test_a_topic_that_stops_is_waited_for(ros, sound, tmp_path):
     with topic_recorder(ros, logs, "ros2:///robot/audio") as recorder:
         for round_ in range(2):
             with speaking(ros, RAW, sound()):
-                wait_for_frames(logs, 100 * (round_ + 1))
+                wait_until_logged(logs, features=100 * (round_ + 1))
             time.sleep(5)
         end(recorder)
     (gap,) = read(logs, "gap")
