@@ -194,7 +194,8 @@ def test_a_broker_that_hung_is_not_told_of_what_is_old(broker, monkeypatch):
         link.flush()
         time.sleep(1.1)
         broker.go_on()
-        flush_until(link, lambda: "a" in listener.values)
+        flush_until(link, lambda: "a" in listener.values and not link._events)
+        monkeypatch.setattr(connection, "_TIMELY_SECONDS", 60.0)
         link.send("c", "new")
         flush_until(link, lambda: "c" in listener.values)
         assert "b" not in listener.values

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from datetime import date
 from pathlib import Path
 
@@ -55,11 +56,24 @@ def test_a_week_becomes_a_picture(tmp_path):
     assert (tmp_path / "week.png").read_bytes().startswith(b"\x89PNG")
 
 
+def wait_until_watching(process):
+    """Wait until a process is told by the kernel of what changes in a folder."""
+    deadline = time.monotonic() + 120
+    is_watching = False
+    while not is_watching:
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+        with suppress(FileNotFoundError):  # it closes one
+            descriptors = Path(f"/proc/{process.pid}/fdinfo").iterdir()
+            is_watching = any("inotify wd" in each.read_text() for each in descriptors)
+
+
 def test_labels_are_printed_while_they_are_recorded(day, model_file, tmp_path):
     (tmp_path / "logs").mkdir()
     command = [sys.executable, EXAMPLES / "follow_live.py", tmp_path / "logs"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as following:
-        time.sleep(2)  # until it looks
+        wait_until_watching(following)
         record = ["record", day, "--model", model_file, "--output", tmp_path / "logs"]
         subprocess.run([*HEARTHLOG, *record], check=True, capture_output=True)
         line = following.stdout.readline()
