@@ -412,8 +412,9 @@ class _Batch(NamedTuple):
         if (heads["length"] + HEAD.size).sum() > len(self.buffer):
             raise self._damaged(number[0], _WRONG_INDEX)  # it leads to some of them twice
         offsets = starts + MESSAGE_HEAD.itemsize
-        if (np.diff(heads["log_time"]) < 0).any():
-            order = np.argsort(heads["log_time"], kind="stable")
+        times = heads["log_time"]
+        if (times[1:] < times[:-1]).any():
+            order = np.argsort(times, kind="stable")
             offsets, heads = offsets[order], heads[order]
         schema = self.file.schemas.get(channel.schema_id)
         return RawMessages(channel, schema, self.buffer, offsets, heads, self.file.path)
