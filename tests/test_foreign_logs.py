@@ -1,13 +1,17 @@
 """Logs that others wrote: what is whole in them is read, and what is left out is named."""
 
+import json
+import struct
 from functools import partial
 
 import pytest
-from bags import INT32, STRING, T0, Bag, int32, string
+from bags import INT32, STRING, T0, Bag, definition, int32, string
+from mcap.writer import IndexType
 from spliced import run
 
 import hearthlog as package
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.messages.type_definitions import message_type
 
 TYPE = "our_msgs/msg/C"
@@ -194,3 +198,203 @@ def test_a_type_is_understood_whatever_form_its_name_has(bag, name):
 def test_an_empty_definition_of_a_known_type_is_that_type(bag):
     bag.add(bag.channel("/i", INT32, ""), int32(7), T0)
     assert package.open_logs(bag.close()).columns("/i")["data"].tolist() == [7]
+
+
+# Times that no calendar has
+
+LATE = [2**63 - 1, 2**63, 2**64 - 1]
+FORMS = {
+    "chunks with an index": {},
+    "small chunks": {"chunk_size": 1},
+    "chunks without an index": {"index_types": IndexType.NONE, "use_statistics": False},
+    "no chunks": {"use_chunking": False},
+    "nothing but records": {
+        "use_chunking": False,
+        "use_statistics": False,
+        "index_types": IndexType.NONE,
+    },
+}
+
+
+def late_bag(path, options, times):
+    """Numbers 0 to 3 at their times, and 99 at others."""
+    bag = Bag(path, **options)
+    numbers = bag.channel("/i", INT32)
+    for i in range(4):
+        if i == 2:
+            for time in times:
+                bag.add(numbers, int32(99), time)
+        bag.add(numbers, int32(i), T0 + i)
+    bag.writer.add_attachment(2**64 - 1, 2**64 - 1, "note", "text/plain", b"abc")
+    return bag.close()
+
+
+@pytest.mark.parametrize("options", FORMS.values(), ids=FORMS)
+@pytest.mark.parametrize("times", [LATE[:1], LATE[1:2], LATE])
+def test_of_a_clock_that_ran_below_zero_all_else_is_read(tmp_path, hearthlog, options, times):
+    path = late_bag(tmp_path / "late.mcap", options, times)
+    done = hearthlog("cat", path)
+    assert [line.rpartition("=")[2] for line in done.stdout.splitlines()] == list("0123")
+    assert done.returncode == 3
+    assert done.stderr == (
+        f"hearthlog: {path}: messages are left out whose log times are after the year 2262, as of "
+        "a clock below zero\n"
+    )
+    assert hearthlog("cat", path, "--end", "2024-01-01").stdout == done.stdout
+    info = hearthlog("info", path, "--json")
+    about = json.loads(info.stdout)
+    assert about["topics"]["/i"]["messages"] == 4
+    assert about["end"].startswith("2023-11-14")
+
+
+@pytest.mark.parametrize("options", FORMS.values(), ids=FORMS)
+def test_recover_loses_the_messages_of_such_a_time_alone(tmp_path, hearthlog, options):
+    path = late_bag(tmp_path / "late.mcap", options, LATE)
+    done = hearthlog("recover", path, "--output", tmp_path / "new.mcap")
+    assert done.returncode == 3
+    assert "4 " in done.stderr.splitlines()[0]
+    assert "log times after the year 2262 at byte" in done.stderr
+    assert "damaged" not in done.stderr
+    columns = package.open_logs(tmp_path / "new.mcap").columns("/i")
+    assert columns["data"].tolist() == [0, 1, 2, 3]
+    assert hearthlog("doctor", tmp_path / "new.mcap").returncode in {0, 3}
+    assert "[late]" in hearthlog("doctor", path).stdout
+
+
+def test_a_publish_time_that_no_calendar_has_is_told(bag, hearthlog):
+    bag.add(bag.channel("/i", INT32), int32(7), T0, publish_time=2**64 - 1)
+    done = hearthlog("cat", bag.close(), "--topics", "/i", "--format", "ndjson")
+    assert '"publish_time":9223372036.854775806' in done.stdout
+    assert (done.returncode, "2262-04-11 stands for them" in done.stderr) == (3, True)
+
+
+# What the index does not list, and what MCAP leaves to others
+
+
+def record(opcode, content):
+    return bytes([opcode]) + struct.pack("<Q", len(content)) + content
+
+
+def text(value):
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def loose(channel, value, time):
+    return record(5, struct.pack("<HIQQ", channel, 0, time, time) + int32(value))
+
+
+def defined(number, topic):
+    """The schema and the channel of a topic of numbers, both of one number."""
+    schema = struct.pack("<H", number) + text(INT32) + text("ros2msg") + text(definition(INT32))
+    channel = struct.pack("<HH", number, number) + text(topic) + text("cdr") + text("")
+    return record(3, schema) + record(4, channel)
+
+
+def with_inserted(path, inserted, messages=0):
+    """Put records before the Data End of a bag, and count messages in its statistics."""
+    data = path.read_bytes()
+    summary, offsets, _ = struct.unpack("<QQI", data[-28:-8])
+    end = data.rfind(record(15, b"")[:1] + struct.pack("<Q", 4), 0, summary)
+    index = bytearray(data[summary:offsets])
+    place = index.find(b"\x0b" + struct.pack("<Q", 56)) + 9
+    (count,) = struct.unpack_from("<Q", index, place)
+    struct.pack_into("<Q", index, place, count + messages)
+    head = data[:end] + inserted + record(15, bytes(4))
+    footer = record(2, struct.pack("<QQI", len(head), 0, 0))
+    path.write_bytes(head + index + footer + data[:8])
+    return path
+
+
+@pytest.fixture
+def numbers(tmp_path):
+    """A bag of 50 numbers in five chunks."""
+    bag = Bag(tmp_path / "numbers.mcap", chunk_size=500)
+    channel = bag.channel("/i", INT32)
+    for i in range(50):
+        bag.add(channel, int32(i), T0 + i)
+    return bag.close()
+
+
+def test_messages_outside_of_chunks_are_read_where_the_index_does_not_list_them(numbers, hearthlog):
+    path = with_inserted(numbers, loose(1, 50, T0 + 50), 1)
+    done = hearthlog("cat", path)
+    assert done.returncode == 0
+    assert [line.rpartition("=")[2] for line in done.stdout.splitlines()] == [
+        str(i) for i in range(51)
+    ]
+    assert len(package.open_logs(path).columns("/i")) == 51
+
+
+def test_a_topic_of_messages_outside_of_chunks_alone_is_listed_and_read(numbers, hearthlog):
+    path = with_inserted(numbers, defined(9, "/loose") + loose(9, 7, T0 + 7), 1)
+    logs = package.open_logs(path)
+    assert logs.topics == {"/i": INT32, "/loose": INT32}
+    assert logs.columns("/loose")["data"].tolist() == [7]
+    assert "/loose" in hearthlog("info", path).stdout
+
+
+PRIVATE = record(0xC1, b"x" * 20)
+
+
+@pytest.mark.parametrize(
+    "between",
+    [PRIVATE, PRIVATE * 40, record(0xFF, b""), record(0x20, b"later")],
+    ids=["one", "many", "empty", "of a later version"],
+)
+@pytest.mark.parametrize("ending", ["", "end"])
+def test_recover_keeps_what_stands_beside_records_that_are_not_known(
+    tmp_path, hearthlog, between, ending
+):
+    parts = [
+        defined(1, "/a"),
+        loose(1, 1, T0),
+        between,
+        loose(1, 2, T0 + 1),
+        between * bool(ending),
+    ]
+    path = tmp_path / "private.mcap"
+    head = MAGIC + record(1, text("ros2") + text("x"))
+    end = record(15, bytes(4)) + record(2, bytes(20)) + MAGIC
+    path.write_bytes(head + b"".join(parts) + end)
+    done = hearthlog("recover", path, "--output", tmp_path / "new.mcap")
+    assert (done.returncode, done.stderr) == (0, f"hearthlog: {path}: 2 messages saved\n")
+    new = tmp_path / "new.mcap"
+    assert package.open_logs(new).columns("/a")["data"].tolist() == [1, 2]
+    assert between in new.read_bytes()
+
+
+def test_recover_keeps_a_chunk_with_records_that_are_not_known(tmp_path, hearthlog):
+    content = defined(1, "/a") + loose(1, 1, T0) + PRIVATE + loose(1, 2, T0 + 1)
+    chunk = struct.pack("<QQQIIQ", T0, T0 + 1, len(content), 0, 0, len(content)) + content
+    path = tmp_path / "private.mcap"
+    head = MAGIC + record(1, text("ros2") + text("x")) + PRIVATE
+    path.write_bytes(
+        head + record(6, chunk) + PRIVATE + record(15, bytes(4)) + record(2, bytes(20)) + MAGIC
+    )
+    done = hearthlog("recover", path, "--output", tmp_path / "new.mcap")
+    assert (done.returncode, done.stderr) == (0, f"hearthlog: {path}: 2 messages saved\n")
+
+
+# Files that are not MCAP, but could be
+
+OTHERS = {
+    "bag.mcap.zstd": (b"\x28\xb5\x2f\xfd", "compressed as a whole: `zstd -d"),
+    "bag.mcap.lz4": (b"\x04\x22\x4d\x18", "compressed as a whole: `lz4 -d"),
+    "bag.mcap.gz": (b"\x1f\x8b", "compressed as a whole: `gzip -d"),
+    "bag.db3": (b"SQLite format 3\0", "a bag in SQLite, no MCAP: `ros2 bag convert`"),
+    "old.bag": (b"#ROSBAG V2.0\n", "a bag of ROS 1, no MCAP: `rosbags-convert`"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "what"), [(k, *v) for k, v in OTHERS.items()], ids=OTHERS
+)
+def test_what_else_a_bag_may_be_is_named(tmp_path, hearthlog, name, start, what):
+    path = tmp_path / "bag" / name
+    path.parent.mkdir()
+    path.write_bytes(start + bytes(100))
+    for verb in ("info", "cat", "recover"):
+        done = hearthlog(verb, path)
+        assert (done.returncode, what in done.stderr) == (1, True)
+    assert what in hearthlog("doctor", path).stdout
+    assert what in hearthlog("info", path.parent).stderr

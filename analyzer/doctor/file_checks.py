@@ -29,7 +29,7 @@ from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.mcap.chunks import read_in_batches
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
+from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC, not_mcap
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import read_footer
@@ -87,7 +87,10 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
     active = findings.path.name.endswith(ACTIVE_SUFFIX)
     magic = source.take(len(MAGIC))
     if magic != MAGIC and not (active and MAGIC.startswith(magic)):
-        findings.error("magic", "is no MCAP file: it does not begin as one")
+        what = not_mcap(source.at(0, 2 * len(MAGIC)))
+        if what == not_mcap(b""):
+            what = f"{what}: it does not begin as one"
+        findings.error("magic", what)
         return
     finished = source.size > len(MAGIC) and source.tail(len(MAGIC)) == MAGIC
     outline = _outline(findings.path, source)

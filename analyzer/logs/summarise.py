@@ -99,7 +99,7 @@ def _name(file: LogFile, location: RecordLocation) -> str:
 
 def _is_counted(file: LogFile) -> bool:
     """Tell whether the index says how many messages each channel has, and which these are."""
-    if file.statistics is None:
+    if file.statistics is None or file.late:
         return False
     counts = file.statistics.channel_message_counts
     is_whole = sum(counts.values()) == file.statistics.message_count

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
 from hearthlog.schemas.mcap.statistics import topic_counts
@@ -362,10 +363,20 @@ def _decode(
         schema.name,
         raw.channel.metadata,
         np.ascontiguousarray(raw.heads["log_time"]),
-        np.ascontiguousarray(raw.heads["publish_time"]),
+        _publish_times(raw),
         np.ascontiguousarray(raw.heads["sequence"]),
         values,
     )
+
+
+def _publish_times(raw: RawMessages) -> Int64:
+    times = np.ascontiguousarray(raw.heads["publish_time"])
+    late = times < 0  # 2**63 or more, in the file
+    if late.any():
+        text = "publish times after the year 2262 are not known here: 2262-04-11 stands for them"
+        warnings.warn(HearthlogWarning(text, raw.channel.topic), stacklevel=2)
+        return np.where(late, LAST_TIME, times)
+    return times
 
 
 def join(parts: Sequence[Columns]) -> Columns:

@@ -3,15 +3,17 @@
 import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.formats import OTHER_SUFFIXES, not_mcap
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
-from hearthlog.schemas.storage.regular_file import may_be_regular
+from hearthlog.schemas.storage.regular_file import may_be_regular, open_regular
 from hearthlog.schemas.times import NANOSECONDS
 
 SUFFIX = ".mcap"
@@ -23,6 +25,7 @@ _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder: itself a folder of parts
 CATALOG_INDEX = "catalog.index"  # of their spans of time, beside it
 ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
+_LOOKED_AT = 1000  # entries of a folder without logs
 CUT = "_cut"  # ends the name of one that is a span of a log, without its suffix
 
 
@@ -256,13 +259,22 @@ def _find_local(path: Path) -> list[Path]:
     if path.is_dir():
         logs = sorted(Path(entry.path) for entry in walk_logs(path))
         if not logs:
-            raise LogError(f"{path}: no log (*{SUFFIX}) in this folder")
+            raise LogError(f"{path}: no log (*{SUFFIX}) in this folder{_others_in(path)}")
         return logs
     if not path.exists():
         raise LogError(f"{path}: no such log")
     if not may_be_regular(path):
         raise LogError(f"{path}: cannot be read (Not a regular file)")
     return [path]
+
+
+def _others_in(folder: Path) -> str:
+    """Name a file that is a log in another form, in a folder without logs."""
+    entries = (entry for entry in islice(folder.rglob("*"), _LOOKED_AT))
+    for other in sorted(entry for entry in entries if entry.suffix in OTHER_SUFFIXES):
+        with suppress(OSError), os.fdopen(open_regular(other), "rb") as stream:
+            return f": {other.name} {not_mcap(stream.read(16))}"
+    return ""
 
 
 def walk_logs(folder: Path) -> Iterator["os.DirEntry[str]"]:

@@ -78,6 +78,10 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
     channels = heads["channel"]
     entries = np.empty(len(starts), INDEX_ENTRIES)
     entries["time"], entries["offset"] = heads["log_time"], starts
+    channels = channels.copy()
+    del heads  # a copy of millions
+    if (channels == channels[0]).all():  # no need to sort them
+        return {int(channels[0]): entries.tobytes()}
     order = np.argsort(channels, kind="stable")
     numbers, firsts, counts = np.unique(channels, return_index=True, return_counts=True)
     ends = np.cumsum(counts)

@@ -23,6 +23,7 @@ CHUNKS = np.dtype(
         ("channels", "<i8"),  # a place in `LogFile.channel_sets`
     ]
 )
+LAST_TIME = (1 << 63) - 2  # ns; later log times, as of clocks that ran below zero, are not read
 _EMPTY = 80  # bytes that a chunk without records has at most
 _RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
 
@@ -37,7 +38,10 @@ class RecordLocation(NamedTuple):
 
 @dataclass
 class ChunkRow:
-    """A row of `CHUNKS` in the making, and the channels whose message indexes follow the chunk."""
+    """A row of `CHUNKS` in the making, and the channels whose message indexes follow the chunk.
+
+    Log times after `LAST_TIME` are that time in it, and it is `late` then.
+    """
 
     offset: int
     length: int
@@ -46,6 +50,7 @@ class ChunkRow:
     start: int
     end: int
     channels: set[int] = field(default_factory=set)
+    late: bool = False
 
     def numbers(self) -> tuple[int, ...]:
         """Return the numbers of the row, without its channels."""
@@ -56,7 +61,7 @@ class ChunkRow:
 
         It does if it begins where the run ends, and the run is not too long yet.
         """
-        is_next = self.offset + self.length == location.offset
+        is_next = self.offset + self.length == location.offset and not self.late
         return self.index_length < 0 and is_next and self.length < _RUN_LIMIT
 
     def extend(self, message: "ChunkRow") -> None:
@@ -71,6 +76,7 @@ class ChunkRow:
         self.size += message.size
         self.start = min(self.start, message.start)
         self.end = max(self.end, message.end)
+        self.late |= message.late
 
 
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
@@ -92,7 +98,7 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     Raises
     ------
     McapError
-        If it is too short, or a log time or a size is 2**63 or more.
+        If it is too short, or a size is 2**63 or more.
     """
     opcode, offset, length = location
     try:
@@ -104,9 +110,7 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
             size, index_length = length, -1
     except struct.error as error:
         raise McapError("a record is too short") from error
-    if max(start, end, size) >= 1 << 63:
-        raise McapError("a number is out of range")
-    return ChunkRow(offset, length, index_length, size, start, end)
+    return _row((offset, length, index_length, size), start, end)
 
 
 def read_chunk_index(content: bytes) -> ChunkRow:
@@ -120,7 +124,7 @@ def read_chunk_index(content: bytes) -> ChunkRow:
     Raises
     ------
     McapError
-        If a place, a log time or a size is 2**63 or more.
+        If a place or a size is 2**63 or more.
     struct.error
         If the content is shorter than it claims, or holds a part of an index offset.
     """
@@ -132,9 +136,17 @@ def read_chunk_index(content: bytes) -> ChunkRow:
     index_length, text = formats.CHUNK_INDEX_TAIL.unpack_from(content, first)
     first += formats.CHUNK_INDEX_TAIL.size + text + formats.UINT64.size
     (size,) = formats.UINT64.unpack_from(content, first)
-    if max(offset + length + index_length, start, end, size) >= 1 << 63:
+    row = _row((offset, length, index_length, size), start, end)
+    row.channels = channels
+    return row
+
+
+def _row(sizes: tuple[int, int, int, int], start: int, end: int) -> ChunkRow:
+    """Make a row of offset, length, length of the indexes and size, and of two log times."""
+    if max(sum(sizes[:3]), sizes[3]) > LAST_TIME:
         raise McapError("a number is out of range")
-    return ChunkRow(offset, length, index_length, size, start, end, channels)
+    late = max(start, end) > LAST_TIME
+    return ChunkRow(*sizes, min(start, LAST_TIME), min(end, LAST_TIME), late=late)
 
 
 def not_empty(chunks: NDArray[np.void]) -> NDArray[np.void]:

@@ -114,6 +114,14 @@ class ChunkWriter:
         self._stream.write(record)
         self._attachments.append(replace(index, offset=offset, length=len(record)))
 
+    def copy_record(self, record: bytes) -> None:
+        """Write a record of a kind that no index lists, as another file holds it.
+
+        The chunk in progress is written before it.
+        """
+        self.flush()
+        self._stream.write(record)
+
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Add a schema.
 

@@ -1,6 +1,8 @@
 """The messages of many chunks at once, still encoded, by the message indexes behind each chunk."""
 
 import hashlib
+import warnings
+from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
@@ -13,16 +15,17 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64, gather
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.chunk_table import not_empty
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME, not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
 
+_LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
@@ -261,7 +264,7 @@ def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
 
 def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.void]]:
     """Go through the records of a chunk: add its definitions to the file, make its index."""
-    starts: list[int] = []
+    starts = array("q")
     for opcode, start, end in iterate_records(content):
         if opcode == Opcode.MESSAGE and end - start >= MESSAGE_HEAD.itemsize:
             starts.append(start)
@@ -271,7 +274,7 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
                 file.schemas.setdefault(record.id, record)
             elif isinstance(record, records.Channel):
                 file.channels.setdefault(record.id, record)
-    made = index_messages(content, np.array(starts, np.int64))
+    made = index_messages(content, np.frombuffer(starts, np.int64))
     return {channel: np.frombuffer(rows, formats.INDEX_ENTRIES) for channel, rows in made.items()}
 
 
@@ -390,6 +393,11 @@ class _Batch(NamedTuple):
             raise self._damaged(number[inside.argmin()], _WRONG_INDEX)
         starts = entries["offset"] + (np.cumsum(self.sizes) - self.sizes)[number]
         heads = gather_heads(self.buffer, starts)
+        late = (heads["log_time"] < 0) | (heads["log_time"] > LAST_TIME)
+        if late.any() and self.file.late:
+            warnings.warn(HearthlogWarning(_LATE, self.file.path, each=True), stacklevel=2)
+            entries, number, rest = entries[~late], number[~late], rest[~late]
+            starts, heads = starts[~late], heads[~late]
         sound = (
             (heads["opcode"] == Opcode.MESSAGE)
             & (heads["channel"] == identity)
@@ -404,8 +412,9 @@ class _Batch(NamedTuple):
         if (heads["length"] + HEAD.size).sum() > len(self.buffer):
             raise self._damaged(number[0], _WRONG_INDEX)  # it leads to some of them twice
         offsets = starts + MESSAGE_HEAD.itemsize
-        if (np.diff(heads["log_time"]) < 0).any():
-            order = np.argsort(heads["log_time"], kind="stable")
+        times = heads["log_time"]
+        if (times[1:] < times[:-1]).any():
+            order = np.argsort(times, kind="stable")
             offsets, heads = offsets[order], heads[order]
         schema = self.file.schemas.get(channel.schema_id)
         return RawMessages(channel, schema, self.buffer, offsets, heads, self.file.path)

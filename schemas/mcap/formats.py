@@ -55,3 +55,28 @@ ATTACHMENT = struct.Struct("<QQI")  # log time, time of creation, length of the 
 SUMMARY_OFFSET = struct.Struct("<9xBQQ")  # with HEAD: opcode, start and length of a group
 FOOTER = struct.Struct("<QQ")  # start of the summary, start of the summary offsets; CRC (UINT32)
 FOOTER_SIZE = HEAD.size + FOOTER.size + UINT32.size + len(MAGIC)
+_OTHERS = {  # formats that are taken for MCAP, by how they begin, and what makes MCAP of them
+    b"\x28\xb5\x2f\xfd": "is compressed as a whole: `zstd -d -o NEW.mcap` makes a log of it",
+    b"\x04\x22\x4d\x18": "is compressed as a whole: `lz4 -d` makes a log of it",
+    b"\x1f\x8b": "is compressed as a whole: `gzip -d` makes a log of it",
+    b"BZh": "is compressed as a whole: `bzip2 -d` makes a log of it",
+    b"\xfd7zXZ\0": "is compressed as a whole: `xz -d` makes a log of it",
+    b"PK\3\4": "is an archive: `unzip` takes out what is in it",
+    b"SQLite format 3\0": "is a bag in SQLite, no MCAP: `ros2 bag convert` makes MCAP of it",
+    b"#ROSBAG": "is a bag of ROS 1, no MCAP: `rosbags-convert` makes a bag of ROS 2 of it",
+}
+OTHER_SUFFIXES = (*(".zst", ".zstd", ".lz4", ".gz", ".bz2", ".xz"), ".db3", ".bag")
+
+
+def not_mcap(start: bytes) -> str:
+    """Say what a file is that does not begin as MCAP does.
+
+    Parameters
+    ----------
+    start : bytes
+        The first 16 bytes of it, or all.
+    """
+    for magic, what in _OTHERS.items():
+        if start.startswith(magic):
+            return what
+    return "is no MCAP file"

@@ -18,13 +18,23 @@ from numpy.typing import NDArray
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap.chunk_table import (
     CHUNKS,
+    LAST_TIME,
     ChunkRow,
     RecordLocation,
     by_start,
     read_chunk_index,
     read_chunk_row,
 )
-from hearthlog.schemas.mcap.formats import FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
+from hearthlog.schemas.mcap.formats import (
+    FOOTER,
+    FOOTER_SIZE,
+    HEAD,
+    INDEX_ENTRIES,
+    MAGIC,
+    MESSAGE_INDEX_HEAD,
+    UINT16,
+    not_mcap,
+)
 from hearthlog.schemas.mcap.record_walk import read_records, walk_records
 from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
@@ -62,6 +72,8 @@ class LogFile:
         All chunks that were met so far, by start time.
     channel_sets : list of frozenset of int
         Channels with messages in a chunk; the empty set if the file does not tell which.
+    late : bool
+        Whether there may be messages with log times after `LAST_TIME`, which are not read.
     record_locations : list of RecordLocation
         Of metadata records and attachments.
     statistics : mcap.records.Statistics or None
@@ -77,6 +89,7 @@ class LogFile:
         self.path, self._file = open_log(path)
         self.complete = False
         self.ended = False
+        self.late = False
         self.header: records.Header | None = None
         self.schemas: dict[int, records.Schema] = {}
         self.channels: dict[int, records.Channel] = {}
@@ -224,10 +237,11 @@ class LogFile:
         )
 
     def _check_magic(self) -> None:
-        magic = self.read(0, len(MAGIC))
+        start = self.read(0, 2 * len(MAGIC))
+        magic = start[: len(MAGIC)]
         if magic == MAGIC or (self.path.name.endswith(ACTIVE_SUFFIX) and MAGIC.startswith(magic)):
             return  # at first a writer has written less than that
-        raise LogError(f"{self.path}: is no MCAP file")
+        raise LogError(f"{self.path}: {not_mcap(start)}")
 
     def _find_chunks(self) -> None:
         end = self.size - FOOTER_SIZE
@@ -245,7 +259,33 @@ class LogFile:
         if not len(self.chunks) and (self.statistics is None or self.statistics.message_count):
             self._forget()
             return False
+        if not self._lists_all_messages():
+            self._walk_between(footer.summary_start)
         return True
+
+    def _lists_all_messages(self) -> bool:
+        """Tell whether the message indexes of all chunks have as many entries as are counted."""
+        if self.statistics is None:
+            return False
+        counts = np.array([len(channels) for channels in self.channel_sets] or [0])
+        heads = counts[self.chunks["channels"]] * MESSAGE_INDEX_HEAD.itemsize
+        size = int((self.chunks["index_length"] - heads).sum())
+        return size == self.statistics.message_count * INDEX_ENTRIES.itemsize
+
+    def _walk_between(self, end: int) -> None:
+        """Find what the index does not list, such as messages outside of chunks."""
+        places = [(each.offset, each.length) for each in self.record_locations]
+        chunks = self.chunks
+        starts = np.array([place for place, _ in places] + [end], np.int64)
+        ends = np.array([sum(place) for place in places] + [end], np.int64)
+        starts = np.concatenate([chunks["offset"], starts])
+        ends = np.concatenate([chunks["offset"] + chunks["length"] + chunks["index_length"], ends])
+        order = np.argsort(starts, kind="stable")
+        behind = np.concatenate([[len(MAGIC)], np.maximum.accumulate(ends[order])[:-1]])
+        rows = array("q")
+        for gap in np.flatnonzero(behind < starts[order]).tolist():
+            self._add_row(rows, self._walk(rows, int(behind[gap]), int(starts[order[gap]])))
+        self._add_chunks(rows)
 
     def _read_summary(self, footer: records.Footer, end: int) -> bool:
         """Read the summary, and return whether it is sound."""
@@ -287,11 +327,25 @@ class LogFile:
             If a record is damaged, or the file cannot be read.
         """
         rows = array("q")
+        row = self._walk(rows, self._end, self.size)
+        if self.complete and not self.ended:
+            raise self.damaged(self._end, "a record claims to be longer than the file")
+        if row is not None:  # its indexes may not all be there yet
+            row.index_length = min(row.index_length, 0)
+            row.channels.clear()
+        self._add_row(rows, row)
+        return self._add_chunks(rows)
+
+    def _walk(self, rows: "array[int]", start: int, end: int) -> ChunkRow | None:
+        """Walk from record to record up to a byte; return the last row, which may not be whole.
+
+        The rows before it are added to `rows`, `_end` is where the last whole record ends, and
+        `ended` whether the data end there.
+        """
         row: ChunkRow | None = None
-        size = self.size
-        for opcode, offset, length, head in walk_records(self.read, self._end):
+        for opcode, offset, length, head in walk_records(self.read, start):
             self.ended = opcode in _ENDS
-            if self.ended or opcode == 0 or offset + length > size:
+            if self.ended or opcode == 0 or offset + length > end:
                 break
             self._end = offset + length
             if opcode == Opcode.MESSAGE_INDEX and row is not None:
@@ -307,20 +361,36 @@ class LogFile:
             self._add_row(rows, row)
             row = chunk
             self._note(location)
-        if self.complete and not self.ended:
-            raise self.damaged(self._end, "a record claims to be longer than the file")
-        if row is not None:  # its indexes may not all be there yet
-            row.index_length = min(row.index_length, 0)
-            row.channels.clear()
-        self._add_row(rows, row)
+        return row
+
+    def _add_chunks(self, rows: "array[int]") -> NDArray[np.void]:
+        """Add rows to `chunks`; return them."""
         chunks = by_start(np.frombuffer(rows, CHUNKS))
         if len(chunks):
             self.chunks = by_start(np.concatenate([self.chunks, chunks]))
         return chunks
 
     def _add_row(self, rows: "array[int]", row: ChunkRow | None) -> None:
-        if row is not None:
-            rows.extend([*row.numbers(), self._channel_set(frozenset(row.channels))])
+        if row is None:
+            return
+        if row.late:
+            self.late = True
+            row.end = self._last_time(row)
+        rows.extend([*row.numbers(), self._channel_set(frozenset(row.channels))])
+
+    def _last_time(self, row: ChunkRow) -> int:
+        """Find the last log time of a chunk up to `LAST_TIME` by the message indexes behind it."""
+        last, offset, end = -1, row.offset + row.length, min(row.offset + row.length, self.size)
+        if 0 < row.index_length <= LIMIT:
+            end += row.index_length
+        for opcode, start, length, _ in walk_records(self.read, offset):
+            if opcode != Opcode.MESSAGE_INDEX or start + length > end:
+                break
+            first = start + MESSAGE_INDEX_HEAD.itemsize
+            raw = self.read(first, max(start + length - first, 0))
+            times = np.frombuffer(raw, INDEX_ENTRIES, len(raw) // INDEX_ENTRIES.itemsize)["time"]
+            last = max(last, int(times[times <= LAST_TIME].max(initial=-1)))
+        return row.end if last < row.start else last
 
     def _note(self, location: RecordLocation) -> None:
         if location.opcode in {Opcode.METADATA, Opcode.ATTACHMENT}:
@@ -359,6 +429,7 @@ class LogFile:
 
     def _forget(self) -> None:
         self.header = None
+        self.late = False
         self.chunks = np.empty(0, CHUNKS)
         self.schemas.clear()
         self.channels.clear()

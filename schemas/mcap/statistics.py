@@ -13,6 +13,7 @@ from mcap.records import McapRecord
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_records import iterate_records
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.formats import FOOTER, FOOTER_SIZE, HEAD, SUMMARY_OFFSET
 from hearthlog.schemas.mcap.logfile import LogFile, open_log
 from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
@@ -74,6 +75,8 @@ def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
     if statistics is None:
         return None
     times = statistics.message_start_time, statistics.message_end_time
+    if max(times) > LAST_TIME:
+        return None
     return (times if statistics.message_count else None,)
 
 

@@ -39,6 +39,7 @@ class Damage:
     times: tuple[int, int] | None = None  # log times of the first and last of them
     others: tuple[str, ...] = ()  # names of lost metadata records and attachments
     cut: bool = False  # whether the file just ends here
+    sound: bool = False  # whether the file is whole here, and something is left out all the same
 
     @property
     def lossless(self) -> bool:
@@ -46,7 +47,9 @@ class Damage:
         return self.exact and not self.messages and not self.others
 
     def __str__(self) -> str:
-        where = f"damaged at byte {self.start} ({self.why})"
+        where = f"{self.why} at byte {self.start}"
+        if not self.sound:
+            where = f"damaged at byte {self.start} ({self.why})"
         if self.lossless:
             return f"{where}: nothing is lost"
         lost = [f"{count} of {topic}" for topic, count in sorted(self.messages.items())]

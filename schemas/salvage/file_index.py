@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import (
     FOOTER,
@@ -28,7 +29,12 @@ from hearthlog.schemas.mcap.formats import (
 from hearthlog.schemas.mcap.records import read_footer
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
-from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk, WholeRecord
+from hearthlog.schemas.salvage.whole_records import (
+    UnknownRecord,
+    WholeAttachment,
+    WholeChunk,
+    WholeRecord,
+)
 
 _BLOCK = 1 << 20
 _DATA_END = HEAD.pack(Opcode.DATA_END, UINT32.size)
@@ -158,14 +164,15 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int, *, moved: bo
             messages = record.channel_message_counts
         elif isinstance(record, records.ChunkIndex):
             chunks.extend([record.chunk_start_offset, record.chunk_length])
-            chunks.extend([record.message_index_length, record.message_start_time])
-            chunks.extend([record.message_end_time, offset])
+            chunks.append(record.message_index_length)
+            times = record.message_start_time, record.message_end_time
+            chunks.extend([*(min(time, LAST_TIME) for time in times), offset])
         elif isinstance(record, records.MetadataIndex):
             if record.name != rosbag2.METADATA:  # it is made anew
                 names[record.offset] = _name_of(record)
         elif isinstance(record, records.AttachmentIndex):
             names[record.offset] = _name_of(record)
-        elif not isinstance(record, records.SummaryOffset):
+        elif not isinstance(record, records.SummaryOffset | UnknownRecord):
             raise McapError("here should be the index")
         offset = whole.end
     table = np.array(chunks, np.int64).reshape(-1, 6)

@@ -6,6 +6,7 @@ add up to the length before it, or to less: the format allows that records grow 
 
 import struct
 import zlib
+from contextlib import suppress
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -13,14 +14,18 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.mcap.chunk_records import index_messages
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES, MAGIC, MESSAGE_INDEX, UINT64
+from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
 from hearthlog.schemas.salvage.whole_records import WholeChunk, WholeRecord
 from hearthlog.schemas.storage.byte_ranges import LocalFile
 
+_VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # have lengths inside
+_UNKNOWN_CHAIN = 16  # records of unknown kinds in a row
 _LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format may add
 
 
@@ -97,13 +102,15 @@ class RecordVerifier:
         opcode, length = HEAD.unpack(data)
         return opcode, length
 
-    def ends(self, offset: int) -> tuple[int, int]:
+    def ends(self, offset: int, kind: int | None = None) -> tuple[int, int]:
         """Find where a record ends by the length before it, and by the lengths inside of it.
 
         Parameters
         ----------
         offset : int
             Byte of the file at which the record begins.
+        kind : int, optional
+            Opcode of a record of this kind; by default the one that it has.
 
         Returns
         -------
@@ -121,7 +128,7 @@ class RecordVerifier:
         opcode, length = self.head(offset)
         outer = offset + HEAD.size + length
         inner = offset + HEAD.size
-        for field in FIELDS.get(opcode, (length,)):
+        for field in FIELDS.get(opcode if kind is None else kind, (length,)):
             if isinstance(field, int):
                 inner += field
                 continue
@@ -156,11 +163,17 @@ class RecordVerifier:
         """
         if offset >= self.end:
             return offset == self.end
-        data = self.read(offset, HEAD.size)
-        if len(data) < HEAD.size:
-            return bool(SHORTEST[data[0]] < UNKNOWN) or MAGIC.startswith(data)
-        opcode, length = HEAD.unpack(data)
-        return bool(SHORTEST[opcode] <= length <= LIMIT) or data.startswith(MAGIC)
+        for _ in range(_UNKNOWN_CHAIN):
+            data = self.read(offset, HEAD.size)
+            if len(data) < HEAD.size:
+                return bool(SHORTEST[data[0]] < UNKNOWN) or MAGIC.startswith(data)
+            opcode, length = HEAD.unpack(data)
+            if opcode <= Opcode.DATA_END or data == MAGIC[: HEAD.size]:
+                return bool(SHORTEST[opcode] <= length <= LIMIT) or data.startswith(MAGIC)
+            offset += HEAD.size + length  # it is known by what follows alone
+            if offset >= self.end:
+                return offset == self.end
+        return True
 
     def whole(self, offset: int, chained: int = 1) -> WholeRecord:
         """Read a record, if it is whole.
@@ -183,10 +196,16 @@ class RecordVerifier:
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
             return self.chunk(offset)
+        if opcode > Opcode.DATA_END and chained == 1:
+            return self._unknown(offset, opcode, length)
         if length < SHORTEST[opcode]:
             raise McapError("a record of unknown kind, or too short")
         if opcode == Opcode.MESSAGE:
             return self._message(offset, chained)
+        return self._framed(offset, opcode)
+
+    def _framed(self, offset: int, opcode: int) -> WholeRecord:
+        """Read a record whose inner lengths tell where it ends."""
         outer, inner = self.ends(offset)
         end = outer if self._is_padded(inner, outer) else inner
         wrong = "" if end == outer else "the length of a record"
@@ -258,16 +277,45 @@ class RecordVerifier:
             break
         messages, others = whole_records.split_content(content)
         self.inner += len(messages) + len(others)
-        definitions = whole_records.read_definitions(content, others)
         entries = index_messages(content, messages)
         span = whole_records.span_of(entries)
         agrees = not entries or span == (start, end)
         wrong = "" if exact and agrees else "the head of a chunk"
-        chunk = StoredChunk(compression, data, size, checksum, *span, entries)
+        late: dict[int, int] = {}
+        if span[1] > LAST_TIME:
+            times = gather_heads(content, messages)["log_time"].astype(np.uint64)
+            starts = messages[times > LAST_TIME]
+            late = {
+                channel: len(rows) // INDEX_ENTRIES.itemsize
+                for channel, rows in index_messages(content, starts).items()
+            }
+            content = whole_records.without_messages(content, starts)
+            messages, others = whole_records.split_content(content)
+            entries = index_messages(content, messages)
+            span = whole_records.span_of(entries)
+        definitions = whole_records.read_definitions(content, others)
+        if late:
+            chunk = compress_chunk(memoryview(content), span, entries)._replace(raw=None)
+        else:
+            chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
-        whole = WholeChunk(chunk, definitions, leading)
+        whole = WholeChunk(chunk, definitions, leading, late)
         behind = outer if padded else offset + first + number
         return WholeRecord(offset, behind, whole, wrong, proved=bool(crc) or agrees)
+
+    def _unknown(self, offset: int, opcode: int, length: int) -> WholeRecord:
+        """Read a record of a kind that MCAP leaves to others, unless it was one of a known kind."""
+        with suppress(McapError, UnicodeDecodeError):
+            return self.chunk(offset)
+        end = offset + HEAD.size + length
+        flipped = [kind for kind in _VARIABLE if (kind ^ opcode).bit_count() == 1]
+        if not self.plausible(end) or (end, end) in [self.ends(offset, kind) for kind in flipped]:
+            raise McapError("a record of unknown kind, or too short")
+        if length > LARGEST[0]:
+            raise McapError("a record claims to be too large")
+        return WholeRecord(
+            offset, end, whole_records.UnknownRecord(self.read(offset, end - offset))
+        )
 
     def _is_padded(self, inner: int, outer: int) -> bool:
         """Tell whether a record holds more than this version of the format knows.
@@ -334,6 +382,7 @@ class RecordVerifier:
         channel : int
             Number of its channel.
         entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
+            Those with log times up to `LAST_TIME`.
         end : int
             Byte of the file before which it ends.
 
@@ -353,4 +402,5 @@ class RecordVerifier:
         entries = raw[HEAD.size + MESSAGE_INDEX.size :]
         if len(entries) % INDEX_ENTRIES.itemsize:
             raise McapError("a message index is damaged")
-        return channel, np.frombuffer(entries, INDEX_ENTRIES), outer
+        rows = np.frombuffer(entries, INDEX_ENTRIES)
+        return channel, rows[rows["time"].astype(np.uint64) <= LAST_TIME], outer

@@ -12,6 +12,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.mcap.formats import MAGIC, not_mcap
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.salvage.salvage import Salvage
@@ -77,6 +78,10 @@ def recover_log(
     recovery = attempt.recovery()
     if not attempt.pieces and (recovery.damages or not recovery.complete):
         if not salvage.is_mcap:
+            with source.open("rb") as stream:
+                what = not_mcap(stream.read(2 * len(MAGIC)))
+            if what != not_mcap(b""):
+                raise NothingWholeError(f"{source}: {what}")
             raise NothingWholeError(f"{source}: is no MCAP file, and holds no whole piece of one")
         raise NothingWholeError(f"{source}: holds nothing that could be saved")
     check_copy(copy, recovery.topics)

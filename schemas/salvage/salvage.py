@@ -9,7 +9,7 @@ the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, 
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -19,8 +19,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.definitions import Definition, Definitions
-from hearthlog.schemas.mcap.formats import MAGIC
+from hearthlog.schemas.mcap.formats import MAGIC, MESSAGE
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.salvage.damage import Damage, DamagedRange, DamageList, loss_in
 from hearthlog.schemas.salvage.file_index import MetRecords, read_index
@@ -28,6 +29,7 @@ from hearthlog.schemas.salvage.index_claims import IndexClaims
 from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
+    UnknownRecord,
     WholeAttachment,
     WholeChunk,
     WholeRecord,
@@ -41,7 +43,9 @@ _KEPT_EACH = 256
 _WINDOW = 1 << 20
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
 
-Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
+_LATE = "log times after the year 2262"
+
+Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk | UnknownRecord
 
 
 class _Places(NamedTuple):
@@ -139,7 +143,7 @@ class Salvage:
 
         Yields
         ------
-        mcap.records.Metadata, mcap.records.Message, WholeAttachment or WholeChunk
+        mcap.records.Metadata, mcap.records.Message, WholeAttachment, WholeChunk or UnknownRecord
             Chunks have been compared with their checksums, and have the message index that they
             should have. They hold no messages of undefined channels: where there are such, the
             other messages come one by one.
@@ -225,17 +229,29 @@ class Salvage:
 
     def _doubt(self, whole: WholeRecord, *, searching: bool) -> None:
         """Raise McapError for what may be another record, or look like one only by chance."""
-        if self._astray and isinstance(whole.record, records.Message | Definition):
+        unproved = records.Message | Definition | UnknownRecord
+        if self._astray and isinstance(whole.record, unproved):
             raise McapError("what is in a damaged chunk is not proved")
         if isinstance(whole.record, records.Message) and self._has_chunks:
             if searching or self._ended:
                 raise McapError("messages are in chunks here")
             if self._reader.like_message_index(whole.offset):
                 raise McapError("a message index has become a message")
+        if isinstance(whole.record, UnknownRecord) and self._like_message(whole.record.record):
+            raise McapError("a message has become another record")
         if not searching:
             return
+        if isinstance(whole.record, records.Message) and whole.record.log_time > LAST_TIME:
+            raise McapError("a log time is out of range")
         if not isinstance(whole.record, WholeChunk) and not self._reader.plausible(whole.end):
             raise McapError("no record begins where this one ends")
+
+    def _like_message(self, record: bytes) -> bool:
+        """Tell whether a record of an unknown kind was a message of a channel, but for a bit."""
+        if len(record) < MESSAGE.size or (record[0] ^ Opcode.MESSAGE).bit_count() != 1:
+            return False
+        _, _, channel, _, log_time, _ = MESSAGE.unpack_from(record)
+        return self.definitions.defines(channel) and 0 < log_time <= LAST_TIME
 
     def _pass(self, offset: int, why: str) -> int:
         """Note that no whole record begins here; return where the next one does."""
@@ -341,16 +357,30 @@ class Salvage:
             yield from self._take_chunk(record, whole)
         elif isinstance(record, records.Message):
             self._ended = False
-            if self.definitions.defines(record.channel_id):
-                yield record
-            else:
-                times = record.log_time, record.log_time
-                self._damages.add_unnamed(record.channel_id, 1, times, whole)
-        elif isinstance(record, records.Metadata | WholeAttachment):
+            yield from self._take_message(record, whole)
+        elif isinstance(record, records.Metadata | WholeAttachment) or (
+            isinstance(record, UnknownRecord) and not self._ended
+        ):
             yield record
+
+    def _take_message(self, message: records.Message, whole: WholeRecord) -> Iterator[Piece]:
+        """Yield a message outside of chunks, if its channel is defined and its time can be read."""
+        if message.log_time > LAST_TIME:
+            self._add_late(whole, {message.channel_id: 1})
+        elif self.definitions.defines(message.channel_id):
+            yield message
+        else:
+            times = message.log_time, message.log_time
+            self._damages.add_unnamed(message.channel_id, 1, times, whole)
+
+    def _add_late(self, whole: WholeRecord, messages: Mapping[int, int]) -> None:
+        """Note messages that are left out, because nobody could read their log times."""
+        if messages:
+            self._damages.add(Damage(whole.offset, whole.end, _LATE, sound=True), dict(messages))
 
     def _take_chunk(self, chunk: WholeChunk, whole: WholeRecord) -> Iterator[Piece]:
         """Yield a chunk if all its channels are defined, else its messages of those that are."""
+        self._add_late(whole, chunk.late)
         agree = True
         for record in chunk.definitions:
             if not self.definitions.add(record):

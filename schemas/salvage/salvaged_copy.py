@@ -17,7 +17,12 @@ from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.gap_channel import gap_channel
 from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames
 from hearthlog.schemas.salvage.salvage import Piece, Salvage
-from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk, chunk_messages
+from hearthlog.schemas.salvage.whole_records import (
+    UnknownRecord,
+    WholeAttachment,
+    WholeChunk,
+    chunk_messages,
+)
 
 
 @dataclass
@@ -189,6 +194,8 @@ class SalvagedCopy:
             for lost in self._search.before(piece):
                 self._add_gap(lost)
             self._add_message(piece)
+        elif isinstance(piece, UnknownRecord):
+            self._writer.copy_record(piece.record)
         elif isinstance(piece, WholeAttachment):
             self._writer.copy_attachment(piece.record, piece.index_record)
         elif piece.name == provenance.METADATA and self._selection is not None:

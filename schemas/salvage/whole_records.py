@@ -28,6 +28,13 @@ class WholeChunk(NamedTuple):
     stored: StoredChunk
     definitions: list[Definition]
     leading: int  # how many of them stand before the first message
+    late: Mapping[int, int] = {}  # by channel: messages that were left out of it for their log time
+
+
+class UnknownRecord(NamedTuple):
+    """A record of a later version of MCAP, or of an application, as the file holds it."""
+
+    record: bytes
 
 
 class WholeAttachment(NamedTuple):
@@ -42,7 +49,8 @@ class WholeRecord(NamedTuple):
 
     offset: int
     end: int
-    record: McapRecord | WholeChunk | WholeAttachment | None  # None for a message index
+    # None for a message index
+    record: McapRecord | WholeChunk | WholeAttachment | UnknownRecord | None
     corrected: str = ""  # what of its head was wrong
     proved: bool = True  # False: without a checksum, what is in it may be wrong instead
 
@@ -72,6 +80,8 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
     for opcode, start, end in iterate_records(content):
         if opcode == kind and end - start >= shortest:
             messages.append(start)
+        elif opcode > Opcode.DATA_END:
+            continue  # of a later version of MCAP, or of an application
         elif opcode not in {Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL}:
             raise McapError("the records of a chunk are damaged")
         elif end - start < HEAD.size + SHORTEST[opcode]:
@@ -79,6 +89,15 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
         else:
             definitions.append(start)
     return np.frombuffer(messages, np.int64), np.frombuffer(definitions, np.int64)
+
+
+def without_messages(content: bytes, starts: Int64) -> bytes:
+    """Copy the records of a chunk without the messages that begin at certain bytes, ascending."""
+    parts, place = [], 0
+    for start in starts.tolist():
+        parts.append(content[place:start])
+        place = start + HEAD.size + HEAD.unpack_from(content, start)[1]
+    return b"".join([*parts, content[place:]])
 
 
 def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
@@ -126,18 +145,11 @@ def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
     -------
     first, last : int
         Log times in nanoseconds; 0 and 0 if the index is empty.
-
-    Raises
-    ------
-    McapError
-        If a log time is 2**63 or more.
     """
     if not entries:
         return 0, 0
-    times = np.concatenate([np.frombuffer(e, INDEX_ENTRIES)["time"] for e in entries.values()])
-    if (times < 0).any():
-        raise McapError("a log time is out of range")
-    return int(times.min()), int(times.max())
+    times = [np.frombuffer(e, INDEX_ENTRIES)["time"].view(np.uint64) for e in entries.values()]
+    return min(int(each.min()) for each in times), max(int(each.max()) for each in times)
 
 
 def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
@@ -166,15 +178,8 @@ def read_message(raw: bytes) -> records.Message:
     ----------
     raw : bytes
         The whole record, with opcode and length.
-
-    Raises
-    ------
-    McapError
-        If its log time is 2**63 or more.
     """
     _, _, channel, sequence, log_time, publish_time = MESSAGE.unpack_from(raw)
-    if log_time >= 1 << 63:
-        raise McapError("a log time is out of range")
     return records.Message(channel, log_time, raw[MESSAGE.size :], publish_time, sequence)
 
 

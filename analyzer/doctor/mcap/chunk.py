@@ -159,7 +159,9 @@ class Chunk:
             self._error("message-short", f"a message at byte {start} of a chunk is too short")
             self.whole = False
         elif opcode not in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            self._error("chunk-opcode", f"{name_of(opcode)} inside a chunk")
+            report = self._findings.error if opcode <= Opcode.DATA_END else self._findings.warning
+            what = f"{name_of(opcode)} inside a chunk"
+            report("chunk-opcode", what, RECOVER, offset=self.offset)
         else:
             channel = self._definitions.read(opcode, self.offset, content)
             return {} if channel is None else {channel: start}

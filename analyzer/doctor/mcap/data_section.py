@@ -24,6 +24,7 @@ from hearthlog.analyzer.doctor.mcap.message_batch import (
 )
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.mcap.chunk_records import iterate_records
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, MESSAGE_HEAD, UINT32, UINT64
 from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import encode
@@ -249,6 +250,9 @@ class DataSection:
         if self.span is not None:
             first, last = min(first, self.span[0]), max(last, self.span[1])
         self.span = first, last
+        if late := int((times > LAST_TIME).sum()):
+            what = f"log times after the year 2262: readers leave {late} messages here out"
+            self.findings.warning("late", what, RECOVER)
         self._parts.append(content)
         self._size += len(content.records)
 
