@@ -6,7 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.count_range import FEWEST, CheckedRates, beta_quantile, checked_rates
+from hearthlog.analyzer.accuracy.count_range import (
+    FEWEST,
+    CheckedRates,
+    beta_quantile,
+    checked_rates,
+)
 from hearthlog.analyzer.accuracy.events import (
     AROUND,
     MINUTE,

@@ -1,23 +1,32 @@
 """Logs as a bag of ROS 1."""
 
 import re
-from collections.abc import Hashable
-from typing import NamedTuple
+import warnings
+from collections.abc import Hashable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
 
-from mcap.records import Schema
-from rosbags.interfaces import Connection
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    Nodetype,
+)
 from rosbags.rosbag1 import Writer
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import held_count
 from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.log_stream import ENCODING, SCHEMA_ENCODING
+from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.logs.columns import without_unreadable
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.messages.message_types import definition, typestore
+from hearthlog.schemas.messages.message_types import typestore
+from hearthlog.schemas.messages.type_definitions import defined_types
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -30,12 +39,13 @@ _LITTLE_ENDIAN = b"\x00\x01"
 def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
     """Write a bag; the sequence numbers of headers, which ROS 2 does not have, are 0."""
     selection.verify()
+    selection = selection.decodable()
     with Writer(files.path) as writer:
         bag = _Bag(writer)
         for batch in selection.messages(progress):
             bag.write(batch)
         if not writer.connections:
-            raise selection.nothing()
+            raise bag.fault or selection.nothing()
 
 
 class _Topic(NamedTuple):
@@ -46,38 +56,64 @@ class _Topic(NamedTuple):
 
     def convert(self, payload: bytes) -> memoryview:
         name = self.connection.msgtype
-        try:
-            if not payload.startswith(_LITTLE_ENDIAN):
-                message = self.types.deserialize_cdr(payload, name)
-                payload = bytes(self.types.serialize_cdr(message, name, little_endian=True))
-            return self.types.cdr_to_ros1(payload, name)
-        except SerdeError as error:
-            raise LogError(f"{self.connection.topic}: no message of type {name}") from error
+        if not payload.startswith(_LITTLE_ENDIAN):
+            message = self.types.deserialize_cdr(payload, name)
+            payload = bytes(self.types.serialize_cdr(message, name, little_endian=True))
+        return self.types.cdr_to_ros1(payload, name)
+
+
+class _Connections(list[Connection]):
+    """Connections of a bag, among which each is found at once by its number."""
+
+    def __contains__(self, connection: object) -> bool:
+        return isinstance(connection, Connection) and connection == self[connection.id]
 
 
 class _Bag:
     """The bag being written."""
 
     def __init__(self, writer: Writer) -> None:
+        self.fault: LogError | None = None
         self._writer = writer
-        self._topics: dict[Hashable, _Topic] = {}
+        self._writer.connections = _Connections()
+        self._types = get_typestore(Stores.EMPTY)  # of ROS 1: the bag has one for each name
+        self._topics: dict[Hashable, _Topic | None] = {}
+        self._connections: dict[Hashable, Connection] = {}
         self._trimmed = 0
 
     def write(self, batch: list[RawMessages]) -> None:
         """Append messages, in the order of their log times."""
         rows = []
-        for messages in batch:
-            topic = self._topic(messages)
-            if messages.log_times[-1] >= _TIME_LIMIT:
-                raise LogError(f"{messages.channel.topic}: ROS 1 has no times after 2106")
+        for each in batch:
+            topic = self._topic(each)
+            if topic is None:
+                continue
+            messages = self._in_time(without_unreadable(each))
             ends = messages.offsets + messages.sizes
             places = zip(messages.offsets.tolist(), ends.tolist(), strict=True)
             payloads = (messages.buffer[first:end].tobytes() for first, end in places)
             times = messages.log_times.tolist()
             rows += [(t, topic, p) for t, p in zip(times, payloads, strict=True)]
         for time, topic, payload in sorted(rows, key=lambda row: row[0]):
-            self._writer.write(topic.connection, time, topic.convert(payload))
+            try:
+                converted = topic.convert(payload)
+            except (SerdeError, ValueError):
+                text = "some messages have no form in ROS 1: left out"
+                self._warn(topic.connection.topic, text)
+            else:
+                self._writer.write(topic.connection, time, converted)
         self._trim()
+
+    def _in_time(self, messages: RawMessages) -> RawMessages:
+        late = messages.log_times >= _TIME_LIMIT
+        if late.any():
+            self._warn(messages.channel.topic, "ROS 1 has no times after 2106: left out")
+            messages = messages.take(~late)
+        return messages
+
+    def _warn(self, topic: str, text: str) -> None:
+        self.fault = self.fault or LogError(f"{topic}: {text}")
+        warnings.warn(HearthlogWarning(text, topic, each=True), stacklevel=2)
 
     def _trim(self) -> None:
         """Replace the places of messages in written chunks by their number, which is enough."""
@@ -86,46 +122,96 @@ class _Bag:
             chunk.connections = counts  # type: ignore[assignment]
         self._trimmed = len(self._writer.chunks) - 1
 
-    def _topic(self, messages: RawMessages) -> _Topic:
+    def _topic(self, messages: RawMessages) -> _Topic | None:
+        """Find the connection for messages; None if the bag has no place for them."""
         channel, schema = messages.channel, messages.schema
-        if schema is None or channel.message_encoding != ENCODING:
-            raise LogError(f"{channel.topic}: holds no ROS 2 messages")
-        key = channel.topic, schema.name, schema.data
+        assert schema is not None  # the channel can be decoded
+        latching = int(held_count(channel) > 0)
+        key = channel.topic, schema.name, schema.encoding, schema.data, latching
         if key not in self._topics:
-            types = _types_of(schema)
-            of_ros1 = get_typestore(Stores.EMPTY)
-            header = get_typestore(Stores.ROS1_NOETIC).fielddefs[_HEADER]
-            of_ros1.fielddefs.update({**types.fielddefs, _HEADER: header})
-            text, digest = of_ros1.generate_msgdef(schema.name)
-            connection = self._writer.add_connection(
-                channel.topic,
-                schema.name,
-                msgdef=text,
-                md5sum=digest,
-                latching=int(held_count(channel) > 0),
-            )
-            self._topics[key] = _Topic(connection, types)
+            try:
+                name, types = _types_of(schema.name, schema.encoding, schema.data)
+                text, digest = self._define(name, types)
+            except (LogError, TypesysError) as error:
+                self._topics[key] = None
+                self._warn(channel.topic, f"{error}: left out")
+            else:
+                connection = self._connect(channel.topic, name, text, digest, latching)
+                self._topics[key] = _Topic(connection, types)
         return self._topics[key]
 
+    def _define(self, name: str, types: Typestore) -> tuple[str, str]:
+        """Return the definition of a type in the bag; LogError if that of another topic differs.
 
-def _types_of(schema: Schema) -> Typestore:
-    """Return the types by which messages of a channel are encoded."""
+        ROS 1 keeps neither comments nor bounds, and readers have one definition for a name. Of
+        constants, those that come first stay.
+        """
+        built_on: dict[str, tuple[str, str]] = {}
+        types.gendefhash(name, built_on)
+        own = {
+            each: (types.fielddefs[each][0], _without_bounds(types.fielddefs[each][1]))
+            for each in (name, *built_on)
+        }
+        if _HEADER in own:
+            own[_HEADER] = get_typestore(Stores.ROS1_NOETIC).fielddefs[_HEADER]
+        for each, (_, fields) in own.items():
+            if each in self._types.fielddefs and self._types.fielddefs[each][1] != fields:
+                raise LogError(
+                    f"{each} is defined in two ways, for which a ROS 1 bag has no place; export "
+                    "the logs of each to a bag of its own"
+                )
+        self._types.fielddefs.update(own | self._types.fielddefs)
+        return self._types.generate_msgdef(name)
+
+    def _connect(self, topic: str, name: str, text: str, digest: str, latching: int) -> Connection:
+        """Add a connection unless there is one like it; the writer would search all of them."""
+        key = topic, name, latching
+        if key not in self._connections:
+            definition_ = MessageDefinition(MessageDefinitionFormat.MSG, text)
+            about = ConnectionExtRosbag1(None, latching)
+            number = len(self._writer.connections)
+            connection = Connection(
+                number, topic, name, definition_, digest, -1, about, self._writer
+            )
+            self._writer.write_connection(connection, self._writer.chunks[-1].data)
+            self._writer.connections.append(connection)
+            self._connections[key] = connection
+        return self._connections[key]
+
+
+def _without_bounds(fields: Sequence[Any]) -> list[Any]:
+    """Leave out the bounds of texts and sequences, which ROS 1 does not have."""
+    return [(name, _unbounded(*described)) for name, described in fields]
+
+
+def _unbounded(node: Nodetype, details: Any) -> tuple[Nodetype, Any]:
+    if node == Nodetype.BASE and details[0] == "wstring":
+        raise LogError("ROS 1 has no wstring")
+    if node == Nodetype.BASE:
+        return node, (details[0], 0)
+    if node == Nodetype.NAME:
+        return node, details
+    return node, (_unbounded(*details[0]), details[1] if node == Nodetype.ARRAY else 0)
+
+
+@lru_cache(256)
+def _types_of(name: str, encoding: str, text: bytes) -> tuple[str, Typestore]:
+    """Return the ROS 2 name of a type, and the types by which messages of it are encoded."""
     ours = typestore()
-    if schema.name in ours.fielddefs and schema.data == definition(schema.name).encode():
-        return ours
+    own = defined_types(name, encoding, text)
+    name = name if name in ours.fielddefs else normalize_msgtype(name)
+    if not own:
+        return name, ours
+    for each in (name, *own):
+        if not _NAME.fullmatch(each):  # code is made of these types
+            raise LogError(f"{each!r} is no name of a type")
+    types = get_typestore(Stores.EMPTY)
     try:
-        if schema.encoding != SCHEMA_ENCODING:
-            raise LogError(f"{schema.name!r} is defined as {schema.encoding!r}")
-        own = get_types_from_msg(schema.data.decode(), schema.name)
-        for name in (schema.name, *own):
-            if not _NAME.fullmatch(name):  # code is made of these types
-                raise LogError(f"{name!r} is no name of a type")
-        types = get_typestore(Stores.EMPTY)
         types.register({**ours.fielddefs, **own})
-        types.get_msgdef(schema.name)
-    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, KeyError) as error:
-        raise LogError(f"the definition of {schema.name!r} cannot be read") from error
-    return types
+        types.get_msgdef(name)
+    except (TypesysError, RecursionError, ValueError, KeyError) as error:
+        raise LogError(f"the definition of {name!r} cannot be read") from error
+    return name, types
 
 
 EXPORTER = Exporter(_save)

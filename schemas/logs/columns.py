@@ -292,7 +292,7 @@ def _decode_readable(raw: RawMessages, fields: Collection[str] | None) -> Column
     try:
         return _decode(raw, fields)
     except LogError:
-        raw = _without_unreadable(raw)
+        raw = without_unreadable(raw)
     if not len(raw):
         return None
     try:
@@ -321,8 +321,14 @@ def faults(raw: RawMessages) -> dict[int, LogError]:
     return dict(sorted(unreadable_rows(kind, raw.buffer, raw.offsets, raw.sizes).items()))
 
 
-def _without_unreadable(raw: RawMessages) -> RawMessages:
-    """Leave out messages that are not of their type; warn of the first of them."""
+def without_unreadable(raw: RawMessages) -> RawMessages:
+    """Leave out messages that are not of their type; warn of the first of them.
+
+    Parameters
+    ----------
+    raw : RawMessages
+        Of a channel that is not `unreadable`.
+    """
     errors = faults(raw)
     if not errors:
         return raw

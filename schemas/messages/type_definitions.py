@@ -166,8 +166,37 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         If the encoding is another one, or the text is larger than 256 KiB or cannot be understood.
     """
     ours = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
+    theirs = {key: fields for key, (_, fields) in defined_types(name, encoding, text).items()}
+    growth = {
+        key: _growth(key, fields, ours[key])
+        for key, fields in theirs.items()
+        if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
+    }
+    return MessageType(name if name in ours else normalize_msgtype(name), ours | theirs, growth)
+
+
+def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
+    """Read a message type, and those that it builds on, as a file defines them.
+
+    Parameters
+    ----------
+    name, encoding, text
+        As of `message_type`.
+
+    Returns
+    -------
+    dict of str to (list, list)
+        Constants and fields by ROS 2 name, as rosbags has them; empty for the definition of ROS 2
+        or hearthlog.
+
+    Raises
+    ------
+    LogError
+        As `message_type`.
+    """
+    ours = typestore().fielddefs
     if name in ours and (not encoding or text == definition(name).encode()):
-        return MessageType(name, ours)
+        return {}
     if not encoding:
         raise LogError(f"the log does not define {name}")
     if encoding not in {"ros2msg", "ros2idl"}:
@@ -178,19 +207,13 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
     if not text.strip():
         if name not in ours:
             raise LogError(f"the log does not define {name}")
-        return MessageType(name, ours)
+        return {}
     try:
         plain = _with_usual_lines(text.decode(errors="replace"))
         types = _types_from_msg(plain, name) if encoding == "ros2msg" else _types_from_idl(plain)
     except (TypesysError, RecursionError, ValueError, KeyError) as error:
         raise LogError(f"the definition of {name} cannot be read") from error
-    theirs = {key: fields for key, (_, fields) in types.items()}
-    growth = {
-        key: _growth(key, fields, ours[key])
-        for key, fields in theirs.items()
-        if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
-    }
-    return MessageType(name, ours | theirs, growth)
+    return types
 
 
 def _with_usual_lines(text: str) -> str:

@@ -126,7 +126,9 @@ def review(
     except HearthlogError as error:
         if queue is None:
             raise
-        raise HearthlogError(f"{error}; or without a viewer, as a text file: --save ten.txt") from error
+        raise HearthlogError(
+            f"{error}; or without a viewer, as a text file: --save ten.txt"
+        ) from error
     if save is not None:
         from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
 
