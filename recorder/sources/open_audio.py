@@ -251,11 +251,17 @@ def _by_libsndfile(path: Path, sound: soundfile.SoundFile, complaints: list[byte
         is_mp3 = sound.format == "MP3"  # its length may be an estimate
         is_short = frames is not None and place < frames and not is_mp3
         if is_broken or is_short or (is_mp3 and any(map(_BROKEN_MP3.search, complaints))):
-            return f"is damaged or cut short after {place / sound.samplerate:.2f} s"
+            return _damage(place / sound.samplerate)
         is_cut = _claims_more(sound.extra_info) or (sound.format == "OGG" and not _is_ended(path))
         return f"is cut short: its sound ends at {place / sound.samplerate:.2f} s" if is_cut else ""
 
     return OpenAudio(sound.samplerate, sound.channels, frames, blocks, fault)
+
+
+def _damage(seconds: float) -> str:
+    if not seconds:
+        return "is damaged, and none of its sound can be read"
+    return f"is damaged or cut short after {seconds:.2f} s"
 
 
 def _filled(block: Float32) -> int:
@@ -354,6 +360,6 @@ def _by_ffmpeg(path: Path, decoder: FileDecoder) -> OpenAudio:
     def fault() -> str:
         if place >= end or not (reason or decoder.fault()):
             return ""
-        return f"is damaged or cut short after {place / decoder.rate:.2f} s"
+        return _damage(place / decoder.rate)
 
     return OpenAudio(decoder.rate, decoder.channels, None, blocks, fault)
