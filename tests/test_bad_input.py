@@ -130,7 +130,7 @@ def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
         (left,) = disk.rglob("*.mcap.active")
         kept = features(left)[0]
         assert len(kept) > 2000
-        still_full = refused("record", sound, "-o", disk)
+        still_full = refused("record", sound, "-o", disk, "--start", "2026-03-01T07:00:00")
         assert still_full.startswith(f"{left}: ")
         assert sorted(path.name for path in left.parent.iterdir()) == [left.name]
         subprocess.run(["mount", "-o", "remount,size=8m", str(disk)], check=True)
