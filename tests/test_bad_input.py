@@ -33,8 +33,8 @@ def sound(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "{}: cannot be read as audio (Format not recognised)"),
-        (b"no sound at all" * 99, "{}: cannot be read as audio (Format not recognised)"),
+        (b"", "{}: holds no audio; the file is empty"),
+        (b"no sound at all" * 99, "{}: cannot be read as audio (Format not recognised"),
         (None, "{}: no such file"),
     ],
     ids=["empty", "text", "missing"],
@@ -43,7 +43,8 @@ def test_a_file_that_is_no_audio(refused, tmp_path, content, message):
     path = tmp_path / "bad.wav"
     if content is not None:
         path.write_bytes(content)
-    assert refused("record", path, "-o", tmp_path / "logs") == message.format(path)
+    # The line ends otherwise where there is no ffmpeg.
+    assert refused("record", path, "-o", tmp_path / "logs").startswith(message.format(path))
     assert not (tmp_path / "logs").exists()
 
 
@@ -84,7 +85,7 @@ def test_a_file_of_nan_and_infinity_in_8_channels_at_192_khz(hearthlog, tmp_path
     samples[2000:2100, 3] = np.inf
     path = tmp_path / "wild.wav"
     soundfile.write(path, samples, 192_000, subtype="FLOAT")
-    result = hearthlog("record", path, "-o", tmp_path / "logs")
+    result = hearthlog("record", path, "-o", tmp_path / "logs", "--start", "2026-03-01")
     assert (result.returncode, result.stderr) == (0, "")
     _, _, values = features(tmp_path / "logs")
     assert len(values) in (39, 40)
@@ -129,7 +130,7 @@ def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
         (left,) = disk.rglob("*.mcap.active")
         kept = features(left)[0]
         assert len(kept) > 2000
-        still_full = refused("record", sound, "-o", disk)
+        still_full = refused("record", sound, "-o", disk, "--start", "2026-03-01T07:00:00")
         assert still_full.startswith(f"{left}: ")
         assert sorted(path.name for path in left.parent.iterdir()) == [left.name]
         subprocess.run(["mount", "-o", "remount,size=8m", str(disk)], check=True)
@@ -252,7 +253,7 @@ def test_variables_of_other_programs_and_of_the_configuration_are_taken(hearthlo
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("record", "--realtime"), "--start and --realtime go with files"),
+        (("record", "--realtime"), "--start, --start-pattern and --realtime go with files"),
         (("record", "x.wav", "--start", "yesterday"), "--start yesterday: not a time such as "),
         (("record", "--what"), "no such option: --what; see `hearthlog record --help`"),
         (("replay",), "missing argument 'path'; see `hearthlog replay --help`"),

@@ -337,11 +337,19 @@ def test_folders_that_are_called_otherwise_need_a_map(copied, tmp_path):
 
 def test_what_is_no_audio_in_a_folder_is_counted_by_its_name(copied, tmp_path):
     folder = copied("folder")
-    (folder / "coughing" / "phone.m4a").touch()
+    (folder / "coughing" / "notes.txt").touch()
+    (folder / "coughing" / "._phone.m4a").touch()
+    (folder / "coughing" / ".Trash").mkdir()
+    (folder / "coughing" / ".Trash" / "old.wav").touch()
     (folder / "manifest.csv").touch()
+    before = rows_of("folder", folder, tmp_path / "before.csv")
+    (folder / "coughing" / "phone.m4a").touch()
     done = command("manifest", "folder", folder, "-o", tmp_path / "m.csv")
     assert done.exit_code == 0
-    assert "left out: 1, not named as audio that can be read: *.m4a\n" in done.stdout
+    assert "left out: 1, not named as audio that can be read: *.txt\n" in done.stdout
+    assert "left out: 1, hidden: its name begins with a dot\n" in done.stdout
+    after = rows_of("folder", folder, tmp_path / "after.csv")
+    assert [row["path"] for row in after if row not in before] == ["coughing/phone.m4a"]
 
 
 def test_links_that_lead_back_are_followed_once(copied, tmp_path):
@@ -636,7 +644,9 @@ def test_broken_audio_is_found_when_it_is_learned_from(copied, tmp_path):
     assert command("manifest", "esc50", folder, "-o", tmp_path / "m.csv").exit_code == 0
     options = "--scenario", tmp_path / "own.toml", "-o", tmp_path / "m.safetensors"
     done = command("train", "--data", tmp_path / "m.csv", *options)
-    assert "1-19111-A-24.wav: cannot be read as audio" in str(done.exception)
+    assert done.exit_code == 3
+    assert "left out: 1, cannot be read" in done.stderr
+    assert "1-19111-A-24.wav: cannot be read as audio" in done.stderr
 
 
 @pytest.mark.parametrize(

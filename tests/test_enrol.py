@@ -70,6 +70,31 @@ def check_marked(log, label, seconds):
     assert mark.end - mark.start == pytest.approx(seconds * NANOSECONDS, abs=1e6)
 
 
+def test_of_several_files_those_that_cannot_be_read_are_named(hearthlog, cough, home, tmp_path):
+    bad, cut = tmp_path / "bad.wav", tmp_path / "cut.wav"
+    bad.write_text("no sound")
+    cut.write_bytes(cough.read_bytes()[:-20_000])
+    files = ("--file", bad, "--file", cough, "--file", cut)
+    result = hearthlog("enrol", "coughing", "--home", home, *files)
+    assert result.returncode == 3
+    assert len(enrolled(home)) == result.stdout.count("\n") == 2
+    refused, short = result.stderr.splitlines()
+    assert refused.startswith(f"hearthlog: {bad}: cannot be read as audio")
+    assert short.startswith(f"hearthlog: {cut}: is cut short")
+    result = hearthlog("enrol", "coughing", "--home", home, "--file", bad, "--file", bad)
+    assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+
+
+def test_a_file_that_says_when_it_begins_is_enrolled_with_that_time(hearthlog, cough, home):
+    named = cough.rename(cough.with_name("20260301T070000Z.wav"))
+    for _ in range(2):
+        assert hearthlog("enrol", "coughing", "--home", home, "--file", named).returncode == 0
+    assert sorted(log.name for log in enrolled(home)) == [
+        "coughing_20260301T065958Z.mcap",
+        "coughing_20260301T070000Z.mcap",
+    ]
+
+
 def test_a_file_is_enrolled_as_its_features_and_doctor_is_content(hearthlog, cough, home):
     result = hearthlog("enrol", "coughing", "--home", home, "--file", cough)
     (log,) = enrolled(home)

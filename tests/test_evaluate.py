@@ -577,6 +577,21 @@ def test_a_model_says_that_one_clip_of_the_data_was_learned_from(own, hearthlog)
     assert json.loads(hearthlog(*words, "--json").stdout)["sources_learned"] == 1
 
 
+def test_a_model_is_scored_without_the_clips_that_cannot_be_read(own, hearthlog):
+    model, learned = own
+    other = write_training_set(learned.parents[1] / "faulty", clips_per_class=2, seed=5)
+    words = ("evaluate", "model", model, "--data", other)
+    clean = hearthlog(*words, "--json")
+    (other.parent / "bad.wav").write_text("no sound")
+    rows = "bad.wav,speech,a,,,\nnone.wav,speech,a,,,\n"
+    other.write_text(other.read_text() + rows)
+    result = hearthlog(*words, "--json")
+    assert (clean.returncode, result.returncode) == (0, 3)
+    for line in ("left out: 1, no such file", "left out: 1, cannot be read, or not all of it"):
+        assert line in result.stderr
+    assert json.loads(result.stdout)["macro_f1"] == json.loads(clean.stdout)["macro_f1"]
+
+
 def test_a_model_says_that_it_is_scored_on_what_it_learned_from(own, hearthlog):
     model, manifest = own
     result = hearthlog("evaluate", "model", model, "--data", manifest)

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.manifest import left_out_lines, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, load_scenario
 
 pytestmark = pytest.mark.fast
@@ -95,6 +95,32 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path, text, line, reason):
     assert message.startswith(f"{path}: " if line is None else f"{path}:{line}: ")
     assert reason in message
     assert message.isprintable()
+
+
+def test_lines_of_no_use_can_be_left_out_and_the_others_are_read(tmp_path):
+    header = "path,label,source_group,start,end\n"
+    rows = [
+        *("a.wav,speech,anna,,", "b.wav,spech,anna,,", "none.wav,speech,anna,,"),
+        *("b.wav,speech,anna,3,1", "a.wav,speech,anna,0,", "b.wav,speech", "b.wav,,anna,,"),
+        *("c.wav,spech,anna,,", "b.wav,speech,anna,,"),
+    ]
+    path = manifest(tmp_path, header + "\n".join(rows))
+    left_out = []
+    clips = read_manifest(path, LABELS, left_out)
+    assert [clip.path.name for clip in clips] == ["a.wav", "b.wav"]
+    lines = left_out_lines(left_out)
+    assert lines[0] == (
+        f"left out: 2, a label that the scenario does not know: {path}:3: 'spech'; {path}:9: "
+        "'spech'"
+    )
+    assert [line.split(": ")[1] for line in lines] == [
+        "2, a label that the scenario does not know",
+        *("1, no such file", "1, no part of a file", "1, listed twice"),
+        *("1, a line that is not complete", "1, no label"),
+    ]
+    path.write_text(header + "none.wav,speech,anna,,\n")
+    with pytest.raises(DataError, match=r"lists no clip that can be used.*none\.wav"):
+        read_manifest(path, LABELS, [])
 
 
 def test_a_missing_manifest_is_named(tmp_path):

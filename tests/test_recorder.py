@@ -44,6 +44,8 @@ def recorded(hearthlog, tmp_path):
 
     def run(*arguments, env=None):
         logs = tmp_path / f"logs{len(list(tmp_path.iterdir()))}"
+        if "--start" not in arguments:
+            arguments += ("--start", "2026-03-01T07:00:00")
         result = hearthlog("record", *arguments, "-o", logs, env=env)
         assert (result.returncode, result.stderr) == (0, "")
         return logs
@@ -277,7 +279,8 @@ def test_a_damaged_log_of_an_earlier_recorder_is_reported_with_status_3(
     left.parent.mkdir()
     left.write_bytes(data)
     soundfile.write(tmp_path / "noise.wav", noise(2), 16_000)
-    result = hearthlog("record", tmp_path / "noise.wav", "-o", left.parent)
+    start = ("--start", "2030-01-01")
+    result = hearthlog("record", tmp_path / "noise.wav", "-o", left.parent, *start)
     assert result.returncode == 3
     completed, damage = result.stderr.splitlines()
     assert completed == f"hearthlog: completed {left.with_suffix('')}, which was left unfinished"

@@ -11,6 +11,7 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training import clip_sound
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
@@ -21,7 +22,6 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder.errors import SourceError
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.home.simulate import write_training_set
@@ -152,10 +152,55 @@ def test_a_class_nobody_recorded_is_named(tmp_path):
         build_dataset(clips, BUILTIN["general"], ignore_progress)
 
 
-def test_a_clip_that_is_no_audio_is_named(tmp_path):
-    (tmp_path / "x.wav").write_text("no sound")
-    with pytest.raises(SourceError, match=r"x\.wav"):
-        dataset(LabelledClip(tmp_path / "x.wav", "speech", "g", "", ""))
+def test_clips_that_cannot_be_read_are_left_out_and_named(tmp_path, monkeypatch):
+    text, empty, cut = tmp_path / "x.wav", tmp_path / "empty.wav", tmp_path / "cut.flac"
+    text.write_text("no sound")
+    empty.touch()
+    soundfile.write(tmp_path / "whole.flac", sound("speech", 6), RATE)
+    cut.write_bytes((tmp_path / "whole.flac").read_bytes()[:50_000])
+    long = clip(tmp_path, "speech", sound("speech", 5))
+    bad = [LabelledClip(path, "speech", "g", "", "") for path in (text, empty, cut)]
+    monkeypatch.setattr(clip_sound, "MOST_SECONDS", 4.0)
+    good = clip(tmp_path, "speech", sound("speech", 3)), clip(tmp_path, "music", sound("music", 3))
+    data = dataset(*bad, good[0], long, good[1])
+    assert data.skipped == {"cannot be read, or not all of it": 4}
+    assert [str(one.clip).split(":")[0] for one in data.left_out] == [
+        *map(str, (text, empty, cut, long.path))
+    ]
+    reasons = "cannot be read as audio", "the file is empty", "cut short", "longer than an hour"
+    assert all(reason in one.clip for reason, one in zip(reasons, data.left_out, strict=True))
+    assert data.digest == dataset(*good).digest
+    part = dataclasses.replace(bad[2], end=1.0)
+    assert len(clip_frames(part)) == 20, "the part is there"
+    with pytest.raises(DataError, match=r"class speech has no segments.*x\.wav"):
+        dataset(bad[0], good[1])
+
+
+def test_a_training_goes_on_without_what_it_cannot_read_and_says_so(home):
+    manifest = home / "manifest.csv"
+    (home / "bad.wav").write_text("no sound")
+    rows = "bad.wav,music,a,,\nnone.wav,music,a,,\nspeech_1.wav,spech,a,,\nspeech_2.wav,music\n"
+    clean = run("--data", manifest, "--scenario", home / "home.toml", "-o", home / "a.safetensors")
+    manifest.write_text(manifest.read_text() + rows)
+    options = "--data", manifest, "--scenario", home / "home.toml"
+    done = run(*options, "-o", home / "b.safetensors")
+    assert (clean.exit_code, done.exit_code) == (0, 3)
+    assert (home / "a.safetensors").read_bytes() == (home / "b.safetensors").read_bytes()
+    told = [line for line in done.stderr.splitlines() if "left out" in line]
+    expected = (
+        f"no such file: {manifest}:39: 'none.wav'",
+        f"a label that the scenario does not know: {manifest}:40: 'spech'",
+        f"a line that is not complete: {manifest}:41: has 2 fields",
+        f"cannot be read, or not all of it: {home}/bad.wav: cannot be read as audio",
+    )
+    assert len(told) == len(expected)
+    for line, words in zip(told, expected, strict=True):
+        assert line.startswith(f"hearthlog: left out: 1, {words}")
+    as_json = json.loads(run(*options, "-o", home / "c.safetensors", "--json").stdout)
+    assert len(as_json["left_out"]) == 4
+    manifest.write_text("path,label,source_group\n" + "none.wav,music,a\n" * 3)
+    done = run(*options, "-o", home / "d.safetensors")
+    assert "lists no clip that can be used" in str(done.exception)
 
 
 @pytest.mark.parametrize("rate", [RATE, 44_100])

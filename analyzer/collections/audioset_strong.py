@@ -14,9 +14,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.collections.clip import CollectionClip, Sound
-from hearthlog.analyzer.collections.files import files_below, inside, is_audio, read_table, seconds
+from hearthlog.analyzer.collections.files import inside, read_table, seconds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
+from hearthlog.recorder.sources.audio_files import files_below
+from hearthlog.recorder.sources.open_audio import is_audio
 
 _COLUMNS = "segment_id", "start_time_seconds", "end_time_seconds", "label"
 _SEGMENT = re.compile(r"([\w-]{11})_(\d{1,12})", re.ASCII)

@@ -17,15 +17,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.collections.clip import CollectionClip, Sound
-from hearthlog.analyzer.collections.files import (
-    audio_by_name,
-    files_below,
-    inside,
-    read_table,
-    seconds,
-)
+from hearthlog.analyzer.collections.files import audio_by_name, inside, read_table, seconds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import read_text
+from hearthlog.recorder.sources.audio_files import files_below
 
 _COLUMNS = "filename", "onset", "offset", "event_label"
 _NAME = re.compile(r"Y?([\w-]{11})_([\d.]+)_([\d.]+)\.wav", re.ASCII)

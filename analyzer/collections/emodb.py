@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.collections.clip import CollectionClip, Sound
-from hearthlog.analyzer.collections.files import is_audio
+from hearthlog.recorder.sources.open_audio import is_audio
 
 _NAME = re.compile(r"(\d\d)[ab]\d\d([WLEAFTN])[a-z]?\.wav")
 _EMOTIONS = {

@@ -1,20 +1,17 @@
 """Files of a collection: tables, JSON, and audio found by its name."""
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
+from hearthlog.recorder.sources.audio_files import files_below
+from hearthlog.recorder.sources.open_audio import is_audio
 from hearthlog.schemas.storage.small_file import read_whole
 
 _TABLE_LIMIT = 128 << 20  # the largest, of AudioSet, has 50 MB
 _JSON_LIMIT = 256 << 20
-_AUDIO = frozenset(
-    {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf"}
-    | {".w64", ".rf64", ".voc"}
-)
 
 
 def read_table(
@@ -101,34 +98,6 @@ def inside(where: str, folder: Path, name: str) -> Path:
     if not name or pure.is_absolute() or ".." in pure.parts or "\0" in name:
         raise DataError(f"{where}: {name[:64]!r} is no name of a file of the collection")
     return folder / pure
-
-
-def is_audio(name: str) -> bool:
-    """Whether a file is named as audio that can be read.
-
-    Parameters
-    ----------
-    name : str
-    """
-    return os.path.splitext(name)[1].lower() in _AUDIO  # noqa: PTH122
-
-
-def files_below(folder: Path) -> Iterator[Path]:
-    """Yield all files in a folder and its folders, also those behind links, sorted by folder.
-
-    Parameters
-    ----------
-    folder : Path
-    """
-    seen: set[tuple[int, int]] = set()
-    for parent, folders, names in os.walk(folder, followlinks=True):
-        status = Path(parent).stat()
-        if (status.st_dev, status.st_ino) in seen:  # a link that leads back
-            folders.clear()
-            continue
-        seen.add((status.st_dev, status.st_ino))
-        folders.sort()
-        yield from (Path(parent, name) for name in sorted(names))
 
 
 def audio_by_name(folder: Path) -> dict[str, Path]:

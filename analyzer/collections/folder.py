@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.collections.clip import CollectionClip, Sound
-from hearthlog.analyzer.collections.files import files_below, is_audio
+from hearthlog.recorder.sources.audio_files import files_below
+from hearthlog.recorder.sources.open_audio import is_audio
 
 _TAKE = re.compile(r"(?:[ _.-]\d{1,3}| ?\(\d{1,3}\))$")
 
@@ -27,6 +28,11 @@ def read(folder: Path) -> Iterator[CollectionClip]:
         inner = path.relative_to(folder).parts
         if len(inner) > 1:
             source = inner[1] if len(inner) > 2 else _TAKE.sub("", path.stem) or path.stem
-            audio = is_audio(path.name)
-            reason = "" if audio else f"not named as audio that can be read: *{path.suffix}"
+            reason = "" if is_audio(path.name) else _no_audio(path)
             yield CollectionClip(path, (Sound((inner[0],)),), source, "", left_out=reason)
+
+
+def _no_audio(path: Path) -> str:
+    if path.name.startswith("."):
+        return "hidden: its name begins with a dot"
+    return f"not named as audio that can be read: *{path.suffix}"

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.collections.clip import CollectionClip, Sound
-from hearthlog.analyzer.collections.files import files_below, is_audio
+from hearthlog.recorder.sources.audio_files import files_below
+from hearthlog.recorder.sources.open_audio import is_audio
 
 _NAME = re.compile(r"03-0[12]-(0[1-8])-0[12]-0[12]-0[12]-(\d\d)\.wav")
 _EMOTIONS = (

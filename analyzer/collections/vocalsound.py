@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from hearthlog.analyzer.collections.clip import CollectionClip, Sound
-from hearthlog.analyzer.collections.files import is_audio, read_json
+from hearthlog.analyzer.collections.files import read_json
 from hearthlog.analyzer.errors import DataError
+from hearthlog.recorder.sources.open_audio import is_audio
 
 _NAME = re.compile(r"([fm]\d+)_\d+_([a-z]+)\.wav")
 

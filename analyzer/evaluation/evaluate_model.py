@@ -10,7 +10,7 @@ from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detec
 from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.rooms import captured, steady_noise
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
@@ -42,6 +42,7 @@ class ModelEvaluation:
     evaluated_seconds: float  # of what the detections are about
     skipped: Mapping[str, int]  # why clips gave no segment, and how many
     sources_learned: int  # sources of which the model has learned from a segment
+    left_out: Sequence[LeftOut] = ()  # clips that could not be read, which `skipped` counts too
 
 
 def evaluate_model(
@@ -62,8 +63,6 @@ def evaluate_model(
     ------
     DataError
         If the classes of the model are not those of the scenario, or no clip has a segment.
-    SourceError
-        If a clip cannot be read.
     """
     scenario = fitted(scenario, model)
     classifier = Classifier(model)
@@ -85,6 +84,7 @@ def evaluate_model(
         evaluated_seconds=listener.duration / NANOSECONDS,
         skipped=data.skipped,
         sources_learned=len(learned_groups(model, data)),
+        left_out=data.left_out,
     )
 
 

@@ -26,15 +26,16 @@ from hearthlog.analyzer.evaluation.scenes import (
     compose_single,
 )
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
+from hearthlog.analyzer.training.dataset import UNREADABLE, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import Scores
 from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording_session import RecordingSession
@@ -135,6 +136,8 @@ class ScenesEvaluation:
         Classes without a clip.
     skipped : dict of str to int
         How many clips were left out, by the reason.
+    left_out : sequence of LeftOut
+        Those that could not be read.
     truth, found : Labelling
         Of the first scene, for pictures; in nanoseconds from its start.
     """
@@ -150,6 +153,7 @@ class ScenesEvaluation:
     sources_learned: int
     lacking: tuple[str, ...]
     skipped: Mapping[str, int]
+    left_out: Sequence[LeftOut]
     truth: Labelling
     found: Labelling
 
@@ -181,13 +185,11 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
     DataError
         If the classes of the model are not those of the scenario, if no clip can be laid, or if a
         scene has no time for a sound.
-    SourceError
-        If a clip cannot be read.
     LogError, OSError
         If there is no room for a scene in the folder of temporary files.
     """
     check_classes(model, scenario)
-    by_label, skipped = _usable(clips, scenario)
+    by_label, skipped, left_out = _usable(clips, scenario)
     used = {scenario.find(label) for label in by_label}
     wanted = [name for name in scenario.classes if name not in {UNKNOWN, scenario.find(SILENCE)}]
     if not by_label:
@@ -240,6 +242,7 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
         sources_learned=_sources_learned(model, laid, scenario),
         lacking=tuple(name for name in wanted if name not in used),
         skipped=skipped,
+        left_out=left_out,
         truth=scenes[0][0],
         found=scenes[0][1],
     )
@@ -250,9 +253,12 @@ def alarms_per_hour(detections: Detections) -> float:
     return sum(detections.false_alarms_per_day.values()) / _HOURS_A_DAY
 
 
-def _usable(clips: Sequence[LabelledClip], scenario: Scenario) -> tuple[Clips, dict[str, int]]:
-    """Return the clips that are laid, by label, and how many others there are, by the reason."""
+def _usable(
+    clips: Sequence[LabelledClip], scenario: Scenario
+) -> tuple[Clips, dict[str, int], list[LeftOut]]:
+    """Return the clips that are laid, by label, how many others there are, and which are faulty."""
     chosen: Clips = {}
+    left_out: list[LeftOut] = []
     skipped: Counter[str] = Counter()
     silence = scenario.find(SILENCE)
     for clip in clips:
@@ -261,11 +267,26 @@ def _usable(clips: Sequence[LabelledClip], scenario: Scenario) -> tuple[Clips, d
             skipped[f"label {clip.label} is not in the scenario"] += 1
         elif name in {UNKNOWN, silence}:
             skipped[f"class {name} is not laid"] += 1
+        elif fault := _fault(clip):
+            skipped[UNREADABLE] += 1
+            left_out.append(LeftOut(UNREADABLE, fault))
         elif min(audio_seconds(clip.path), clip.end) - clip.start < FRAME_SECONDS:
             skipped[f"shorter than a frame of {1000 * FRAME_SECONDS:g} ms"] += 1
         else:
             chosen.setdefault(clip.label, []).append(clip)
-    return chosen, dict(sorted(skipped.items()))
+    return chosen, dict(sorted(skipped.items())), left_out
+
+
+def _fault(clip: LabelledClip) -> str:
+    """Say why the part of a clip that is laid cannot be read; empty if it can."""
+    faults: list[str] = []
+    end = min(clip.end, clip.start + _MOST_SECONDS)
+    try:
+        for _ in read_audio(clip.path, clip.start, end, incomplete=faults.append):
+            pass
+    except SourceError as error:
+        return str(error)
+    return faults[0] if faults else ""
 
 
 def _read(clip: LabelledClip) -> Float32:

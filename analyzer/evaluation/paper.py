@@ -21,7 +21,7 @@ from hearthlog.analyzer.evaluation.evaluate_method import (
 )
 from hearthlog.analyzer.training.dataset import Dataset, Recording, build_dataset, clip_recordings
 from hearthlog.analyzer.training.installed import DEFAULT
-from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.training.svm_method import PAPER
@@ -64,6 +64,8 @@ class Reproduction:
         By method and by what is never on both sides of a fold.
     skipped : mapping of str to int
         Number of clips that gave no segment, by the reason.
+    left_out : sequence of LeftOut
+        Clips that could not be read.
     """
 
     scenario: str
@@ -73,6 +75,7 @@ class Reproduction:
     collections: int
     results: Mapping[tuple[str, Kind], CrossValidation]
     skipped: Mapping[str, int]
+    left_out: Sequence[LeftOut]
 
 
 def reproduce(
@@ -95,8 +98,6 @@ def reproduce(
     DataError
         If a class has no segments, if the segments cannot be divided into folds of all kinds, as
         `divide` says, or if all of them are alike.
-    SourceError
-        If a clip cannot be read.
     """
     chosen = [BUILTIN[name] for name in scenarios]
     results: dict[str, dict[tuple[str, Kind], CrossValidation]] = {name: {} for name in scenarios}
@@ -156,6 +157,7 @@ def _reproduction(
         collections=len(np.unique(data.collection)),
         results=results,
         skipped=data.skipped,
+        left_out=data.left_out,
     )
 
 

@@ -13,7 +13,7 @@ from hearthlog.analyzer.evaluation.evaluate_model import fitted, segment_probabi
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.rooms import (
     RoomCopy,
     band_limits,
@@ -125,12 +125,15 @@ class Robustness:
         Why clips gave no segment, and how many.
     sources_learned : int
         Sources of which the model has learned from a segment.
+    left_out : sequence of LeftOut
+        Clips that could not be read, which `skipped` counts too.
     """
 
     unchanged: Scores
     changed: Mapping[str, Changed]
     skipped: Mapping[str, int]
     sources_learned: int
+    left_out: Sequence[LeftOut]
 
 
 def robustness(
@@ -157,8 +160,6 @@ def robustness(
     ------
     DataError
         If the classes of the model are not those of the scenario, or no clip has a segment.
-    SourceError
-        If a clip cannot be read.
     """
     scenario = fitted(scenario, model)
     done = groups = learned = 0
@@ -166,6 +167,7 @@ def robustness(
     group_numbers: list[Indices] = []
     predictions: list[Indices] = []
     skipped: Counter[str] = Counter()
+    left_out: list[LeftOut] = []
     batches = list(_batches(clips))
     results = in_parallel(delayed(_judge)(one, model, scenario, conditions) for one in batches)
     for batch, judged in zip(batches, results, strict=True):
@@ -174,6 +176,7 @@ def robustness(
         group_numbers.append(judged.group + groups)
         groups += len(batch)
         skipped.update(judged.skipped)
+        left_out += judged.left_out
         learned += judged.sources_learned
         done += len(batch)
         progress(done / len(clips))
@@ -195,6 +198,7 @@ def robustness(
         },
         skipped=dict(sorted(skipped.items())),
         sources_learned=learned,
+        left_out=left_out,
     )
 
 
@@ -206,6 +210,7 @@ class _Judged(NamedTuple):
     predicted: Indices  # shape (1 + conditions, n)
     skipped: Mapping[str, int]
     sources_learned: int
+    left_out: Sequence[LeftOut]
 
 
 def _batches(clips: Sequence[LabelledClip]) -> Iterator[list[tuple[int, LabelledClip]]]:
@@ -246,7 +251,7 @@ def _judge(
         inputs = of_segments(classifier.inputs, windows, floor)
         predicted[place] = segment_probabilities(classifier, inputs).argmax(axis=1)
     learned = len(learned_groups(model, data))
-    return _Judged(data.target, data.group, predicted, data.skipped, learned)
+    return _Judged(data.target, data.group, predicted, data.skipped, learned, data.left_out)
 
 
 def _changed(

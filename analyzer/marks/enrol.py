@@ -26,8 +26,10 @@ from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.file_times import GUESS, file_time
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.open_audio import audio_seconds
+from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -56,8 +58,8 @@ class Enrolled:
 def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
     """Enrol an audio file, or its first seconds.
 
-    Its frames get times that end now, or before older enrolled logs of the class: logs of one class
-    do not overlap.
+    Its frames get the times that its name or its metadata say, else times that end now; or earlier
+    ones, for enrolled logs of one class do not overlap.
 
     Parameters
     ----------
@@ -88,7 +90,11 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     length = audio_seconds(audio)
     if seconds is not None:
         length = min(length, seconds)
-    source = FileSource([audio], _free_start(home, label, length))
+    moment = file_time(audio, time_zone(load_settings(None, {}, {}).timezone))
+    end = time.time_ns()
+    if moment.origin != GUESS:
+        end = moment.start + int(length * NANOSECONDS)
+    source = FileSource([audio], _free_start(home, label, length, end))
     enrolled = _enrol(home, label, source, length, threading.Event())
     warning = "; ".join(source.warnings)
     return [replace(each, warning=warning) for each in enrolled]
@@ -302,12 +308,11 @@ def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) 
     return Enrolled(path, len(stamps) * FRAME_NANOSECONDS / NANOSECONDS)
 
 
-def _free_start(home: Path, label: str, seconds: float) -> int:
-    """Return the start of the last span of time that ends by now and overlaps no enrolled log."""
+def _free_start(home: Path, label: str, seconds: float, end: int) -> int:
+    """Return the start of the last span that ends by a time and overlaps no enrolled log."""
     length = int(seconds * NANOSECONDS)
     logs = filter(is_log, (home / ENROLLED).rglob(f"{label}_*{SUFFIX}"))
     spans = [span for log in logs if (span := time_span(log)) is not None]
-    end = time.time_ns()
     for first, last in sorted(spans, reverse=True):
         if first < end and last > end - length:
             end = first

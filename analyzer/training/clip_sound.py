@@ -3,10 +3,13 @@
 import numpy as np
 
 from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_SAMPLES
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
+
+MOST_SECONDS = 3600.0  # of a clip, which is held in memory
 
 
 def clip_frames(clip: LabelledClip) -> Float32:
@@ -24,8 +27,19 @@ def clip_frames(clip: LabelledClip) -> Float32:
     Raises
     ------
     SourceError
-        If the clip cannot be read.
+        If the clip cannot be read completely, or is longer than an hour.
     """
     cutter = FrameCutter()
-    blocks = [cutter.push(block) for block in read_audio(clip.path, clip.start, clip.end)]
+    faults: list[str] = []
+    blocks: list[Float32] = []
+    left = round(MOST_SECONDS / FRAME_SECONDS)
+    for block in read_audio(clip.path, clip.start, clip.end, incomplete=faults.append):
+        blocks.append(cutter.push(block))
+        left -= len(blocks[-1])
+        if left < 0:
+            raise SourceError(
+                f"{clip.path}: is longer than an hour; give it a start and an end in the manifest"
+            )
+    if faults:
+        raise SourceError(faults[0])
     return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])

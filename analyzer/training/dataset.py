@@ -11,7 +11,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.rooms import RoomCopy, in_room
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.sightings import Sighting
@@ -20,12 +20,14 @@ from hearthlog.models.classifiers.description import Amount
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.errors import SourceError
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
+UNREADABLE = "cannot be read, or not all of it"
 CONFIRMED = "this home, as it was labelled"  # a collection
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 _SEED = 20_261_122
@@ -52,6 +54,8 @@ class Recording(NamedTuple):
         Its start and end in nanoseconds of UTC, if that is known.
     sighting : Sighting or None
         Whence it came, if that is known.
+    fault : str
+        Why it could not be read; empty if it could.
     """
 
     label: str
@@ -65,6 +69,7 @@ class Recording(NamedTuple):
     most: int | None = None
     span: tuple[int, int] | None = None
     sighting: Sighting | None = None
+    fault: str = ""
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,8 @@ class Dataset:
         Starts and ends of the recordings that were used, in nanoseconds of UTC, if they are known.
     sightings : sequence of (Sighting or None)
         Whence the recording of each segment came, if that is known; empty if it is of none.
+    left_out : sequence of LeftOut
+        Recordings that could not be read, which `skipped` counts too.
     """
 
     windows: Float32
@@ -116,6 +123,7 @@ class Dataset:
     skipped: Mapping[str, int]
     spans: Int64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
     sightings: Sequence[Sighting | None] = ()
+    left_out: Sequence[LeftOut] = ()
 
     def __len__(self) -> int:
         return len(self.target)
@@ -178,15 +186,16 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     ------
     DataError
         If a class is left without segments.
-    SourceError
-        If a clip cannot be read.
     """
     recordings = chain(clip_recordings(clips, scenario, progress, features, rooms), home)
     data = cut_recordings(recordings, scenario, features)
     for name, amount in data.amounts.items():
         if not amount.segments:
             labels = ", ".join(scenario.classes[name])
-            raise DataError(f"class {name} has no segments: no usable clip is labelled {labels}")
+            why = f" (left out: {data.left_out[0].clip})" if data.left_out else ""
+            raise DataError(
+                f"class {name} has no segments: no usable clip is labelled {labels}{why}"
+            )
     return data
 
 
@@ -197,7 +206,9 @@ def clip_recordings(
     features: FeatureSet = DEFAULT,
     rooms: int = 0,
 ) -> Iterator[Recording]:
-    """Read clips and compute their features; clips of labels outside the scenario have none.
+    """Read clips and compute their features.
+
+    Clips of labels outside the scenario have none, nor those that cannot be read.
 
     Parameters
     ----------
@@ -214,18 +225,17 @@ def clip_recordings(
     ------
     Recording
         In the order of the clips.
-
-    Raises
-    ------
-    SourceError
-        If a clip cannot be read.
     """
     for number, clip in enumerate(clips):
         progress(number / len(clips))
-        frames = np.empty((0, FRAME_SAMPLES), np.float32)
+        frames, fault = np.empty((0, FRAME_SAMPLES), np.float32), ""
         if scenario.find(clip.label) is not None:
-            frames = clip_frames(clip)
-        yield _recording(clip, frames, features, rooms, np.random.default_rng([_SEED, number]))
+            try:
+                frames = clip_frames(clip)
+            except SourceError as error:
+                fault = str(error)
+        rng = np.random.default_rng([_SEED, number])
+        yield _recording(clip, frames, features, rooms, rng)._replace(fault=fault)
     progress(1.0)
 
 
@@ -259,6 +269,7 @@ def cut_recordings(
     used: Counter[tuple[str, str]] = Counter()
     skipped: Counter[str] = Counter()
     seconds: dict[str, float] = {}
+    left_out: list[LeftOut] = []
     chosen: list[_Chosen] = []
     spans: list[tuple[int, int]] = []
     rows = [np.empty((0, 3), np.intp)]
@@ -269,6 +280,8 @@ def cut_recordings(
             skipped[f"label {item.label} is not in the scenario"] += 1
             continue
         reason, starts = _segments(item, features)
+        if item.fault:
+            left_out.append(LeftOut(reason, item.fault))
         if reason:
             skipped[reason] += 1
             continue
@@ -301,6 +314,7 @@ def cut_recordings(
         skipped=dict(sorted(skipped.items())),
         spans=np.array(spans, np.int64).reshape(-1, 2),
         sightings=[one.recording.sighting for one in segments],
+        left_out=left_out,
     )
 
 
@@ -360,6 +374,8 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]
     """Return where the segments that are loud enough begin, and why there are none."""
     values, window = recording.features, features.window_frames
     nothing = np.empty(0, np.intp)
+    if recording.fault:
+        return UNREADABLE, nothing
     if values.shape[1] != features.width:
         return f"its features are not {features.name}", nothing
     if len(values) < window:

@@ -1,9 +1,10 @@
 """The manifest of labelled clips: a CSV file beside the audio."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
@@ -12,6 +13,7 @@ from hearthlog.models.classifiers.description import TEXT
 
 REQUIRED = ("path", "label", "source_group")
 OPTIONAL = ("source", "licence", "start", "end")
+_NAMED = 3  # of those that are left out
 SIZE_LIMIT = 64 << 20  # half a million clips; what is larger is something else
 
 
@@ -41,7 +43,50 @@ class LabelledClip:
     end: float = math.inf
 
 
-def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
+class LeftOut(NamedTuple):
+    """A clip that nothing is learned from.
+
+    Attributes
+    ----------
+    reason : str
+        Why; the same for clips of one kind.
+    clip : str
+        Which one, and more about it.
+    """
+
+    reason: str
+    clip: str
+
+
+def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
+    """Say how many clips were left out, and which first, in a line for each reason.
+
+    Parameters
+    ----------
+    left_out : sequence of LeftOut
+    """
+    by_reason: dict[str, list[str]] = {}
+    for reason, clip in left_out:
+        by_reason.setdefault(reason, []).append(clip)
+    lines = []
+    for reason, clips in by_reason.items():
+        first = "; ".join(clips[:_NAMED])
+        more = f"; and {len(clips) - _NAMED:,} more" if len(clips) > _NAMED else ""
+        lines.append(f"left out: {len(clips):,}, {reason}: {first}{more}")
+    return lines
+
+
+class _RowError(DataError):
+    """One line of a manifest is of no use."""
+
+    def __init__(self, where: str, reason: str, detail: str, shown: str = "") -> None:
+        super().__init__(f"{where}: {detail}")
+        self.left_out = LeftOut(reason, f"{where}: {shown or detail}")
+
+
+def read_manifest(
+    path: Path, labels: Collection[str], left_out: list[LeftOut] | None = None
+) -> list[LabelledClip]:
     """Read a manifest with the columns path, label, source_group.
 
     Parameters
@@ -51,6 +96,8 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
         licence, start and end, too; others are ignored.
     labels : collection of str
         Allowed labels; other names of the same sounds (`hearthlog.models.classes`) are allowed too.
+    left_out : list of LeftOut, optional
+        Takes lines that are of no use, which raise an error without it.
 
     Returns
     -------
@@ -78,38 +125,57 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
     seen: dict[tuple[Path, float, float], int] = {}
     for number, record in lines:
         where = f"{path}:{number}"
-        clip = _clip(where, path.parent, column, record, labels)
-        span = clip.path, clip.start, clip.end
-        if span in seen:
-            raise DataError(f"{where}: {clip.path.name!r} is listed in line {seen[span]} too")
-        seen[span] = number
+        try:
+            clip = _clip(where, path.parent, column, record, labels)
+            _check_new(where, clip, seen, number)
+        except _RowError as error:
+            if left_out is None:
+                raise
+            left_out.append(error.left_out)
+            continue
         clips.append(clip)
+    if not clips and left_out:
+        raise DataError(f"{path}: lists no clip that can be used; of its first, {left_out[0].clip}")
     if not clips:
         raise DataError(f"{path}: lists no clips")
     return clips
+
+
+def _check_new(
+    where: str, clip: LabelledClip, seen: dict[tuple[Path, float, float], int], number: int
+) -> None:
+    """Refuse a part of a file that another line lists."""
+    first = seen.setdefault((clip.path, clip.start, clip.end), number)
+    if first != number:
+        raise _RowError(where, "listed twice", f"{clip.path.name!r} is listed in line {first} too")
 
 
 def _clip(
     where: str, folder: Path, column: dict[str, int], record: list[str], labels: Collection[str]
 ) -> LabelledClip:
     if len(record) <= max(column[name] for name in REQUIRED):
-        raise DataError(f"{where}: has {len(record)} fields, the first line names {len(column)}")
+        detail = f"has {len(record)} fields, the first line names {len(column)}"
+        raise _RowError(where, "a line that is not complete", detail)
     value = {
         name: record[column[name]].strip() if column.get(name, len(record)) < len(record) else ""
         for name in (*REQUIRED, *OPTIONAL)
     }
     for name in REQUIRED:
         if not value[name]:
-            raise DataError(f"{where}: {name} is empty")
+            raise _RowError(where, f"no {name}", f"{name} is empty")
     for name in ("source", "licence"):
         if not TEXT.fullmatch(value[name]):
-            raise DataError(f"{where}: {name} must be one line of at most 300 characters")
+            detail = f"{name} must be one line of at most 300 characters"
+            raise _RowError(where, f"no {name} that can be kept", detail)
     if not meant_by(value["label"], labels):
         names = ", ".join(sorted(labels))
-        raise DataError(f"{where}: unknown label {value['label'][:64]!r}; known are {names}")
+        shown = repr(value["label"][:64])
+        detail = f"unknown label {shown}; known are {names}"
+        raise _RowError(where, "a label that the scenario does not know", detail, shown)
     audio = folder / value["path"]
     if not _is_file(audio):
-        raise DataError(f"{where}: no such file: {value['path'][:256]!r}")
+        shown = repr(value["path"][:256])
+        raise _RowError(where, "no such file", f"no such file: {shown}", shown)
     return LabelledClip(
         audio,
         value["label"],
@@ -126,10 +192,11 @@ def _span(where: str, start: str, end: str) -> tuple[float, float]:
     except ValueError:
         span = math.nan, math.nan
     if not 0 <= span[0] < span[1]:
-        raise DataError(
-            f"{where}: start {start[:32]!r} and end {end[:32]!r} are no part of a file; give "
-            "seconds, the start before the end"
+        detail = (
+            f"start {start[:32]!r} and end {end[:32]!r} are no part of a file; give seconds, the "
+            "start before the end"
         )
+        raise _RowError(where, "no part of a file", detail)
     return span
 
 

@@ -23,6 +23,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
+_NAMED = 10  # of the files that are damaged
 
 
 class FileSource:
@@ -50,8 +51,6 @@ class FileSource:
     realtime : bool
     frames : int
         Number of frames that were yielded.
-    warnings : list of str
-        What of the files was not heard or not at its time, as far as they were read.
 
     Raises
     ------
@@ -79,12 +78,29 @@ class FileSource:
         check_times(start, last + int(self._seconds * NANOSECONDS))
         self.device = _name(paths)
         self.frames = 0
-        self.warnings: list[str] = []
+        self._faults: list[str] = []
+        self._overlaps: list[tuple[float, Path]] = []  # seconds, and the file that begins too early
         self._paths = paths
         self._start = start
         self.realtime = realtime
         self._channels = channels
         self._progress = progress
+
+    @property
+    def warnings(self) -> list[str]:
+        """What of the files was not heard, or not at its time, as far as they were read."""
+        lines = [f"{fault}; what is there was heard" for fault in self._faults[:_NAMED]]
+        if len(self._faults) > _NAMED:
+            lines.append(f"{len(self._faults) - _NAMED:,} more files are damaged or cut short")
+        if self._overlaps:
+            count = len(self._overlaps)
+            files = "1 file begins" if count == 1 else f"{count:,} files begin"
+            lines.append(
+                f"{files} before the end of the one before, up to {max(self._overlaps)[0]:.1f} s, "
+                f"first {self._overlaps[0][1]}: logged behind each other, so that their times are "
+                "later than they say"
+            )
+        return lines
 
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield the frames, the gaps between files, and the health of the source.
@@ -132,7 +148,7 @@ class FileSource:
         if not self.frames:
             files = ", ".join(str(path) for path in self._paths)
             raise SourceError(
-                "; ".join(self.warnings) or f"{files}: shorter than one frame of 50 ms"
+                "; ".join(self._faults) or f"{files}: shorter than one frame of 50 ms"
             )
 
     def _frames(self) -> Iterator["Float32 | _Pause"]:
@@ -150,7 +166,7 @@ class FileSource:
                 yield _Pause(moment.start, f"between the files {before} and {path.name}")
                 held, samples, begin = held[:0], 0, moment.start
             before = path.name
-            for block in read_audio(path, channels=self._channels, incomplete=self.warnings.append):
+            for block in read_audio(path, channels=self._channels, incomplete=self._faults.append):
                 samples += len(block)
                 held = np.concatenate([held, block])
                 whole = len(held) - len(held) % size
@@ -166,10 +182,7 @@ class FileSource:
         late = moment.start - end
         step = max(moment.step, FRAME_NANOSECONDS)
         if late <= -step:
-            self.warnings.append(
-                f"{path}: begins {-late / NANOSECONDS:.2f} s before the end of the file before it; "
-                "it is logged behind that, with later times"
-            )
+            self._overlaps.append((-late / NANOSECONDS, path))
         return late >= step
 
 

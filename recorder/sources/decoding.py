@@ -35,8 +35,7 @@ def read_audio(
     channels : int or None
         Those of an array, as `check_channels` takes them, which are kept apart.
     incomplete : callable
-        Told in a sentence that the file is damaged or cut short, if that is so; what is there was
-        yielded then.
+        Told at the end that the file is damaged or cut short, if it is; what is there was yielded.
 
     Yields
     ------
@@ -56,7 +55,7 @@ def read_audio(
         blocks = (mix(block) for block in audio.blocks(first, last))
         yield from _resampled(blocks, audio.rate, channels)
         if fault := audio.fault():
-            incomplete(f"{path}: {fault}; what is there was read")
+            incomplete(f"{path}: {fault}")
 
 
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:

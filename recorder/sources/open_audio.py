@@ -37,6 +37,11 @@ _CLAIMED_RF64 = re.compile(r"frame count (\d+) does not match value from 'ds64' 
 _NOT_MP3 = {b"RIFF", b"RF64", b"riff", b"fLaC", b"OggS", b"FORM", b"caff", b".snd"}  # begin so
 _OF_MPG123 = re.compile(rb"\[[^]]*mpg123|(?:Note|Warning): |mpg123|\s*$")
 _BROKEN_MP3 = re.compile(rb"error:|Xing stream size off|resync")
+_MP3_SEARCHED = 65_536  # bytes in which the first frame begins
+_MP3_BIT_RATES = (  # in kbit/s: of MPEG 2 and 2.5, and of MPEG 1
+    (8, 16, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128, 144, 160),
+    (32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320),
+)
 _OGG_PAGE = 65_307  # bytes, at most
 _OGG_END = 4  # flag of the last page
 _STDERR = 2
@@ -81,20 +86,26 @@ def open_audio(path: Path) -> Iterator[OpenAudio]:
         768 kHz.
     """
     _check_file(path)
-    reason = ""
     complaints: list[bytes] = []
     try:
         sound = _opened(path, complaints)
     except soundfile.LibsndfileError as error:
         sound, reason = None, error.error_string.rstrip(".") or "it is damaged"
-    if sound is not None and sound.frames:
-        with sound:
-            yield _by_libsndfile(path, sound, complaints)
+        if "regular file" in reason:  # so it says of an MP3 file without a frame
+            reason = "Format not recognised"
+    if sound is None:
+        with _decoder(path, reason) as decoder:
+            yield _by_ffmpeg(path, decoder)
         return
-    if sound is not None:
-        sound.close()
-    with _decoder(path, reason) as decoder:
-        yield _by_ffmpeg(path, decoder)
+    with sound:
+        if not sound.frames:
+            raise SourceError(f"{path}: holds no audio")
+        hidden = _hidden_seconds(path, sound)
+        if hidden and has_ffmpeg():
+            with _decoder(path, "") as decoder:
+                yield _by_ffmpeg(path, decoder)
+            return
+        yield _by_libsndfile(path, sound, complaints, hidden)
 
 
 def audio_seconds(path: Path) -> float:
@@ -219,7 +230,9 @@ def _is_chunk(view: _View, place: int) -> bool:
     return view[place : place + 4].isalnum() and place + 8 + size <= len(view)
 
 
-def _by_libsndfile(path: Path, sound: soundfile.SoundFile, complaints: list[bytes]) -> OpenAudio:
+def _by_libsndfile(
+    path: Path, sound: soundfile.SoundFile, complaints: list[bytes], hidden: float
+) -> OpenAudio:
     _check_rate(path, sound.samplerate)
     frames = None if isinstance(sound, _Unseekable) else sound.frames
     place, end, is_broken = 0, 0.0, False
@@ -231,13 +244,7 @@ def _by_libsndfile(path: Path, sound: soundfile.SoundFile, complaints: list[byte
             place = sound.seek(min(first, frames))
         size = int(sound.samplerate * BLOCK_SECONDS)
         while not is_broken and (count := int(min(size, last - place))) > 0:
-            block = np.full((count, sound.channels), np.nan, np.float32)
-            try:
-                with _without_mpg123(path, complaints):
-                    block = sound.read(count, out=block)
-            except soundfile.LibsndfileError:
-                is_broken = True
-                block = block[: _filled(block)]
+            block, is_broken = _read(path, sound, count, complaints)
             if not len(block):
                 return
             place += len(block)
@@ -248,20 +255,83 @@ def _by_libsndfile(path: Path, sound: soundfile.SoundFile, complaints: list[byte
     def fault() -> str:
         if place >= end:  # no more was wanted
             return ""
+        if hidden:
+            return f"does not say how long it is; install ffmpeg, which reads {hidden:.0f} s more"
         is_mp3 = sound.format == "MP3"  # its length may be an estimate
         is_short = frames is not None and place < frames and not is_mp3
         if is_broken or is_short or (is_mp3 and any(map(_BROKEN_MP3.search, complaints))):
-            return f"is damaged or cut short after {place / sound.samplerate:.2f} s"
-        is_cut = _claims_more(sound.extra_info) or (sound.format == "OGG" and not _is_ended(path))
-        return f"is cut short: its sound ends at {place / sound.samplerate:.2f} s" if is_cut else ""
+            return _damage(place / sound.samplerate)
+        return _cut(path, sound, place / sound.samplerate)
 
     return OpenAudio(sound.samplerate, sound.channels, frames, blocks, fault)
 
 
-def _filled(block: Float32) -> int:
-    """Return how many samples were read into a block of NaN, for libsndfile does not say."""
-    filled = np.flatnonzero(~np.isnan(block).all(axis=1))
-    return int(filled[-1]) + 1 if len(filled) else 0
+def _read(
+    path: Path, sound: soundfile.SoundFile, count: int, complaints: list[bytes]
+) -> tuple[Float32, bool]:
+    """Read so many samples, or fewer; return whether libsndfile cannot go on."""
+    block = np.full((count, sound.channels), np.nan, np.float32)
+    try:
+        with _without_mpg123(path, complaints):
+            return sound.read(count, out=block), False
+    except soundfile.LibsndfileError:
+        # It does not say how many it has read before.
+        filled = np.flatnonzero(~np.isnan(block).all(axis=1))
+        return block[: int(filled[-1]) + 1 if len(filled) else 0], True
+
+
+def _cut(path: Path, sound: soundfile.SoundFile, seconds: float) -> str:
+    """Say that a file ends before its sound does, if it does."""
+    is_open = sound.format == "OGG" and not _is_ended(path)
+    if is_open or _claims_more(sound.extra_info):
+        return f"is cut short: its sound ends at {seconds:.2f} s"
+    return ""
+
+
+def _damage(seconds: float) -> str:
+    if not seconds:
+        return "is damaged, and none of its sound can be read"
+    return f"is damaged or cut short after {seconds:.2f} s"
+
+
+def _hidden_seconds(path: Path, sound: soundfile.SoundFile) -> float:
+    """Return how much of an MP3 file libsndfile leaves out, where it guesses the length wrongly.
+
+    Without a table at its beginning it goes by the first bit rate, which may change.
+    """
+    if sound.format != "MP3":
+        return 0.0
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
+        place = 0
+        if view[:3] == b"ID3":
+            place = 10 + sum(
+                byte << shift for byte, shift in zip(view[6:10], (21, 14, 7, 0), strict=False)
+            )
+        place = view.find(b"\xff", place, place + _MP3_SEARCHED)
+        head = view[place : place + 200]
+        if place < 0 or any(table in head for table in (b"Xing", b"Info", b"VBRI")):
+            return 0.0
+        samples = 0
+        while place >= 0 and place + 4 <= len(view):
+            length, count = _mp3_frame(view[place : place + 4])
+            samples += count
+            place = place + length if length else view.find(b"\xff", place + 1, place + 65_536)
+    hidden = (samples - sound.frames) / sound.samplerate
+    return hidden if hidden > 0.5 + 0.01 * sound.frames / sound.samplerate else 0.0
+
+
+def _mp3_frame(head: bytes) -> tuple[int, int]:
+    """Return the bytes and the samples of a frame of layer III by its header; 0 if it is none."""
+    version, rate, speed = head[1] >> 3 & 3, head[2] >> 2 & 3, head[2] >> 4
+    if head[0] != 0xFF or head[1] >> 5 != 7 or head[1] >> 1 & 3 != 1 or version == 1 or rate == 3:
+        return 0, 0
+    if speed in {0, 15}:
+        return 0, 0
+    is_first = version == 3
+    bits = 1000 * _MP3_BIT_RATES[is_first][speed - 1]
+    per_second = (44_100, 48_000, 32_000)[rate] >> (0 if is_first else 1 if version == 2 else 2)
+    samples = 1152 if is_first else 576
+    return samples // 8 * bits // per_second + (head[2] >> 1 & 1), samples
 
 
 def _claims_more(log: str) -> bool:
@@ -307,24 +377,19 @@ def _without_mpg123(path: Path, complaints: list[bytes]) -> Iterator[None]:
 
 @contextmanager
 def _decoder(path: Path, reason: str) -> Iterator[FileDecoder]:
-    """Start ffmpeg for a file that libsndfile cannot read, or finds nothing in."""
+    """Start ffmpeg for a file that libsndfile cannot read."""
     unreadable = f"{path}: cannot be read as audio"
     if not has_ffmpeg():
         target = f"{path.stem}{'-2' if path.suffix.lower() == '.wav' else ''}.wav"
         raise SourceError(
             f"{unreadable} ({reason}); install ffmpeg (Debian: apt install ffmpeg), or convert it "
             f"elsewhere: ffmpeg -i {shlex.quote(path.name)} {shlex.quote(target)}"
-            if reason
-            else f"{path}: holds no audio"
         )
     try:
         decoder = FileDecoder(path)
     except SourceError as error:
-        raise SourceError(
-            f"{unreadable} ({str(error) or f'{reason}; not by ffmpeg either'})"
-            if reason
-            else f"{path}: holds no audio"
-        ) from error
+        why = str(error) or f"{reason}; not by ffmpeg either"
+        raise SourceError(f"{unreadable} ({why})") from error
     with decoder:
         yield decoder
 
@@ -354,6 +419,6 @@ def _by_ffmpeg(path: Path, decoder: FileDecoder) -> OpenAudio:
     def fault() -> str:
         if place >= end or not (reason or decoder.fault()):
             return ""
-        return f"is damaged or cut short after {place / decoder.rate:.2f} s"
+        return _damage(place / decoder.rate)
 
     return OpenAudio(decoder.rate, decoder.channels, None, blocks, fault)

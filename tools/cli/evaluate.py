@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,7 +24,7 @@ from hearthlog.tools.cli.options import (
     Scheduler,
     check_output,
     chosen_method,
-    manifest_path,
+    labelled_clips,
 )
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
     from hearthlog.analyzer.evaluation.evaluate_model import ModelEvaluation
     from hearthlog.analyzer.training.dataset import Dataset
+    from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
     from hearthlog.schemas.progress import Progress
@@ -148,12 +149,15 @@ def evaluate_model(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Score a model on labelled clips."""
+    """Score a model on labelled clips.
+
+    Exit status 3: the model has learned from some of the clips, or some cannot be read.
+    """
     from hearthlog.analyzer.extras import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation import evaluate_model as evaluation
-    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.manifest import left_out_lines
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile.modelfile import load_model
@@ -163,7 +167,8 @@ def evaluate_model(
     seconds = feature_set(loaded.description.feature_set).window_seconds
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     evaluation.check_classes(loaded, classes)
-    clips = read_manifest(manifest_path(data), classes.labels)
+    left_out: list[LeftOut] = []
+    clips = labelled_clips([data], classes.labels, left_out)
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         result = evaluation.evaluate_model(loaded, clips, classes, report)
     scores = result.scores
@@ -188,7 +193,8 @@ def evaluate_model(
         print_scores(scores, result.detections)
         print_reliability(result.reliability, result.expected_calibration_error)
         print_skipped(result.skipped, "clips")
-    end_with_warnings(learned_lines(result.sources_learned, scores.groups))
+    warnings = left_out_lines([*left_out, *result.left_out])
+    end_with_warnings([*warnings, *learned_lines(result.sources_learned, scores.groups)])
 
 
 evaluate.command()(scenes)
@@ -224,6 +230,7 @@ def evaluate_method(
             | _calibration(result)
             | {"skipped": dict(segments.skipped)}
         )
+        _end_with(segments.left_out)
         return
     print(
         f"method {method}, scenario {scenario}: {result.scores.segments} segments of "
@@ -232,6 +239,7 @@ def evaluate_method(
     )
     print_scores(result.scores)
     print_reliability(result.reliability, result.expected_calibration_error)
+    _end_with(segments.left_out)
 
 
 @evaluate.command()
@@ -255,6 +263,7 @@ def search(
     if as_json:
         rows = [one.method.parameters | asdict(one.scores) for one in tried]
         print_json({"scenario": scenario, "method": method, "by": folds, "tried": rows})
+        _end_with(segments.left_out)
         return
     print(
         f"method {method}, scenario {scenario}: {len(segments)} segments of "
@@ -264,6 +273,7 @@ def search(
     best = tried[0].method.parameters
     options = "".join(f" --{name} {value:g}" for name, value in best.items())
     print(f"\nhearthlog train --method {method}{options} …")
+    _end_with(segments.left_out)
 
 
 @evaluate.command()
@@ -288,6 +298,7 @@ def adaptation(
         curve = adaptation_curve(segments, chosen, progress)
     if as_json:
         print_json({"scenario": scenario, "method": method} | curve._asdict())
+        _end_with(segments.left_out)
         return
     window = f"{chosen.features.window_seconds:g} s"
     print(f"macro F1 after so many corrected segments of {window}\n")
@@ -300,6 +311,7 @@ def adaptation(
         f"\nlargest loss of a class in a home: {-min(curve.worst):.3f}, of silence "
         f"{-min(curve.worst_of_silence):.3f}"
     )
+    _end_with(segments.left_out)
 
 
 evaluate.command()(paper)
@@ -311,21 +323,29 @@ def _learning(
 ) -> "Iterator[tuple[Method, Dataset, Progress]]":
     """Cut the clips into segments; what learns from them in the block runs on the cluster."""
     from hearthlog.analyzer.training.dataset import build_dataset
-    from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.workers.parallel import fits_on
 
     method = chosen_method(name)
     with fits_on(scheduler):
         classes = load_scenario(scenario)
-        clips = read_manifest(manifest_path(data), classes.labels)
+        left_out: list[LeftOut] = []
+        clips = labelled_clips([data], classes.labels, left_out)
         classes = classes.with_unknown((clip.label, clip.source_group) for clip in clips)
         with share_done(f"listening to {len(clips)} clips", announce=True) as progress:
             segments = build_dataset(
                 clips, classes, progress, features=method.features, rooms=method.rooms
             )
+        segments = replace(segments, left_out=[*left_out, *segments.left_out])
         with share_done(f"learning from {len(segments)} segments", announce=True) as progress:
             yield method, segments, progress
+
+
+def _end_with(left_out: "Sequence[LeftOut]") -> None:
+    """Tell which clips were left out, and end with exit status 3 if any was."""
+    from hearthlog.analyzer.training.manifest import left_out_lines
+
+    end_with_warnings(left_out_lines(left_out))
 
 
 def _calibration(result: "CrossValidation | ModelEvaluation") -> dict[str, Any]:

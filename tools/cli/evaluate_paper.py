@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from hearthlog.schemas.text import shortened
-from hearthlog.tools.cli.options import Clips, Json, manifest_path
+from hearthlog.tools.cli.options import Clips, Json, labelled_clips
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import between, share
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
-from hearthlog.tools.cli.text import number, print_json
+from hearthlog.tools.cli.text import end_with_warnings, number, print_json
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
     from hearthlog.analyzer.evaluation.paper import Reproduction
+    from hearthlog.analyzer.training.manifest import LeftOut
 
 _MOSTLY = 0.7  # share of a class that is of one collection
 _THIN = 20  # sources
@@ -35,19 +36,22 @@ def paper(
 
     require("sklearn", "scipy", "joblib")
     from hearthlog.analyzer.evaluation.paper import PAPER_F1, reproduce
-    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.manifest import left_out_lines
     from hearthlog.analyzer.training.scenario import LABELS
 
-    clips = read_manifest(manifest_path(data), LABELS)
+    left_out: list[LeftOut] = []
+    clips = labelled_clips([data], LABELS, left_out)
     scenarios = [scenario] if scenario else list(PAPER_F1)
     with share_done(f"learning from {number(len(clips), 'clip')}", announce=True) as progress:
         found = reproduce(clips, scenarios, progress)
+    left_out += dict.fromkeys(clip for one in found for clip in one.left_out)
     if as_json:
         print_json({one.scenario: _as_json(one) for one in found})
-        return
-    for one in found:
-        print_reproduction(one)
-    print(_WHY)
+    else:
+        for one in found:
+            print_reproduction(one)
+        print(_WHY)
+    end_with_warnings(left_out_lines(left_out))
 
 
 def print_reproduction(found: "Reproduction") -> None:

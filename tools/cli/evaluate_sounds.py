@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output, manifest_path
+from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output, labelled_clips
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import (
     print_coughs,
@@ -18,7 +18,7 @@ from hearthlog.tools.cli.scores import (
 from hearthlog.tools.cli.text import end_with_warnings, number, print_json
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.training.manifest import LabelledClip
+    from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
     from hearthlog.analyzer.training.scenario import Scenario
     from hearthlog.models.classifiers.model import Model
 
@@ -45,7 +45,8 @@ def scenes(
 ) -> None:
     """Compose scenes of labelled clips, record them with a model, and score its labels.
 
-    Exit status 3: a class has no clip, or the model has learned from some of the clips.
+    Exit status 3: a class has no clip, the model has learned from some of the clips, or some cannot
+    be read.
     """
     from hearthlog.analyzer.extras import require
 
@@ -55,9 +56,10 @@ def scenes(
         alarms_per_hour,
         evaluate_scenes,
     )
+    from hearthlog.analyzer.training.manifest import left_out_lines
 
     check_output("--plot", plot, ".png", "a picture")
-    loaded, clips, classes = _read(model, data, scenario)
+    loaded, clips, classes, left_out = _read(model, data, scenario)
     options = SceneOptions(scenes, 60.0 * minutes, floor, colour, gain, seed)
     with share_done(f"recording {number(scenes, 'scene')}", announce=True) as report:
         found = evaluate_scenes(model, loaded, clips, classes, options, report)
@@ -98,7 +100,8 @@ def scenes(
         if found.coughs is not None:
             print_coughs(found.coughs)
         print_skipped(found.skipped, "clips")
-    warnings = learned_lines(found.sources_learned, found.sources)
+    warnings = left_out_lines([*left_out, *found.left_out])
+    warnings += learned_lines(found.sources_learned, found.sources)
     if found.lacking:
         names = ", ".join(found.lacking)
         warnings.append(f"{data}: has no clip of {names}: what is labelled so is a false alarm")
@@ -115,15 +118,16 @@ def robustness(
 ) -> None:
     """Score a model on labelled clips in noise, in other rooms and by other microphones.
 
-    Exit status 3: the model has learned from some of the clips.
+    Exit status 3: the model has learned from some of the clips, or some cannot be read.
     """
     from hearthlog.analyzer.extras import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation import robustness as evaluation
+    from hearthlog.analyzer.training.manifest import left_out_lines
 
     check_output("--plot", plot, ".png", "a picture")
-    loaded, clips, classes = _read(model, data, scenario)
+    loaded, clips, classes, left_out = _read(model, data, scenario)
     with share_done(f"listening to {number(len(clips), 'clip')}", announce=True) as report:
         found = evaluation.robustness(loaded, clips, classes, report)
     if plot is not None:
@@ -150,7 +154,8 @@ def robustness(
         )
         print_robustness(found)
         print_skipped(found.skipped, "clips")
-    end_with_warnings(learned_lines(found.sources_learned, found.unchanged.groups))
+    warnings = left_out_lines([*left_out, *found.left_out])
+    end_with_warnings([*warnings, *learned_lines(found.sources_learned, found.unchanged.groups)])
 
 
 def learned_lines(learned: int, sources: int) -> list[str]:
@@ -163,12 +168,12 @@ def learned_lines(learned: int, sources: int) -> list[str]:
 
 def _read(
     model: Path, data: Path, scenario: str | None
-) -> "tuple[Model, list[LabelledClip], Scenario]":
-    """Read a model, its scenario unless another one is named, and clips."""
-    from hearthlog.analyzer.training.manifest import read_manifest
+) -> "tuple[Model, list[LabelledClip], Scenario, list[LeftOut]]":
+    """Read a model, its scenario unless another one is named, and clips; some are of no use."""
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.modelfile.modelfile import load_model
 
     loaded = load_model(model)
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
-    return loaded, read_manifest(manifest_path(data), classes.labels), classes
+    left_out: list[LeftOut] = []
+    return loaded, labelled_clips([data], classes.labels, left_out), classes, left_out

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
-from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, manifest_path, models_folder
+from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, labelled_clips, models_folder
 from hearthlog.tools.cli.scores import share
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong_use
@@ -16,6 +16,7 @@ from hearthlog.tools.cli.verdict import print_verdict, refusal
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.compare_models import Comparison
     from hearthlog.analyzer.training.dataset import Recording
+    from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.scenario import Scenario
     from hearthlog.models.classifiers.model import Model
     from hearthlog.models.features.feature_set import FeatureSet
@@ -95,10 +96,12 @@ def compare(
 ) -> None:
     """Run two models on the same sound, and say which is better, and how surely.
 
-    Sources that one of them has learned from are left out. Exit status 3: there are no others. Of
-    logs it is also said how much of a day each model gives to each class.
+    Sources that one of them has learned from are left out. Exit status 3: there are no others, or
+    some clips cannot be read. Of logs it is also said how much of a day each model gives to each
+    class.
     """
     from hearthlog.analyzer.evaluation.compare_models import check_features, compare_models
+    from hearthlog.analyzer.training.manifest import left_out_lines
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.features.installed import feature_set
 
@@ -114,7 +117,8 @@ def compare(
     check_features(first, second)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
     features = feature_set(first.description.feature_set)
-    recordings = _recordings(data, logs, chosen, features)
+    left_out: list[LeftOut] = []
+    recordings = _recordings(data, logs, chosen, features, left_out)
     if logs is not None and not recordings:
         tell("nothing is marked: it is said how the models differ, not which is better")
         shares = _minutes_in_logs(first, second, logs)
@@ -135,12 +139,13 @@ def compare(
         print(json.dumps(asdict(comparison) | more, indent=2))
     else:
         _print_comparison(comparison, shares)
+    warnings = left_out_lines(left_out)
     if not comparison.held_out:
-        tell(
+        warnings.append(
             "every source is one that these models have learned from: this says nothing of how "
             "good they are on others"
         )
-        raise typer.Exit(3)
+    end_with_warnings(warnings)
 
 
 @models.command()
@@ -245,19 +250,25 @@ def _logs_folder() -> Path:
 
 
 def _recordings(
-    data: Path | None, logs: Path | None, scenario: "Scenario", features: "FeatureSet"
+    data: Path | None,
+    logs: Path | None,
+    scenario: "Scenario",
+    features: "FeatureSet",
+    left_out: "list[LeftOut]",
 ) -> "list[Recording]":
-    from hearthlog.analyzer.training.dataset import clip_recordings
+    from hearthlog.analyzer.training.dataset import UNREADABLE, clip_recordings
     from hearthlog.analyzer.training.home_data import home_recordings
-    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.tools.cli.progress import share_done
 
     if logs is not None:
         return list(home_recordings(logs, features))
     assert data is not None
-    clips = read_manifest(manifest_path(data), scenario.labels)
+    clips = labelled_clips([data], scenario.labels, left_out)
     with share_done(f"listening to {len(clips)} clips") as report:
-        return list(clip_recordings(clips, scenario, report, features))
+        recordings = list(clip_recordings(clips, scenario, report, features))
+    left_out += [LeftOut(UNREADABLE, each.fault) for each in recordings if each.fault]
+    return recordings
 
 
 def _named(folder: Path, name: str) -> "Model":

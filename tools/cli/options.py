@@ -9,6 +9,9 @@ import typer
 from hearthlog.tools.cli.text import wrong_use
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
     from hearthlog.analyzer.training.method import Method
 
 _LAST = (1 << 63) - 1  # log time
@@ -102,6 +105,16 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 def manifest_path(path: Path) -> Path:
     """Return the manifest that a path is, or that the folder holds."""
     return path / "manifest.csv" if path.is_dir() else path
+
+
+def labelled_clips(
+    data: "Sequence[Path]", labels: "Collection[str]", left_out: "list[LeftOut]"
+) -> "list[LabelledClip]":
+    """Read manifests, or the folders of them; take what is of no use in them apart."""
+    from hearthlog.analyzer.training.manifest import read_manifest
+
+    paths = map(manifest_path, data)
+    return [clip for path in paths for clip in read_manifest(path, labels, left_out)]
 
 
 def models_folder(given: Path | None = None) -> Path:

@@ -1,9 +1,9 @@
 """`hearthlog train`: labelled sound to a model file."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,7 +16,7 @@ from hearthlog.tools.cli.options import (
     Json,
     Scheduler,
     chosen_method,
-    manifest_path,
+    labelled_clips,
     models_folder,
 )
 from hearthlog.tools.cli.progress import share_done
@@ -28,6 +28,7 @@ from hearthlog.tools.cli.verdict import print_verdict, refusal
 if TYPE_CHECKING:
     from hearthlog.analyzer.gate.judge import Verdict
     from hearthlog.analyzer.training.dataset import Dataset, Recording
+    from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.method import Method
     from hearthlog.models.classifiers.description import Amount
     from hearthlog.models.classifiers.model import Model
@@ -81,14 +82,16 @@ def train(
 ) -> None:
     """Learn a model from labelled sound, and measure it on sources it has not heard.
 
-    One of a home is judged there; whatever is found, it is written, and the exit status is 0.
-    `hearthlog models promote` ends with 1 if it may not label.
+    One of a home is judged there; whatever is found, it is written.
+    `hearthlog models promote` ends with 1 if it may not label. Exit status 3: clips were left out
+    that cannot be read, or lines of the manifest.
     """
     from hearthlog.analyzer.extras import require
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
     from hearthlog.schemas.messages.topics import check_scenario_name
 
     require("sklearn", "scipy", "joblib")
+    left_out: list[LeftOut] = []
     speakers = scenario == _SPEAKERS
     if speakers or data:
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
@@ -108,17 +111,15 @@ def train(
 
         chosen = chosen_method(method, cost=cost, gamma=gamma)
         with fits_on(scheduler):
-            model, segments = _learned(data or [], scenario, home or [], chosen, smoothing)
+            words = scenario, home or [], chosen, smoothing
+            model, segments = _learned(data or [], *words, left_out)
     output = output or _next_model(f"scenario-{scenario}" if scenario else "home")
     save_model(model, output)
     saved = load_model(output)
     of_home = bool(home) and (scenario is None or (bool(data) and not speakers))
     verdict = _judged(saved, output, home or []) if of_home else None
     if as_json:
-        result = {"model": str(output), "sha256": saved.sha256, "skipped": dict(segments.skipped)}
-        if verdict is not None:
-            result["judgement"] = verdict.judgement.model_dump()
-        print(json.dumps(result | saved.description.model_dump()))
+        _print_json(saved, output, segments, verdict, left_out)
     else:
         _print(saved, segments)
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
@@ -131,6 +132,27 @@ def train(
                 f"\nto let it label: put it in the place of the file of scenario {scenario}, or "
                 f"`hearthlog record --scenario {scenario}={output}`"
             )
+    if left_out:
+        raise typer.Exit(3)
+
+
+def _print_json(
+    model: "Model",
+    output: Path,
+    segments: "Dataset",
+    verdict: "Verdict | None",
+    left_out: "Sequence[LeftOut]",
+) -> None:
+    result: dict[str, Any] = {
+        "model": str(output),
+        "sha256": model.sha256,
+        "skipped": dict(segments.skipped),
+    }
+    if left_out:
+        result["left_out"] = [one._asdict() for one in left_out]
+    if verdict is not None:
+        result["judgement"] = verdict.judgement.model_dump()
+    print(json.dumps(result | model.description.model_dump()))
 
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
@@ -194,19 +216,24 @@ def _model_of(home: list[Path], scenario: str) -> Path:
 
 
 def _learned(
-    data: list[Path], scenario: str, home: list[Path], method: "Method", smoothing: str
+    data: list[Path],
+    scenario: str,
+    home: list[Path],
+    method: "Method",
+    smoothing: str,
+    left_out: "list[LeftOut]",
 ) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import build_dataset
-    from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.training.train import train_model
     from hearthlog.models.classes import UNKNOWN
 
     _check_smoothing(smoothing)
     if scenario == _SPEAKERS:
-        return _learned_voices(data, home, method, smoothing)
+        return _learned_voices(data, home, method, smoothing, left_out)
     chosen = load_scenario(scenario)
-    clips = [clip for path in data for clip in read_manifest(manifest_path(path), chosen.labels)]
+    clips = labelled_clips(data, chosen.labels, left_out)
+    _tell_left_out(left_out)
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
     if UNKNOWN not in chosen.classes:
         tell(
@@ -216,6 +243,8 @@ def _learned(
     recordings = list(_home_recordings(home, method.features, method.gate))
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
+    _tell_left_out(segments.left_out)
+    left_out += segments.left_out
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         model = train_model(segments, chosen, report, method, smoothing)
@@ -236,6 +265,13 @@ def _check_use(
         wrong_use("--data goes with --scenario and --output, and without --base")
 
 
+def _tell_left_out(left_out: "Sequence[LeftOut]") -> None:
+    from hearthlog.analyzer.training.manifest import left_out_lines
+
+    for line in left_out_lines(left_out):
+        tell(line)
+
+
 def _check_smoothing(name: str) -> None:
     from hearthlog.analyzer.training.train import SMOOTHINGS
 
@@ -244,12 +280,15 @@ def _check_smoothing(name: str) -> None:
 
 
 def _learned_voices(
-    data: list[Path], home: list[Path], method: "Method", smoothing: str
+    data: list[Path],
+    home: list[Path],
+    method: "Method",
+    smoothing: str,
+    left_out: "list[LeftOut]",
 ) -> tuple["Model", "Dataset"]:
     """Learn who of those that are enrolled speaks."""
     from hearthlog.analyzer.discover.enrolled_voices import check_voices
     from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
-    from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.speakers import (
         others_of,
         speaker_recordings,
@@ -263,11 +302,14 @@ def _learned_voices(
     enrolled = list(speaker_recordings(home, method.features))
     scenario = speakers_scenario(enrolled)
     check_voices(enrolled, method.features)
-    clips = [clip for path in data for clip in read_manifest(manifest_path(path), scenario.labels)]
+    clips = labelled_clips(data, scenario.labels, left_out)
+    _tell_left_out(left_out)
     others = others_of(load_model(starter_file(GENERAL)), method, scenario)
     with share_done(f"listening to {len(clips)} clips", announce=bool(clips)) as report:
         more = list(clip_recordings(clips, scenario, report, method.features, method.rooms))
     segments = cut_recordings([*enrolled, *more], scenario, method.features)
+    _tell_left_out(segments.left_out)
+    left_out += segments.left_out
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         model = train_model(segments, scenario, report, method, smoothing, others)
     return model, segments

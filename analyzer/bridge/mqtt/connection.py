@@ -79,6 +79,7 @@ class Connection:
         self._place = place_of(settings)
         self._hint = ""
         self._connected: float | None = None  # since when, by CLOCK_MONOTONIC
+        self._is_refused = False  # by the broker, which then ends the connection
         self._short = 0  # connections in a row that were
         self._values: dict[str, str] = {}  # the newest of each topic that the broker keeps
         self._unsent: dict[str, None] = {}  # topics, in order
@@ -227,7 +228,9 @@ class Connection:
     ) -> None:
         if reason.is_failure:
             self._say(f"{self._place}: refused: {reason}; see user, password_file and client_id")
+            self._is_refused = True
             return
+        self._is_refused = False
         self._connected = time.monotonic()
         self._sent = None
         for topic in self._subscriptions:
@@ -250,8 +253,9 @@ class Connection:
         since, self._connected = self._connected, None
         self._ready_at = math.inf
         if since is None:
-            if reason.is_failure:
+            if reason.is_failure and not self._is_refused:  # else that was said
                 self._say(f"{self._place}: no connection: {reason}{self._hint}; trying again")
+            self._is_refused = False
             return
         is_short = reason.is_failure and time.monotonic() - since < _SHORT_SECONDS
         self._short = self._short + 1 if is_short else 0

@@ -1,11 +1,12 @@
 """The public way to learn models and to compare them."""
 
+import warnings
 from pathlib import Path
 
 from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
-from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings
+from hearthlog.analyzer.training.dataset import UNREADABLE, build_dataset, clip_recordings
 from hearthlog.analyzer.training.installed import DEFAULT, method_named
-from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.manifest import LeftOut, left_out_lines, read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
@@ -41,8 +42,11 @@ def train(
     ------
     DataError
         If the manifest, the scenario or the method cannot be used.
-    SourceError
-        If a clip cannot be read.
+
+    Warns
+    -----
+    UserWarning
+        If clips were left out: those that cannot be read, and lines of the manifest of no use.
 
     Examples
     --------
@@ -53,9 +57,12 @@ def train(
     True
     """
     chosen, way = load_scenario(scenario), method_named(method)
-    clips = read_manifest(Path(manifest), chosen.labels)
+    left_out: list[LeftOut] = []
+    clips = read_manifest(Path(manifest), chosen.labels, left_out)
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
     data = build_dataset(clips, chosen, ignore_progress, features=way.features, rooms=way.rooms)
+    for line in left_out_lines([*left_out, *data.left_out]):
+        warnings.warn(line, stacklevel=2)
     return train_model(data, chosen, ignore_progress, way, smoothing)
 
 
@@ -78,8 +85,11 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
     ------
     DataError
         If the models cannot be compared, or the clips cannot be used.
-    SourceError
-        If a clip cannot be read.
+
+    Warns
+    -----
+    UserWarning
+        As `train`.
 
     Examples
     --------
@@ -88,7 +98,11 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
     False
     """
     scenario = scenario_of(a)
-    clips = read_manifest(Path(manifest), scenario.labels)
+    left_out: list[LeftOut] = []
+    clips = read_manifest(Path(manifest), scenario.labels, left_out)
     features = feature_set(a.description.feature_set)
-    recordings = clip_recordings(clips, scenario, ignore_progress, features)
+    recordings = list(clip_recordings(clips, scenario, ignore_progress, features))
+    left_out += [LeftOut(UNREADABLE, each.fault) for each in recordings if each.fault]
+    for line in left_out_lines(left_out):
+        warnings.warn(line, stacklevel=2)
     return compare_models(a, b, recordings, scenario)
