@@ -187,7 +187,7 @@ def is_starter(name: str, sha256: str) -> bool:
 
 
 def first_starter(folder: Path) -> str | None:
-    """Name the starter model that labelled a home before it had a champion.
+    """Name the starter model that labelled a home before the champion.
 
     Parameters
     ----------
@@ -198,7 +198,8 @@ def first_starter(folder: Path) -> str | None:
     -------
     str or None
         The one that the champion was adapted from, over models of the folder that are still there;
-        else `general`, or None if that is of another feature set.
+        else `general`, with which a recorder begins; None if that is the champion, or is of another
+        feature set.
     """
     try:
         champion = model = load(folder, CHAMPION)
@@ -215,10 +216,9 @@ def first_starter(folder: Path) -> str | None:
             break
         with suppress(ModelError):
             model = load_model(path)
-    if is_starter(champion.name, champion.sha256):
-        return champion.name
-    general = load_model(starter_file(GENERAL)).description.feature_set
-    return GENERAL if champion.description.feature_set == general else None
+    general = load_model(starter_file(GENERAL))
+    alike = champion.description.feature_set == general.description.feature_set
+    return GENERAL if alike and champion.sha256 != general.sha256 else None
 
 
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
@@ -292,7 +292,7 @@ def rollback(folder: Path) -> tuple[Model, str]:
                 _write_history(folder, earlier)
                 return model, before
         starter = first_starter(folder)
-        if starter is None or starter == before:
+        if starter is None:
             raise ModelError(f"{folder}: no champion before {before} can be used; promote a model")
         model = load(folder, starter)
         _copy_starter(folder, model)
