@@ -2,11 +2,29 @@
 
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from hearthlog.recorder.events import OK, SourceHealth
 
 _AGAIN_SECONDS = 600.0
+_takers: list[Callable[[str], None]] = []
+
+
+@contextmanager
+def lines_to(take: Callable[[str], None]) -> Iterator[None]:
+    """Give the lines of the recorder to somebody else while the block runs.
+
+    Parameters
+    ----------
+    take : callable
+        Is told each line; must not block.
+    """
+    _takers.append(take)
+    try:
+        yield
+    finally:
+        _takers.remove(take)
 
 
 def say(text: str) -> None:
@@ -16,6 +34,9 @@ def say(text: str) -> None:
     ----------
     text : str
     """
+    if _takers:
+        _takers[-1](f"hearthlog: {text}")
+        return
     with suppress(OSError):  # the log says it too
         sys.stderr.write(f"hearthlog: {text}\n")
         sys.stderr.flush()

@@ -96,6 +96,11 @@ class MicrophoneStream:
         self._end = int(frames.stamps[-1]) + FRAME_NANOSECONDS
         return events
 
+    @property
+    def device(self) -> str:
+        """Name of what is heard."""
+        return self._device
+
     def device_changes(self) -> bool:
         """Follow the source to another device; return whether there is one."""
         before, self._device = self._device, self._source.device

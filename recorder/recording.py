@@ -14,7 +14,12 @@ from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.recovery import end_of_sound, recover_active
 from hearthlog.recorder.memory import keep_one_heap
-from hearthlog.recorder.recording_session import NOT_RUNNING, RecordingSession, RecordingSummary
+from hearthlog.recorder.recording_session import (
+    NOT_RUNNING,
+    RecorderState,
+    RecordingSession,
+    RecordingSummary,
+)
 from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -62,7 +67,10 @@ def record_files(
 
 
 def record_microphones(
-    settings: Settings, stop: Flag, reload_requests: ReloadRequests | None = None
+    settings: Settings,
+    stop: Flag,
+    reload_requests: ReloadRequests | None = None,
+    state: RecorderState | None = None,
 ) -> RecordingSummary:
     """Record the configured microphones until `stop` is set, whatever happens to them.
 
@@ -73,6 +81,8 @@ def record_microphones(
         Once set, the log is completed.
     reload_requests : ReloadRequests or None
         Make the recorder check at once whether a model's file has been replaced.
+    state : RecorderState or None
+        Is kept true while it records.
 
     Raises
     ------
@@ -105,7 +115,7 @@ def record_microphones(
             name: _Resumed(source, end_of_sound(settings.output, settings.node, name, now), rest)
             for name, source in sources.items()
         }
-        summary = _record(settings, resumed, stop, reload_requests, lock)
+        summary = _record(settings, resumed, stop, reload_requests, lock, state)
     summary.recovered = recovered
     return summary
 
@@ -200,18 +210,19 @@ def record(
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 
 
-def _record(
+def _record(  # noqa: PLR0913, PLR0917
     settings: Settings,
     sources: Mapping[str, SoundSource],
     stop: Flag,
     reload_requests: ReloadRequests | None,
     lock: FolderLock | None = None,
+    state: RecorderState | None = None,
 ) -> RecordingSummary:
     with ExitStack() as stack:
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
         models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
-        session = RecordingSession(settings, sources, models, lock)
+        session = RecordingSession(settings, sources, models, lock, state)
         manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):

@@ -1,14 +1,17 @@
 """One recording: the log of some sources, the clips beside it, and what labels them."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
+from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk.keeper import DiskKeeper
 from hearthlog.recorder.events import (
+    OK,
     WARNING,
     Event,
     Frames,
@@ -32,6 +35,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.messages.gaps import ON_PURPOSE
+from hearthlog.schemas.messages.topics import LIVE
 
 NOT_RUNNING = "the recorder was not running"
 _NOT_LOST = (NOT_RUNNING, *ON_PURPOSE)  # with these the reasons of a gap begin
@@ -49,6 +53,34 @@ class RecordingSummary:
     labels: int = 0  # frames that have one
 
 
+@dataclass
+class RecorderState:
+    """What a recorder is doing, for a terminal; other threads may read it at any time.
+
+    Attributes
+    ----------
+    sound : dict of str to Frames
+        Last sound of each microphone.
+    labels : dict of str to FrameLabels or None
+        Of that sound.
+    trouble : dict of str to str
+        What is wrong with a microphone; empty if nothing is.
+    clip_frames : int
+        Of sound that was kept.
+    keeps : bool
+        Whether sound is to be kept.
+    news : deque of str
+        Changes of models and of microphones that were not told yet.
+    """
+
+    sound: dict[str, Frames] = field(default_factory=dict)
+    labels: dict[str, FrameLabels | None] = field(default_factory=dict)
+    trouble: dict[str, str] = field(default_factory=dict)
+    clip_frames: int = 0
+    keeps: bool = False
+    news: deque[str] = field(default_factory=lambda: deque(maxlen=100))
+
+
 class RecordingSession:
     """The recording of some sources: their log, the clips beside it, and what labels them.
 
@@ -61,6 +93,8 @@ class RecordingSession:
         By the name of the microphone; several may have the same.
     lock : FolderLock or None
         Of the folder of the logs, where microphones are recorded into it.
+    state : RecorderState or None
+        Is kept true; None if nobody looks at it.
 
     Attributes
     ----------
@@ -81,8 +115,10 @@ class RecordingSession:
         sources: Mapping[str, SoundSource],
         models: Mapping[str, LabellingModels],
         lock: FolderLock | None = None,
+        state: RecorderState | None = None,
     ) -> None:
         self._settings = settings
+        self._state = state
         self._streams = {
             name: MicrophoneStream(settings, name, source, models[name])
             for name, source in sources.items()
@@ -135,6 +171,18 @@ class RecordingSession:
         for notice in self._log.notices():
             say(notice.text)
             self._log.write(stream.pipeline.report("disk", self._now, notice))
+        if self._state is not None:
+            self._update(self._state, microphone, event)
+
+    def _update(self, state: RecorderState, microphone: str, event: Event) -> None:
+        """Keep the state of the recorder true after an event."""
+        if isinstance(event, Frames):
+            state.sound[microphone] = event
+            state.labels[microphone] = self._streams[microphone].pipeline.last_labels
+        elif isinstance(event, SourceHealth):
+            state.trouble[microphone] = event.summary if event.level != OK else ""
+        state.clip_frames = self._clips.kept_frames
+        state.keeps = self._settings.keep_audio != "off"
 
     def _record(self, stream: MicrophoneStream, event: Event) -> None:
         if isinstance(event, Gap) and not event.reason.startswith(_NOT_LOST):
@@ -144,6 +192,7 @@ class RecordingSession:
             self._look_for_models(stream, event)
         if stream.device_changes():
             self._log.begin_anew(self._describe(), stream.pipeline.flush())
+            self._tell(f"{stream.pipeline.microphone}: the microphone is {stream.device} now")
         notices = self._clips.before(stream.pipeline.microphone, event)
         self._log.write(stream.pipeline.push(event))
         labels = stream.pipeline.last_labels
@@ -213,7 +262,13 @@ class RecordingSession:
         Their labels begin a log of their own: the names of the classes belong to the channel, and
         the model card to the file.
         """
+        before = stream.models.model
         changes = stream.models.change()
+        for labelling, model, _ in changes:
+            where = "" if labelling == LIVE else f" ({labelling.replace('/', ' ')})"
+            after = f", after {before.name}" if labelling == LIVE and before is not None else ""
+            if model is not None:
+                self._tell(f"the labels are by {model.name} now{after}{where}")
         closing: list[EncodedMessage] = []
         opening: list[EncodedMessage] = []
         for each in self._streams.values():
@@ -226,6 +281,10 @@ class RecordingSession:
         by_time = attrgetter("log_time")
         self._log.begin_anew(self._describe(), sorted(closing, key=by_time))
         self._log.write(sorted(opening, key=by_time))
+
+    def _tell(self, text: str) -> None:
+        if self._state is not None:
+            self._state.news.append(text)
 
     def _describe(self) -> LogDescription:
         return join_descriptions([stream.describe() for stream in self._streams.values()])

@@ -76,6 +76,20 @@ def test_a_checked_minute_has_what_is_right_wrong_and_missed(tmp_path):
     assert len(checked(tmp_path, "other")) == 0
 
 
+def test_what_outlasts_a_checked_minute_is_right_or_missed_by_the_part_in_it_alone(tmp_path):
+    fridge = [(at("10:00:50"), 20, "objects_activity", 0.9), (at("10:05:03"), 5, "crying", 0.9)]
+    earlier = (at("10:02:55"), 10, "music", 0.9)  # goes on in the minute that is checked
+    logs = write_day(tmp_path, DAY, [*fridge, earlier])
+    check(logs, at("10:00"), [(50, 60, "speech")])
+    check(logs, at("10:04"), [(57, 60, "crying")])
+    check(logs, at("10:03"), [(0, 5, "speech"), (20, 22, "music")])
+    minutes = checked(tmp_path)
+    assert minutes.check("objects_activity") == (1, 0, 0, 0, 0)
+    assert minutes.check("speech") == (0, 0, 2, 2, 0)
+    assert minutes.check("crying") == (0, 0, 1, 1, 1)
+    assert minutes.check("music") == (0, 0, 1, 1, 0)
+
+
 def test_a_mark_that_says_nothing_is_known_says_nothing(tmp_path):
     logs = write_day(tmp_path, DAY, [(at("10:00:05"), 2, "coughing", 0.9)])
     check(logs, at("10:00"), [(5, 7, "unknown")])

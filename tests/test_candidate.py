@@ -17,7 +17,7 @@ from logs import read
 from spliced import run
 from test_swap import block, count, labels_by, recording, said, wait_for
 
-from hearthlog.analyzer.gate.evidence import right_at_random
+from hearthlog.analyzer.gate.evidence import gather_evidence
 from hearthlog.analyzer.gate.on_trial import compare_on_trial
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.coverage import find_coverage
@@ -353,9 +353,10 @@ def test_a_minute_in_a_quiet_that_ends_hours_later_is_known(folder, tmp_path, ca
     drawn = ReviewedSpan("mic", start, start + 40 * NANOSECONDS, chosen=RANDOM)
     write_marks(log, [], reviewed=[drawn])
     trial = compare_on_trial([logs])
-    assert (trial.random.sounds, trial.losses) == (1, [])
+    assert (trial.quiet.sounds, trial.random.sounds, trial.losses) == (1, 0, [])
     models = (load_model(folder / f"{name}.safetensors") for name in ("one", "two"))
-    assert right_at_random(*models, recent_logs([logs])).sounds == 1
+    evidence = gather_evidence(*models, recent_logs([logs]))
+    assert (evidence.quiet.sounds, evidence.random.sounds) == (1, 0)
 
 
 def review_as_the_candidate_says(logs):

@@ -17,7 +17,7 @@ from spliced import run
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_frames, changes_of_labellings
-from hearthlog.analyzer.gate.evidence import Evidence, Right, gather_evidence
+from hearthlog.analyzer.gate.evidence import Evidence, Right, _outcomes, _right, gather_evidence
 from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import (
     Part,
@@ -27,13 +27,16 @@ from hearthlog.analyzer.gate.recent_time import (
     recent_logs,
     sample,
 )
+from hearthlog.analyzer.gate.reference import Sound
 from hearthlog.analyzer.gate.rules import clearly_better, damages
+from hearthlog.analyzer.gate.two_models import LabelledFrames
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
-from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list
 from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
+from hearthlog.models.classifiers.description import Amount, Description
 from hearthlog.models.modelfile.judgement import (
     Judgement,
     insist,
@@ -229,7 +232,8 @@ def test_time_that_a_model_has_learned_from_does_not_speak_for_it(capfd):
     done = run(capfd, "models", "promote", "learned")
     assert done.returncode == 1
     assert done.stdout.splitlines()[-1:] != ["learned is the champion"]
-    assert "only 4.0 min of the last two weeks are in the logs and not learned" in done.stderr
+    assert "only 4.0 min are recorded and not learned from, and it takes 10 min" in done.stderr
+    assert "record 7 minutes more, then promote it" in done.stderr
 
 
 @pytest.mark.usefixtures("place")
@@ -240,7 +244,7 @@ def test_a_model_that_does_not_say_what_it_learned_from_has_learned_from_all_mar
     home = {"speech": amount}
     keep("old", training_data=one.description.training_data.model_copy(update={"home": home}))
     done = run(capfd, "models", "promote", "old")
-    assert "are in the logs and not learned from" in done.stderr
+    assert "are recorded and not learned from" in done.stderr
     assert "other sounds that were marked" not in done.stdout
     keep_alike()
     assert "other sounds that were marked" in run(capfd, "models", "promote", "alike").stdout
@@ -254,7 +258,9 @@ def test_what_cannot_be_judged_is_refused_in_a_line(capfd, tmp_path):
         return done.stderr.splitlines()[-1]
 
     keep_alike()
-    assert "there are no recent logs" in refusal("--logs", tmp_path / "nowhere")
+    assert "only 0.0 min are recorded and not learned from" in refusal(
+        "--logs", tmp_path / "nowhere"
+    )
     Path("models/champion.safetensors").unlink()
     assert "no labels in" in refusal("--logs", tmp_path / "nowhere")
     for path in (Path("models/one.safetensors"),):
@@ -469,10 +475,97 @@ def test_a_model_that_changes_much_has_to_be_right_about_more():
     assert damages(evidence(little, Right(40, 30, 30, 3, 3)), "one") == []
 
 
+COUGHING_BECOMES_NEW = [[1300, 0, 0, 0], [0, 10, 0, 50], [0, 0, 40, 0], [0, 0, 0, 0]]
+
+
+def with_new_class(known):
+    """Make evidence of a home whose marks teach laughing, which takes most of the coughing."""
+    table = np.array(COUGHING_BECOMES_NEW, float)
+    changes = Changes(["silence", "coughing", "music", "laughing"], table)
+    nothing = Right()
+    return Evidence(
+        60.0, 14 * 1440.0, changes, table, nothing, nothing, [], nothing, {"laughing"}, known
+    )
+
+
+@pytest.mark.parametrize(
+    ("known", "harmless"),
+    [
+        ({("laughing", "coughing", "laughing"): 4}, True),
+        (
+            {
+                ("laughing", "coughing", "laughing"): 4,
+                ("coughing", "coughing", "coughing"): 9,
+                ("coughing", "coughing", "laughing"): 1,
+            },
+            True,
+        ),
+        ({}, False),  # no mark says that coughing was wrong
+        ({("laughing", "music", "laughing"): 4}, False),
+        (
+            {
+                ("laughing", "coughing", "laughing"): 4,
+                ("coughing", "coughing", "coughing"): 1,
+                ("coughing", "coughing", "laughing"): 1,
+            },
+            False,
+        ),
+    ],
+)
+def test_a_new_class_may_take_what_marks_say_was_wrong_and_not_what_a_person_left(known, harmless):
+    reasons = damages(with_new_class(known), "one")
+    assert harmless or "most becomes laughing" in reasons[0]
+    assert len(reasons) == (not harmless)
+
+
+@pytest.mark.usefixtures("place")
+def test_what_a_new_class_takes_over_is_judged_by_marks_that_were_learned_from(lived):
+    """Another name for talking: right where marks say so, wrong where they say talking."""
+    (log,) = find_logs(Path("logs"))
+    one = load_model(Path("models/one.safetensors"))
+    classes = ["giggle" if name == "speech" else name for name in one.classes]
+    text = one.description.model_dump_json().replace('"speech"', '"giggle"')
+    training = Description.model_validate_json(text).training_data
+    amounts = {**training.classes, "giggle": Amount(sources=0, segments=0, seconds=0.0)}
+    home = {"giggle": Amount(sources=2, segments=20, seconds=20.0)}
+    update = {"classes": amounts, "home": home, "home_spans": [[START, START + MINUTE]]}
+    about = Description.model_validate_json(text).model_copy(
+        update={"classes": classes, "training_data": training.model_copy(update=update)}
+    )
+    after = replace(one, description=about)
+    talking = [(a, b) for a, b, name in truth(lived) if name == "speech" and b - a > SECOND]
+    write_marks(log, [Mark("mic", *span, "giggle") for span in talking[:2]])
+    found = gather_evidence(one, after, recent_logs([Path("logs")]))
+    assert found.taught == {"giggle"}
+    right = sum(n for (true, _, new), n in found.known.items() if true == new == "giggle")
+    assert 0 < right <= 2
+    looked_at = ReviewedSpan("mic", START, START + MINUTES * MINUTE, chosen=QUEUE)
+    write_marks(log, [Mark("mic", *span, "speech") for span in talking[2:]], reviewed=[looked_at])
+    found = gather_evidence(one, after, recent_logs([Path("logs")]))
+    assert sum(n for (true, _, new), n in found.known.items()
+               if (true, new) == ("speech", "giggle")) > 0  # fmt: skip
+
+
+def test_right_is_said_of_sounds_and_a_model_is_wrong_about_a_class_that_it_lacks():
+    frames = LabelledFrames(
+        np.arange(40) * 50_000_000, np.repeat([0, 1, 1, 1], 10), np.repeat([0, 1, 1, 2], 10),
+        np.ones(40, np.float32), np.ones(40),
+    )  # fmt: skip
+    names = ["silence", "speech", "dog"]
+    known = [("silence", 0), ("speech", 10), ("cat", 20), ("dog", 30)]
+    sounds = [Sound(i * 50_000_000, (i + 10) * 50_000_000, name, True, "mic") for name, i in known]
+    outcomes = list(_outcomes(sounds, frames, names))
+    assert _right(one for one in outcomes if one.label != "silence") == (3, 1, 2, 1, 0)
+
+
 def test_fewer_right_by_chance_is_no_damage():
     same = [[1300, 0, 0], [0, 100, 0], [0, 0, 40]]
     assert damages(evidence(same, Right(40, 30, 29, 4, 5)), "one") == []
     assert damages(evidence(same, Right(40, 30, 25, 2, 7)), "one") != []
+    heard = replace(evidence(same), quiet=Right(9, 9, 3, 0, 6))
+    assert damages(heard, "one") == [
+        "of 9 silences of the minutes that were drawn at random it leaves 3 silent, one 9"
+    ]
 
 
 def test_sound_that_vanishes_and_a_class_that_multiplies_are_damage_unless_random_minutes_say_not():

@@ -28,7 +28,9 @@ from hearthlog.analyzer.training.home_data import (
 )
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
+from hearthlog.analyzer.training.scenario import scenario_of
 from hearthlog.analyzer.training.unreviewed import unreviewed_sounds
+from hearthlog.models.classifiers.description import Description
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -273,15 +275,70 @@ def test_a_model_says_from_which_time_of_the_home_it_has_learned(home, model_fil
     assert sum(training.home_confirmed.values()) == count > 0
 
 
-def kettle(logs, seconds):
-    """Mark so many seconds of the loudest sound of each log as a kettle."""
+def kettle(logs, seconds, label="kettle"):
+    """Mark so many seconds of the longest sound of each log as a kettle."""
     for log, length in zip(logs_in(logs), seconds, strict=True):
         (found,) = read_columns([log], ["/mic/segment"]).values()
         sounds = np.flatnonzero(found["label"] != "silence")
         longest = sounds[found["duration"][sounds].argmax()]
         begin = int(found["header.stamp"][longest])
         if length:
-            write_marks(log, [Mark("mic", begin, begin + length * SECOND, "kettle")])
+            write_marks(log, [Mark("mic", begin, begin + length * SECOND, label)])
+
+
+def with_unknown(model_file, *labels):
+    """Return a model in which laughing is called unknown, and so are some labels."""
+    model = load_model(model_file)
+    about = json.loads(model.description.model_dump_json().replace('"laughing"', '"unknown"'))
+    about["scenario"]["unknown"] = list(labels)
+    return replace(model, description=Description.model_validate(about))
+
+
+@pytest.mark.parametrize(
+    ("label", "name", "scenario"),
+    [
+        ("kettle", "kettle", (["kettle", "siren"], ["siren"])),
+        ("water_tap", "tap_water", (["tap_water", "siren"], ["siren"])),
+        ("kettle", "kettle", (["kettle"], ["other_negative"])),
+    ],
+)
+def test_a_mark_makes_its_class_though_the_model_counts_that_sound_as_unknown(
+    two_days, model_file, label, name, scenario
+):
+    before, after = scenario
+    base = with_unknown(model_file, *before)
+    kettle(two_days, (5, 5), label)
+    lessons = home_lessons([two_days], base)
+    assert lessons.notes[:-1] == []
+    assert lessons.segments.classes == (*base.classes, name)
+    number = base.classes.index("unknown")
+    of_home = lessons.segments.collection == lessons.segments.collection_names.index(HOME)
+    assert set(lessons.segments.target[of_home]) == {len(base.classes)}
+    adapted = adapt_model(base, lessons.segments)
+    assert adapted.description.scenario["unknown"] == after
+    assert adapted.description.scenario[name] == [name]
+    assert scenario_of(adapted).find(label) == name
+    again = home_lessons([two_days], adapted).segments
+    assert again.classes == adapted.classes
+    assert number not in again.target[again.collection == again.collection_names.index(HOME)]
+
+
+def test_too_few_marks_of_what_counts_as_unknown_teach_that_and_it_is_said(two_days, model_file):
+    base = with_unknown(model_file, "kettle", "other_negative")
+    kettle(two_days, (5, 0))
+    lessons = home_lessons([two_days], base)
+    assert lessons.notes[0] == (
+        "1 mark of kettle: they count as unknown; 5 more seconds, on another day, and it can be "
+        "learned"
+    )
+    of_home = lessons.segments.collection == lessons.segments.collection_names.index(HOME)
+    assert set(lessons.segments.target[of_home]) == {base.classes.index("unknown")}
+    kettle(two_days, (5, 5), "other_negative")
+    lessons = home_lessons([two_days], base)
+    assert lessons.segments.classes == base.classes
+    assert "2 marks of other_negative: learned as unknown, to which the model counts them" in (
+        lessons.notes
+    )
 
 
 def test_a_class_of_two_days_and_ten_seconds_is_learned_and_stays_as_long_as_its_marks(

@@ -2,16 +2,19 @@
 
 import shutil
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.clips import kept_time
 from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.logs.spans import NONE, joined, one, pieces
+from hearthlog.analyzer.logs.spans import NONE, cut, joined, one, pieces
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, read_marks, read_reviewed
 from hearthlog.analyzer.review.queue.coverage import cover, sample
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
@@ -22,14 +25,18 @@ from hearthlog.analyzer.review.queue.random_minutes import (
     whole_minutes,
 )
 from hearthlog.analyzer.review.queue.ranking import worth
+from hearthlog.analyzer.review.queue.review_list import read_list
 from hearthlog.analyzer.review.queue.span_sounds import labelling_model, span_sounds
 from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
 from hearthlog.analyzer.review.timeline.model import no_spans
 from hearthlog.models.starter import GENERAL, starter_file
+from hearthlog.recorder.clips.clip_choice import KeptSound
+from hearthlog.recorder.clips.clip_layer import ClipWriter
 from hearthlog.recorder.config import Settings
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.record import record_composition
@@ -56,6 +63,21 @@ def recorded(tmp_path_factory):
 @pytest.fixture
 def home(recorded, tmp_path):
     return shutil.copytree(recorded, tmp_path / "home")
+
+
+@pytest.fixture
+def heard(recorded, tmp_path):
+    """With the sound of the first half, which was kept."""
+    home = shutil.copytree(recorded, tmp_path / "heard")
+    (log,) = find_logs(home)
+    settings = Settings(output=home, keep_audio="always")
+    clips = ClipWriter(settings, ["mic"], lambda stamp: (log, stamp + MINUTE))
+    frames = LENGTH // 2 * 1200
+    stamps = START + np.arange(frames) * FRAME_NANOSECONDS
+    samples = np.random.default_rng(0).integers(-3000, 3000, (frames, FRAME_SAMPLES), np.int16)
+    assert clips.write("mic", [KeptSound(stamps, samples)]) == []
+    clips.finish()
+    return home
 
 
 def items(home, queue="useful", count=10, models="none"):
@@ -237,13 +259,13 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     path = tmp_path / "ten.txt"
     done = run(capfd, "review", home, "--queue", "--save", path)
     assert done.returncode == 0, done.stderr
+    assert "no sound of these lines was kept" in done.stderr
+    assert not (tmp_path / "ten").exists()
     asked = items(home)
-    zero = find_coverage(home)["mic"].starts[0]
     cannot_judge = asked[0]
 
     def keep(line):
-        start = zero + round(float(line.split("\t")[0]) * NANOSECONDS)
-        return not cannot_judge.start <= start < cannot_judge.end
+        return not cannot_judge.start <= read_time(line.split("\t")[0]) < cannot_judge.end
 
     lines = path.read_text().splitlines()
     kept = [line for line in lines if keep(line)]
@@ -268,6 +290,45 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     before = written(home, read_reviewed)
     again = run(capfd, "annotate", "import", home, path)
     assert (again.returncode, written(home, read_reviewed)) == (0, before)
+
+
+def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_line(
+    heard, tmp_path, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    done = run(capfd, "review", heard, "--queue", "--save", "ten.txt", "--timezone", "Asia/Tokyo")
+    assert done.returncode == 0, done.stderr
+    lines = [line.split("\t") for line in Path("ten.txt").read_text().splitlines()]
+    (layer,) = heard.rglob("*.audio.mcap")
+    kept = kept_time([layer], "/mic/audio", START, START + LENGTH * MINUTE)
+    folder = Path("ten")
+    assert oct(folder.stat().st_mode)[-3:] == "700"
+    for number, (start, end, _, *note) in enumerate(lines, 1):
+        assert start.endswith("+09:00")
+        span = read_time(start), read_time(end)
+        length = cut(kept, *span).length
+        file = folder / f"{number:02}.wav"
+        assert file.exists() == (length >= NANOSECONDS // 10) == (str(file) in "".join(note))
+        if file.exists():
+            assert oct(file.stat().st_mode)[-3:] == "600"
+            sound, rate = soundfile.read(file)
+            assert len(sound) / rate == pytest.approx((span[1] - span[0]) / NANOSECONDS, abs=1e-3)
+            assert np.abs(sound).max() > 0
+    assert "of the others no sound was kept" in done.stderr
+    begins = [n for n, line in enumerate(lines, 1) if "a minute drawn at random" in line[-1]]
+    assert len(begins) == 2
+    for first in begins:
+        start = read_time(lines[first - 1][0])
+        heard_of_it = cut(kept, start, start + MINUTE).length > 0
+        assert bool(list(folder.glob(f"{first:02}-*.wav"))) == heard_of_it
+    spans = [line for line in read_list(Path("ten.queue.csv")) if line.reason != RANDOM]
+    asked = [cut(kept, span.start, span.end).length / (span.end - span.start) for span in spans]
+    assert sum(share > 0.5 for share in asked) == len(spans)
+    assert run(capfd, "annotate", "import", heard, "ten.txt").returncode == 0
+    marks = {(m.start, m.end, m.label) for m in written(heard, read_marks)}
+    assert marks == {(read_time(a), read_time(b), c) for a, b, c, *_ in lines}
+    again = run(capfd, "review", heard, "--queue", "--save", "ten.csv")
+    assert (again.returncode, Path("ten.csv").exists()) == (1, False)
 
 
 def test_labels_where_a_queue_did_not_ask_are_told_apart(home, tmp_path, capfd):

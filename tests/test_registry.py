@@ -2,9 +2,12 @@
 
 import json
 import random
+import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from kept import keep_models, put_by_hand
@@ -12,8 +15,16 @@ from spliced import run
 
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import list_models, load, promote, rollback, target
+from hearthlog.models.modelfile.judgement import read_judgement
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.registry import (
+    first_starter,
+    list_models,
+    load,
+    promote,
+    rollback,
+    target,
+)
 
 
 @pytest.fixture
@@ -35,7 +46,8 @@ def test_a_promoted_model_is_the_champion_and_the_one_before_comes_back(folder):
     promote(folder, "broad")
     assert [rollback(folder)[0].name for _ in range(2)] == ["two", "one"]
     assert champion(folder) == "one"
-    with pytest.raises(ModelError, match="no champion before one"):
+    assert rollback(folder)[0].name == "general"  # by which a recorder labels without a champion
+    with pytest.raises(ModelError, match="no champion before general"):
         rollback(folder)
 
 
@@ -98,7 +110,8 @@ def test_the_list_has_every_file_and_what_is_wrong_with_it(folder):
     promote(folder, "two", "candidate")
     put_by_hand(folder, "gone.safetensors")
     found = {entry.name: entry for entry in list_models(folder)}
-    assert list(found) == ["bad", "broad", "gone", "one", "two"]
+    assert list(found) == ["bad", "broad", "gone", "one", "two", "general", "bathroom"]
+    assert [name for name, entry in found.items() if entry.starter] == ["general", "bathroom"]
     assert found["gone"].aliases == ("champion",)
     assert found["two"].aliases == ("candidate",)
     assert {name for name, entry in found.items() if entry.model is None} == {"bad", "gone"}
@@ -156,7 +169,8 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
         "sha256",
         "size",
     ]
-    assert [row.split()[0] for row in rows] == ["broad", "one", "two"]
+    assert [row.split()[0] for row in rows] == ["broad", "one", "two", "general", "bathroom"]
+    assert rows[3].split()[1] == "starter"
     assert "champion" in rows[1]
     assert load(folder, "one").sha256[:12] in rows[1]
     (folder / "bad.safetensors").write_bytes(b"garbage")
@@ -182,8 +196,49 @@ def test_promotion_and_rollback_say_what_was_done(folder, capfd):
     assert run(capfd, *command).stdout == "two is the champion already\n"
     said = run(capfd, "models", "rollback", "--folder", folder).stdout
     assert said == f"one ({load(folder, 'one').sha256[:12]}) is the champion again, after two\n"
+    said = run(capfd, "models", "rollback", "--folder", folder).stdout
+    assert said.startswith("general (")
+    assert said.endswith(") is the champion again, after one\n")
     result = run(capfd, "models", "rollback", "--folder", folder)
     assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+
+
+def adapted_from(folder, name, base):
+    """Put a model into the folder that was adapted from another one."""
+    one = load(folder, "one")
+    training = one.description.training_data.model_copy(update={"base_sha256": base.sha256})
+    about = one.description.model_copy(update={"training_data": training})
+    save_model(replace(one, description=about), folder / f"{name}.safetensors")
+    return load(folder, name)
+
+
+def test_before_the_first_champion_there_was_the_starter_that_it_comes_from(folder):
+    (folder / "history").unlink(missing_ok=True)
+    bathroom = load_model(Path("bathroom"))
+    home = adapted_from(folder, "home-1", bathroom)
+    adapted_from(folder, "home-2", home)
+    put_by_hand(folder, "home-2.safetensors")
+    assert first_starter(folder) == "bathroom"
+    model, before = rollback(folder)
+    assert (model.name, model.sha256, before) == ("bathroom", bathroom.sha256, "home-2")
+    assert champion(folder) == "bathroom"
+    assert load_model(folder / "champion.safetensors").sha256 == bathroom.sha256
+    assert read_judgement(folder, bathroom.sha256).may_label
+    promote(folder, "one")
+    assert [rollback(folder)[0].name for _ in range(2)] == ["bathroom", "general"]
+
+
+def test_a_starter_is_promoted_unless_a_file_of_the_folder_has_its_name(folder, capfd):
+    general = load_model(Path("general"))
+    done = run(capfd, "models", "promote", "general", "--folder", folder)
+    assert done.stdout == f"general ({general.sha256[:12]}) is the champion, after one\n"
+    assert rollback(folder)[0].name == "one"
+    shutil.copy(folder / "two.safetensors", folder / "bathroom.safetensors")
+    assert promote(folder, "bathroom")[0].sha256 == load(folder, "two").sha256
+    (folder / "general.safetensors").unlink()
+    put_by_hand(folder, "general.safetensors")
+    with pytest.raises(ModelError, match="no such model file"):
+        load(folder, "champion")
 
 
 def test_the_folder_is_that_of_the_configured_model(folder, capfd, monkeypatch, tmp_path):

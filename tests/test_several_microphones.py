@@ -11,7 +11,7 @@ from spliced import run
 from together import record_together
 
 from hearthlog.analyzer.accuracy.reviewed_labels import read_reviewed_labels
-from hearthlog.analyzer.gate.evidence import right_at_random
+from hearthlog.analyzer.gate.evidence import gather_evidence
 from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -122,8 +122,8 @@ def test_models_are_judged_by_what_each_microphone_heard_at_the_same_time(
     spans = [ReviewedSpan(name, *heard[:2], chosen=RANDOM) for name in files]
     write_marks(log_in(home), [], reviewed=spans)
     model = load_model(model_file)
-    right = right_at_random(model, model, recent_logs([home]))
-    assert (right.sounds, right.before, right.after) == (2, 2, 2)
+    found = gather_evidence(model, model, recent_logs([home]))
+    assert [each[:3] for each in (found.random, found.quiet)] == [(1, 1, 1), (1, 1, 1)]
 
 
 @pytest.mark.parametrize("microphone", ["kitchen", "bath"])

@@ -16,7 +16,6 @@ from hearthlog.analyzer.accuracy.events import (
     AROUND,
     MINUTE,
     SET_APART,
-    events_by_minute,
     events_of,
     overlapping,
     sounding_minutes,
@@ -24,8 +23,8 @@ from hearthlog.analyzer.accuracy.events import (
 )
 from hearthlog.analyzer.accuracy.reviewed_labels import ReviewedLabels, read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.spans import Spans
-from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.logs.spans import Spans, cut
+from hearthlog.analyzer.marks.marks import RANDOM, ReviewedSpan
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Bool, Int64
 
@@ -90,7 +89,7 @@ class CheckedMinutes:
     ----------
     labelled, right, true, missed : dict of str to np.ndarray [shape=(n,)], int64
         By class, of the events that begin in each minute: labelled ones, those of them that have a
-        part that is true, true ones, and those of them of which nothing was labelled.
+        part in it that is true, true ones, and those of them of which nothing in it was labelled.
     sounding, television : np.ndarray [shape=(n,)], bool
         Whether anything sounds, and whether it sounds like a television, by the labels.
     models : list of str
@@ -227,13 +226,18 @@ def _like_television(minute: ReviewedLabels) -> bool:
 
 
 def _events(minute: ReviewedLabels, name: str) -> list[int]:
-    """Count the events that begin in a minute: labelled, right, true and missed ones."""
-    edges = np.array([minute.span.start, minute.span.end])
+    """Count the events that begin in a minute: labelled, right, true and missed ones.
+
+    Of what outlasts the minute only the part in it was looked at, and says whether it is right.
+    """
     labelled, true = events_of(minute.labels, name), events_of(minute.true, name)
-    right = _rows(labelled, overlapping(labelled, true))
-    missed = _rows(true, ~overlapping(true, labelled))
-    return [int(events_by_minute(each, edges)[0]) for each in (labelled, right, true, missed)]
+    own, others = _begun(labelled, minute.span), _begun(true, minute.span)
+    right = overlapping(own, cut(true, minute.span.start, minute.span.end))
+    found = overlapping(others, cut(labelled, minute.span.start, minute.span.end))
+    return [len(own.starts), int(right.sum()), len(others.starts), int((~found).sum())]
 
 
-def _rows(spans: Spans, which: Bool) -> Spans:
-    return Spans(spans.starts[which], spans.ends[which])
+def _begun(events: Spans, minute: ReviewedSpan) -> Spans:
+    """Return the events that begin in a minute, and end with it at the latest."""
+    first, last = np.searchsorted(events.starts, [minute.start, minute.end])
+    return Spans(events.starts[first:last], np.minimum(events.ends[first:last], minute.end))

@@ -1,7 +1,8 @@
 """What another model would change in a home, measured on time that it has not learned from."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +22,10 @@ from hearthlog.analyzer.gate.recent_time import (
     WeightedPart,
     recorded_minutes,
 )
-from hearthlog.analyzer.gate.reference import Sound, spans_of
+from hearthlog.analyzer.gate.reference import Sound, left_alone, spans_of
 from hearthlog.analyzer.gate.two_models import LabelledFrames, TwoModels, joined_frames
 from hearthlog.analyzer.logs.spans import Spans, rows_at
-from hearthlog.models.classes import translation
+from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -33,6 +34,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 SURE = 0.9  # probability
 _REFERENCE_SECONDS = 3_600.0
+_LEARNED_SECONDS = 900.0  # of the marks that a new class is from, and of what was left alone
 _NEAR = 60 * NANOSECONDS
 _MOST = 0.5  # of a sound
 
@@ -43,6 +45,7 @@ class Right(NamedTuple):
     Attributes
     ----------
     sounds : int
+        A model that lacks the class of one is wrong about it.
     before, after : int
         Right in the first model, in the second.
     gained, lost : int
@@ -54,6 +57,18 @@ class Right(NamedTuple):
     after: int = 0
     gained: int = 0
     lost: int = 0
+
+    def plus(self, other: "Right") -> "Right":
+        """Return the sums.
+
+        Parameters
+        ----------
+        other : Right
+        """
+        return Right(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+NOTHING_KNOWN = Right()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +90,13 @@ class Evidence:
         from.
     losses : list of str
         Logs and layers that cannot be used, and why.
+    quiet : Right
+        The silences of the minutes that were drawn at random.
+    taught : frozenset of str
+        Classes that the second model has from marks of the home, and the first has not.
+    known : mapping of (str, str, str) to int
+        Known sounds, also those that were learned from, by the class that a person gives them, and
+        those of the first and of the second model; empty if no class is taught.
     """
 
     minutes: float
@@ -84,6 +106,9 @@ class Evidence:
     random: Right
     marks: Right
     losses: list[str]
+    quiet: Right = NOTHING_KNOWN
+    taught: frozenset[str] = frozenset()
+    known: Mapping[tuple[str, str, str], int] = field(default_factory=dict)
 
 
 def gather_evidence(
@@ -111,25 +136,36 @@ def gather_evidence(
     known = known_sounds(logs, losses)
     learned = learned_by(before, after, known)
     chosen = unlearned_sample(logs, learned)
-    places = _places(
-        [(log, [s for s in own if s.random or not _is_in(learned, s)]) for log, own in known]
-    )
+    unlearned = [[s for s in own if s.random or not _is_in(learned, s)] for _, own in known]
+    places = _places([(log, own) for (log, _), own in zip(known, unlearned, strict=True)])
     models = TwoModels(before, after)
+    taught = _taught(models, after)
+    count = len(chosen) + len(places)
+    if taught:
+        rest = [
+            (log, [*left_alone(log.path), *(s for s in own if s not in new)])
+            for (log, own), new in zip(known, unlearned, strict=True)
+        ]
+        places += _places(rest, _LEARNED_SECONDS)
     parts = [*chosen, *(WeightedPart(part, 1.0) for part, _ in places)]
     labelled = list(label_parts(models, parts, losses, progress))
     frames = joined_frames(labelled[: len(chosen)])
-    right = [
-        _right(sounds, own, models.classes)
+    outcomes = [
+        list(_outcomes(sounds, own, models.classes))
         for (_, sounds), own in zip(places, labelled[len(chosen) :], strict=True)
     ]
+    right = [one for each in outcomes[: count - len(chosen)] for one in each]
     return Evidence(
         minutes=len(frames.stamps) * FRAME_SECONDS / 60,
         recorded=recorded_minutes(logs),
         changes=changes_of_sample(models.classes, frames, logs),
         sure=changes_of_sample(models.classes, frames, logs, SURE).minutes,
-        random=_sum(one for one, _ in right),
-        marks=_sum(one for _, one in right),
+        random=_right(one for one in right if one.random and one.label != SILENCE),
+        marks=_right(one for one in right if not one.random and one.label != SILENCE),
         losses=losses,
+        quiet=_right(one for one in right if one.random and one.label == SILENCE),
+        taught=taught,
+        known=Counter(one[1:] for each in outcomes for one in each) if taught else {},
     )
 
 
@@ -153,17 +189,30 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> R
     models = TwoModels(before, after)
     parts = [WeightedPart(part, 1.0) for part, _ in places]
     labelled = label_parts(models, parts, losses, ignore_progress)
-    return _sum(
-        _right(sounds, own, models.classes)[0]
+    return _right(
+        one
         for (_, sounds), own in zip(places, labelled, strict=True)
+        for one in _outcomes(sounds, own, models.classes)
+        if one.label != SILENCE
     )
+
+
+def _taught(models: TwoModels, after: Model) -> frozenset[str]:
+    """Name the classes that the second model has from marks of the home, and the first has not."""
+    training = after.description.training_data
+    of_home = {
+        name
+        for name, amount in training.home.items()
+        if amount.segments and not training.classes[name].segments
+    }
+    return frozenset(of_home & set(models.classes[models.before :]))
 
 
 def _is_in(spans: Spans, sound: Sound) -> bool:
     return bool(rows_at(spans, np.array([(sound.start + sound.end) // 2]))[0] >= 0)
 
 
-def _places(known: KnownSounds) -> list[tuple[Part, list[Sound]]]:
+def _places(known: KnownSounds, most: float = _REFERENCE_SECONDS) -> list[tuple[Part, list[Sound]]]:
     """Join sounds that are near each other, so that they are labelled at once; the latest ones."""
     places: list[tuple[Part, list[Sound]]] = []
     by_microphone = (
@@ -180,27 +229,47 @@ def _places(known: KnownSounds) -> list[tuple[Part, list[Sound]]]:
     # What was drawn at random goes first, then the latest.
     places.sort(key=lambda place: (any(s.random for s in place[1]), place[0].start), reverse=True)
     seconds = np.cumsum([(part.end - part.start) / NANOSECONDS for part, _ in places])
-    return places[: int(np.searchsorted(seconds, _REFERENCE_SECONDS, side="right"))]
+    return places[: int(np.searchsorted(seconds, most, side="right"))]
 
 
-def _right(
+class _Outcome(NamedTuple):
+    """A known sound: its class, and the one that each model gives it for most of its time."""
+
+    random: bool
+    label: str
+    before: str
+    after: str
+
+
+def _outcomes(
     sounds: Sequence[Sound], frames: LabelledFrames, classes: Sequence[str]
-) -> tuple[Right, Right]:
-    """Count the sounds that each model is right about: those drawn at random, and the others."""
+) -> Iterator[_Outcome]:
+    """Yield what two models make of known sounds that were labelled; classes are `classes`' names.
+
+    A name is empty where no class has most of the sound.
+    """
     names = translation({sound.label for sound in sounds}, classes)
-    counts = {True: Right(), False: Right()}
     for sound in sounds:
         first, last = np.searchsorted(frames.stamps, [sound.start, sound.end])
-        if names[sound.label] not in classes or last <= first:
-            continue
-        number = classes.index(names[sound.label])
-        a, b = (
-            bool((labels[first:last] == number).mean() > _MOST)
-            for labels in (frames.before, frames.after)
-        )
-        counts[sound.random] = _sum([counts[sound.random], Right(1, a, b, b > a, a > b)])
-    return counts[True], counts[False]
+        if last > first:
+            name = names[sound.label]
+            if class_name(name) == OTHER_NEGATIVE and UNKNOWN in classes:
+                name = UNKNOWN
+            counts = (
+                np.bincount(labels[first:last], minlength=len(classes)) / (last - first)
+                for labels in (frames.before, frames.after)
+            )
+            most = (classes[c.argmax()] if c.max() > _MOST else "" for c in counts)
+            yield _Outcome(sound.random, name, *most)
 
 
-def _sum(several: Iterable[Right]) -> Right:
-    return Right(*(sum(column) for column in zip(Right(), *several, strict=True)))
+def _right(outcomes: Iterable[_Outcome]) -> Right:
+    """Count the sounds that each model is right about."""
+    pairs = [(one.before == one.label, one.after == one.label) for one in outcomes]
+    return Right(
+        len(pairs),
+        sum(a for a, _ in pairs),
+        sum(b for _, b in pairs),
+        sum(b > a for a, b in pairs),
+        sum(a > b for a, b in pairs),
+    )

@@ -10,12 +10,12 @@ from hearthlog.analyzer.accuracy.count_range import beta_quantile
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_labellings
-from hearthlog.analyzer.gate.evidence import Right
+from hearthlog.analyzer.gate.evidence import NOTHING_KNOWN, Right
 from hearthlog.analyzer.gate.reference import Sound, reference
 from hearthlog.analyzer.logs.labelling import Labelling, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.logs.spans import joined, lengths
-from hearthlog.models.classes import UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, is_layer
@@ -43,6 +43,8 @@ class Trial:
         Known sounds of the minutes that were drawn at random, and other marks.
     losses : list of str
         What could not be read, and why.
+    quiet : Right
+        The silences of the minutes that were drawn at random.
     """
 
     champion: str
@@ -53,6 +55,7 @@ class Trial:
     random: Right
     marks: Right
     losses: list[str]
+    quiet: Right = NOTHING_KNOWN
 
 
 def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> Trial:
@@ -99,6 +102,7 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
             known += [sound for sound in sounds if sound.microphone == name]
         except LogError as error:
             losses.append(str(error))
+    sounding = [sound for sound in known if class_name(sound.label) != SILENCE]
     sides = [unified(side.labelling) for side in (live, candidate)]
     return Trial(
         champion=last.get("model", ""),
@@ -106,9 +110,10 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
         candidate_sha256=last.get("candidate_sha256", ""),
         minutes=difference.total.minutes,
         changes=changes_of_labellings(difference),
-        random=_right([sound for sound in known if sound.random], *sides),
-        marks=_right([sound for sound in known if not sound.random], *sides),
+        random=_right([one for one in sounding if one.random], *sides),
+        marks=_right([one for one in sounding if not one.random], *sides),
         losses=[*sources.losses, *losses],
+        quiet=_right([one for one in known if one.random and one not in sounding], *sides),
     )
 
 

@@ -1,15 +1,19 @@
 """What is known of the sounds of a home: marks, and what was looked at and left as it was."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, joined, remains
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.models.classes import UNKNOWN, class_name
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.topics import LIVE, relabelling
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -62,9 +66,38 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
     others = [
         Sound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
         for mark in marks
-        if not any(_inside(mark, span) for span in drawn)
+        if class_name(mark.label) != UNKNOWN  # whoever marked it could not tell
+        and not any(_inside(mark, span) for span in drawn)
     ]
     return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST]
+
+
+def left_alone(log: Path) -> list[Sound]:
+    """Return the sounds of a log that a person looked at, not by chance, and did not mark.
+
+    Parameters
+    ----------
+    log : Path
+
+    Returns
+    -------
+    list of Sound
+        Of half a second or more; none of what cannot be read.
+    """
+    sounds: list[Sound] = []
+    with suppress(DataError, LogError):
+        marks = read_marks(log)
+        spans = [span for span in read_reviewed(log) if span.chosen != RANDOM]
+        labellings = find_labellings(log) if spans else Labellings([])
+        for span in spans:
+            with suppress(DataError, LogError):
+                marked = {(mark.start, mark.end) for mark in marks}
+                sounds += [
+                    sound._replace(random=False)
+                    for sound in _true(labellings, span, marks)
+                    if (sound.start, sound.end) not in marked
+                ]
+    return [sound for sound in sounds if sound.end - sound.start >= _SHORTEST]
 
 
 def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
@@ -72,7 +105,8 @@ def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> 
     known = partial(Sound, random=True, microphone=span.microphone)
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
-        yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
+        if class_name(mark.label) != UNKNOWN:
+            yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
     corrects = LIVE if span.corrects == LIVE else relabelling(span.corrects)
     name = labellings.find(span.microphone, corrects)
     labels = labellings.read(span.microphone, name, span.start, span.end).labelling

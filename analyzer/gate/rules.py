@@ -1,5 +1,6 @@
 """What counts as damage to a home."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ from hearthlog.analyzer.gate.evidence import Evidence, Right
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Float64
 
-_LEAST_MINUTES = 10.0  # of sound to judge by
+LEAST_MINUTES = 10.0  # of sound to judge by
 _SILENCE_FALLS = 0.10  # of the time
 _MUCH = 0.01  # of the time: a class that is worth a rule
 _MUCH_OF_SOUND = 0.10  # of the time that is not silence
@@ -36,14 +37,17 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
         A sentence for each damage, or that there is too little sound to tell; empty if there is no
         damage.
     """
-    if not evidence.minutes and not evidence.losses:
-        return ["there are no recent logs that it has not learned from: record for some hours"]
-    if evidence.minutes < _LEAST_MINUTES:
+    if evidence.minutes < LEAST_MINUTES:
         loss = f" ({evidence.losses[0]})" if evidence.losses else ""
-        text = f"only {time_words(evidence.minutes)} of the last two weeks are in the logs and not "
-        return [f"{text}learned from{loss}: record for some hours more, then promote it"]
+        missing = math.ceil(LEAST_MINUTES - evidence.minutes)
+        text = (
+            f"of the last two weeks only {time_words(evidence.minutes)} are recorded and not "
+            f"learned from, and it takes {time_words(LEAST_MINUTES)} to judge it{loss}: record "
+            f"{missing} minutes more, then promote it"
+        )
+        return [text]
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
-    if not clearly_better(evidence.random):
+    if not clearly_better(evidence.random.plus(evidence.quiet)):
         reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
     return reasons
 
@@ -86,12 +90,19 @@ def _silence_lost(evidence: Evidence) -> Iterator[str]:
 def _not_better(evidence: Evidence, champion: str) -> Iterator[str]:
     """See whether it is right about fewer sounds, or about no more though it changes much."""
     right, changes = evidence.random, evidence.changes
-    known = less_right(right, champion)
+    known, both = less_right(right, champion), right.plus(evidence.quiet)
     changed = changes.minutes.sum() - np.trace(changes.minutes)
     much = max(_CHANGED * _sound(evidence), _CHANGED_MINUTES)
     if is_worse(right):
         yield known
-    elif right.sounds and right.lost >= right.gained and changed > much:
+    elif is_worse(evidence.quiet):
+        quiet = evidence.quiet
+        yield (
+            f"of {quiet.sounds} silences of the minutes that were drawn at random it leaves "
+            f"{quiet.after} silent, {champion} {quiet.before}"
+        )
+    elif both.sounds and both.lost >= both.gained and changed > much:
+        known = known if right.sounds else "nothing sounds in the minutes drawn at random"
         yield (
             f"{known}, and {changes.words(changed)} would change: `hearthlog review logs --queue` "
             "asks for more such minutes, then promote it again"
@@ -111,14 +122,29 @@ def _sure_lost(evidence: Evidence, champion: str) -> Iterator[str]:
     for i, name in enumerate(changes.classes):
         sure, kept = float(evidence.sure[i].sum()), float(evidence.sure[i, i])
         much = sure >= min(_MUCH * total, _MUCH_OF_SOUND * sound)
-        if sure and much and kept < _KEPT * sure:
-            others = evidence.sure[i].copy()
-            others[i] = 0
+        others = evidence.sure[i].copy()
+        others[i] = 0
+        asked = sum(
+            float(others[j])
+            for j, new in enumerate(changes.classes)
+            if _is_asked_for(evidence, name, new)
+        )
+        if sure and much and kept + asked < _KEPT * sure:
             most = class_words(changes.classes[int(others.argmax())])
             yield (
                 f"of {changes.words(sure)} of {class_words(name)} of which {champion} is sure "
                 f"{time_words(kept)} are left, most becomes {most}"
             )
+
+
+def _is_asked_for(evidence: Evidence, name: str, new: str) -> bool:
+    """See whether marks of a new class say that a class was wrong, and none that it was right."""
+    if new not in evidence.taught:
+        return False
+    wrong = sum(n for (true, old, _), n in evidence.known.items() if (true, old) == (new, name))
+    own = [(after, n) for (true, _, after), n in evidence.known.items() if true == name]
+    lost = sum(n for after, n in own if after == new)
+    return wrong > 0 and lost <= (1.0 - _KEPT) * sum(n for _, n in own)
 
 
 def _out_of_proportion(evidence: Evidence) -> Iterator[str]:

@@ -71,11 +71,14 @@ class TwoModels:
     ----------
     classes : list of str
         Those of the first model, then others of the second.
+    before : int
+        Number of classes of the first model.
     """
 
     def __init__(self, before: Model, after: Model) -> None:
         names = translation(after.classes, before.classes)
         self.classes = list(dict.fromkeys([*before.classes, *names.values()]))
+        self.before = len(before.classes)
         self._numbers = np.array([self.classes.index(names[name]) for name in after.classes])
         self._model = before
         self._classifiers = Classifier(before), Classifier(after)

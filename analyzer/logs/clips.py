@@ -1,11 +1,12 @@
 """Clips of sound in a log."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import LogError
@@ -20,6 +21,8 @@ _FORMAT = "pcm-s16"
 _FULL_SCALE = np.float32(32768.0)
 _RATES = range(1_000, 1_000_001)
 _CHANNELS = range(1, 257)
+_NEAR = 10 * NANOSECONDS  # between the time of a message and that of its sound
+_TOUCHING = 5_000_000  # ns: stamps are as good as 1 ms
 
 
 class Clip(NamedTuple):
@@ -97,6 +100,11 @@ def read_clips(
     LogError
         If the log is damaged, if the topic holds no clips, or if `clips_of` refuses one.
     """
+    for clip in _clips(path, name, start, end):
+        yield clip.start, clip.rate, _mono(clip)
+
+
+def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterator[Clip]:
     for batch in iterate_messages([path], [name], start, end):
         for raw in batch:
             if not is_compatible(raw.channel, raw.schema, message_types.RAW_AUDIO, CLIP_FIELDS):
@@ -104,10 +112,72 @@ def read_clips(
                 raise LogError(f"{path}: {name}: holds {kind}, not clips")
         for columns in decode(batch, CLIP_FIELDS):
             try:
-                for clip in clips_of(columns):
-                    yield clip.start, clip.rate, _mono(clip)
+                yield from clips_of(columns)
             except LogError as error:
                 raise LogError(f"{path}: {error}") from error
+
+
+def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
+    """Return the time of which sound was kept.
+
+    Parameters
+    ----------
+    layers : iterable of Path
+        Layers of sound.
+    name : str
+        The topic, such as `/mic/audio`.
+    start, end : int
+        In nanoseconds of UTC.
+
+    Raises
+    ------
+    LogError
+        As `read_clips`.
+    """
+    times = [
+        (clip.start, clip.end)
+        for layer in layers
+        for clip in _clips(layer, name, start - _NEAR, end + _NEAR)
+    ]
+    edges = np.array(times, np.int64).reshape(-1, 2)
+    return joined(edges[:, 0], edges[:, 1], _TOUCHING)
+
+
+def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple[int, Float32]:
+    """Return the kept sound of a span of time, with silence where none was kept.
+
+    Parameters
+    ----------
+    layers : sequence of Path
+        Layers of sound.
+    name : str
+        The topic, such as `/mic/audio`.
+    start, end : int
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    rate : int
+        Samples per second, of the first clip; 0 if no sound was kept.
+    samples : np.ndarray [shape=(n,)], float32
+        -1 to 1. Clips of another rate are left out.
+
+    Raises
+    ------
+    LogError
+        As `read_clips`.
+    """
+    rate, sound = 0, np.empty(0, np.float32)
+    for layer in layers:
+        for begin, own_rate, samples in read_clips(layer, name, start - _NEAR, end + _NEAR):
+            place = (begin - start) * own_rate // NANOSECONDS
+            length = (end - start) * own_rate // NANOSECONDS
+            first, last = max(place, 0), min(place + len(samples), length)
+            if first < last and rate in {0, own_rate}:
+                if not rate:
+                    rate, sound = own_rate, np.zeros(length, np.float32)
+                sound[first:last] = samples[first - place : last - place]
+    return rate, sound
 
 
 def _mono(clip: Clip) -> Float32:

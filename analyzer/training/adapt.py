@@ -13,6 +13,7 @@ from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.learned_segments import learned_digests, segment_digests
 from hearthlog.analyzer.training.method import Examples, Method, prepare
+from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.sightings import with_directions
 from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.description import (
@@ -154,9 +155,13 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
     figures = {name: metrics.classes.get(name, unknown) for name in classes}
     amounts = {name: training.classes.get(name, none) for name in classes}
     bias = description.decision_bias
+    before = {name: tuple(labels) for name, labels in description.scenario.items()}
+    before = {name: before.get(name, (name,)) for name in classes if name in description.classes}
+    new = {name: (name,) for name in classes if name not in before}
+    labels = Scenario(description.scenario_name, before).with_taught(new).classes
     update = {
         "classes": list(classes),
-        "scenario": {name: description.scenario.get(name, [name]) for name in classes},
+        "scenario": {name: list(labels[name]) for name in classes},
         "decision_bias": {name: value for name, value in bias.items() if name in classes},
         "metrics": metrics.model_copy(update={"classes": figures, "confusion": confusion.tolist()}),
         "training_data": training.model_copy(update={"classes": amounts}),

@@ -1,5 +1,6 @@
 """What a home teaches a model: its marks, and what was right before and is to stay so."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -20,7 +21,14 @@ from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teach
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.unreviewed import unreviewed_silence, unreviewed_sounds
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, meant_by
+from hearthlog.models.classes import (
+    OTHER,
+    OTHER_NEGATIVE,
+    SILENCE,
+    UNKNOWN,
+    class_name,
+    meant_by,
+)
 from hearthlog.models.classifiers.description import MOST_CLASSES
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
@@ -101,7 +109,7 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> L
             kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model), scenario)
         if in_room and not counts.looked_at:
             notes.append(_NOT_LOOKED_AT)
-    segments = cut_recordings([*marked, *kept], taught, features)
+    segments = cut_recordings([*marked, *_as_unknown(kept, model, taught)], taught, features)
     if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
         segments = cut_recordings([], taught, features)
     nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
@@ -142,12 +150,13 @@ def _with_new_classes(
 ) -> tuple[Scenario, list[str], set[str]]:
     """Return a scenario with the classes of which marks tell enough.
 
-    Then what lacks of other classes, and the labels of those.
+    A label that the scenario counts as unknown makes its class like any other, and until then is
+    learned as unknown. Then what lacks of other classes, and the labels that cannot be learned.
     """
     known = scenario_of(model)
-    names = base_classes(model)
-    known = Scenario(known.name, {name: known.classes[name] for name in names})
-    listed = {*known.classes, *known.class_of}
+    known = Scenario(known.name, {name: known.classes[name] for name in base_classes(model)})
+    as_unknown = set(known.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}
+    listed = {*known.classes, *known.class_of} - as_unknown
     others = [one for one in marked if not meant_by(one.label, listed)]
     labels: dict[str, set[str]] = {}
     for one in others:
@@ -156,21 +165,48 @@ def _with_new_classes(
     amounts = cut_recordings(others, Scenario(known.name, every), features).amounts if every else {}
     notes: list[str] = []
     learned: dict[str, tuple[str, ...]] = {}
+    unlearned: set[str] = set()
     for name, amount in amounts.items():
         seconds = max(_FEWEST_SECONDS - amount.seconds, 0.0)
-        room = len(names) + len(learned) < MOST_CLASSES
+        room = len(known.classes) + len(learned) < MOST_CLASSES
         if room and not seconds and amount.sources >= _FEWEST_DAYS:
             learned[name] = every[name]
             continue
         count = sum(class_name(one.label) == name for one in others)
-        more = [f"{seconds:.0f} more seconds"] if seconds else []
+        more = [f"{math.ceil(round(seconds, 3))} more seconds"] if seconds else []
         more += ["on another day"] if amount.sources < _FEWEST_DAYS else []
         what = "the model has no room for it"
         if room:
             what = f"{', '.join(more)}, and it can be learned"
+        if any(meant_by(label, as_unknown) for label in every[name]):
+            what = f"they count as unknown; {what}"
+        else:
+            unlearned |= set(every[name])
         notes.append(f"{count} {'mark' if count == 1 else 'marks'} of {name}: {what}")
-    unlearned = {label for name in every.keys() - learned.keys() for label in every[name]}
-    return Scenario(known.name, {**known.classes, **learned}), notes, unlearned
+    return known.with_taught(learned), notes + _lumped(marked, known), unlearned
+
+
+def _lumped(marked: Sequence[Recording], known: Scenario) -> list[str]:
+    """Name the marks that are learned as a class of another name, such as `other`."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for one in marked:
+        name = known.find(one.label, marked=True)
+        if name in {OTHER, UNKNOWN} and (name == OTHER or class_name(one.label) == OTHER_NEGATIVE):
+            counts[class_name(one.label), name] += class_name(one.label) != name
+    return [
+        f"{count} {'mark' if count == 1 else 'marks'} of {label}: learned as {name}, "
+        "to which the model counts them"
+        for (label, name), count in sorted(counts.items())
+        if count
+    ]
+
+
+def _as_unknown(kept: Sequence[Recording], model: Model, taught: Scenario) -> Iterator[Recording]:
+    """Give what stays unknown a label that no new class of the home has taken."""
+    before = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]
+    after = taught.classes.get(UNKNOWN, (before,))[0]
+    for one in kept:
+        yield one._replace(label=after) if one.label == before else one
 
 
 def _seldom_kept(kept: Sequence[Recording], model: Model) -> set[str]:

@@ -91,6 +91,22 @@ class Scenario:
         labels = tuple(sorted({label for label, _ in others}))
         return Scenario(self.name, {**self.classes, sound.UNKNOWN: labels}, self.ignored)
 
+    def with_taught(self, learned: Mapping[str, tuple[str, ...]]) -> "Scenario":
+        """Return this scenario with the classes that a home teaches, which then are not unknown.
+
+        Parameters
+        ----------
+        learned : mapping of str to tuple of str
+            The new classes, and the labels of each.
+        """
+        classes = {**self.classes, **learned}
+        if sound.UNKNOWN in self.classes:
+            taken = learned.keys() | {one for labels in learned.values() for one in labels}
+            unknown = self.classes[sound.UNKNOWN]
+            rest = [one for one in unknown if not {one, sound.class_name(one)} & taken]
+            classes[sound.UNKNOWN] = tuple(rest) or (sound.OTHER_NEGATIVE,)
+        return Scenario(self.name, classes, self.ignored)
+
     @property
     def labels(self) -> frozenset[str]:
         """Labels that a manifest may use: built-in labels, those in a class, and ignored ones."""

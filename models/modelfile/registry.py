@@ -8,6 +8,7 @@ the two, it ends with the current champion, which is skipped.
 
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -17,8 +18,9 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
-from hearthlog.models.starter import STARTERS, starter_file
-from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
+from hearthlog.models.starter import GENERAL, STARTERS, starter_file
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.storage.new_files import locked_folder, replaced_file, sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
 DEFAULT_FOLDER = Path("models")
@@ -29,17 +31,18 @@ _KEPT = 100  # earlier champions
 
 @dataclass(frozen=True, eq=False)
 class ModelEntry:
-    """One model file of the folder."""
+    """One model file of the folder, or a starter."""
 
     name: str
     aliases: tuple[str, ...]  # that point to it
     size: int  # bytes
     model: Model | None
     problem: str = ""  # why the file cannot be used
+    starter: bool = False  # comes with this version, whether it is in the folder or not
 
 
 def list_models(folder: Path) -> list[ModelEntry]:
-    """Load every model of a folder, and list the targets of broken aliases too.
+    """Load every model of a folder, and the starters; list the targets of broken aliases too.
 
     Parameters
     ----------
@@ -60,10 +63,11 @@ def list_models(folder: Path) -> list[ModelEntry]:
     named = {alias: target(folder, alias) for alias in ALIASES}
     names = {path.stem for path in folder.glob("[!.]*" + SUFFIX)} - set(ALIASES)
     names |= {name for name in named.values() if name is not None}
-    return [
-        _entry(folder, name, tuple(alias for alias in ALIASES if named[alias] == name))
+    entries = [
+        _entry(_path(folder, name), tuple(alias for alias in ALIASES if named[alias] == name))
         for name in sorted(names)
     ]
+    return entries + [_entry(starter_file(name), ()) for name in STARTERS if name not in names]
 
 
 def target(folder: Path, alias: str) -> str | None:
@@ -126,14 +130,14 @@ def resolve(folder: Path, name: str) -> str:
 
 
 def load(folder: Path, name: str) -> Model:
-    """Load a model of a folder.
+    """Load a model of a folder, or a starter model.
 
     Parameters
     ----------
     folder : Path
         Folder of model files.
     name : str
-        Name of a model, of its file, or an alias.
+        Name of a model, of its file, or an alias; a starter of which there is no file.
 
     Raises
     ------
@@ -141,7 +145,10 @@ def load(folder: Path, name: str) -> Model:
         If there is no such folder, or `resolve` or `load_model` refuses the model.
     """
     _check_folder(folder)
-    return load_model(_path(folder, resolve(folder, name)))
+    path = _path(folder, resolve(folder, name))
+    if name.removesuffix(SUFFIX) in STARTERS and not os.path.lexists(path):
+        path = starter_file(path.stem)
+    return load_model(path)
 
 
 def find_model(folder: Path, sha256: str) -> Path | None:
@@ -179,8 +186,43 @@ def is_starter(name: str, sha256: str) -> bool:
     return name in STARTERS and file.is_file() and _digest(file) == sha256
 
 
+def first_starter(folder: Path) -> str | None:
+    """Name the starter model that labelled a home before the champion.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+
+    Returns
+    -------
+    str or None
+        The one that the champion was adapted from, over models of the folder that are still there;
+        else `general`, with which a recorder begins; None if that is the champion, or is of another
+        feature set.
+    """
+    try:
+        champion = model = load(folder, CHAMPION)
+    except ModelError:
+        return GENERAL
+    seen: set[str] = set()
+    while (sha256 := model.description.training_data.base_sha256) not in {"", *seen}:
+        seen.add(sha256)
+        for name in STARTERS:
+            if is_starter(name, sha256):
+                return name
+        path = find_model(folder, sha256)
+        if path is None:
+            break
+        with suppress(ModelError):
+            model = load_model(path)
+    general = load_model(starter_file(GENERAL))
+    alike = champion.description.feature_set == general.description.feature_set
+    return GENERAL if alike and champion.sha256 != general.sha256 else None
+
+
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
-    """Point an alias to a model, if that model can be used.
+    """Point an alias to a model, if that model can be used; a starter is copied to the folder.
 
     Whether it may label is for a judgement to say, which a recorder asks for.
 
@@ -208,6 +250,7 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
     with _locked(folder):
         before = target(folder, alias)
         model = load(folder, name)
+        _copy_starter(folder, model)
         if model.name != before:
             if alias == CHAMPION and before is not None:
                 _write_history(folder, [*_earlier(folder), before])
@@ -217,6 +260,8 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
 
 def rollback(folder: Path) -> tuple[Model, str]:
     """Make the last earlier champion that can still be used the champion again: it may label.
+
+    Before the first one that was the starter model which the recorder began with.
 
     Parameters
     ----------
@@ -246,17 +291,37 @@ def rollback(folder: Path) -> tuple[Model, str]:
                 _point(folder, CHAMPION, model.name)
                 _write_history(folder, earlier)
                 return model, before
-        raise ModelError(f"{folder}: no champion before {before} can be used; promote a model")
+        starter = first_starter(folder)
+        if starter is None:
+            raise ModelError(f"{folder}: no champion before {before} can be used; promote a model")
+        model = load(folder, starter)
+        _copy_starter(folder, model)
+        insist(folder, model.sha256)
+        _point(folder, CHAMPION, model.name)
+        _write_history(folder, [])
+        return model, before
 
 
-def _entry(folder: Path, name: str, aliases: tuple[str, ...]) -> ModelEntry:
-    path = _path(folder, name)
+def _copy_starter(folder: Path, model: Model) -> None:
+    """Put a starter model into a folder, if no file of its name is there."""
+    path = _path(folder, model.name)
+    if os.path.lexists(path):
+        return
+    try:
+        with replaced_file(path) as temporary:
+            shutil.copyfile(starter_file(model.name), temporary)
+    except LogError as error:
+        raise ModelError(str(error)) from error
+
+
+def _entry(path: Path, aliases: tuple[str, ...]) -> ModelEntry:
     try:
         model = load_model(path)
-        return ModelEntry(name, aliases, path.stat().st_size, model)
+        size, starter = path.stat().st_size, is_starter(model.name, model.sha256)
+        return ModelEntry(path.stem, aliases, size, model, starter=starter)
     except (ModelError, OSError) as error:
         size = path.stat().st_size if path.is_file() else 0
-        return ModelEntry(name, aliases, size, None, str(error))
+        return ModelEntry(path.stem, aliases, size, None, str(error))
 
 
 def _path(folder: Path, name: str) -> Path:

@@ -49,6 +49,11 @@ class ClipWriter:
     file_at : callable
         Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
         log; see `RollingLog.file_at`.
+
+    Attributes
+    ----------
+    kept_frames : int
+        That were written.
     """
 
     def __init__(
@@ -68,6 +73,7 @@ class ClipWriter:
         self._stopped = ""
         self._day = range(0)
         self._used = 0  # frames kept of the day
+        self.kept_frames = 0
 
     def write(self, microphone: str, sounds: Sequence[KeptSound]) -> list[Notice]:
         """Append sound to the layers of the logs that contain its time.
@@ -181,6 +187,7 @@ class ClipWriter:
                 self._writer = None
             return f"{audio_path(log)} cannot be written ({getattr(error, 'strerror', 0) or error})"
         self._used += len(sound.stamps)
+        self.kept_frames += len(sound.stamps)
         return ""
 
     def _metadata(self, log: Path) -> dict[str, str]:

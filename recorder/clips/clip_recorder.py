@@ -50,6 +50,11 @@ class ClipRecorder:
             for pipeline in pipelines
         }
 
+    @property
+    def kept_frames(self) -> int:
+        """Frames of sound that were kept."""
+        return self._writer.kept_frames
+
     def before(self, microphone: str, event: Event) -> list[Notice]:
         """Prepare for an event that is about to be logged: a gap ends the sound before it.
 

@@ -50,7 +50,7 @@ _Folder = Annotated[
 
 @models.command("list")
 def list_(folder: _Folder = None, as_json: Json = False) -> None:
-    """List the models; exit status 3: one of them cannot be used."""
+    """List the models and the starters; exit status 3: one of them cannot be used."""
     from hearthlog.models.modelfile.registry import list_models
 
     entries = list_models(models_folder(folder))
@@ -150,7 +150,7 @@ def compare(
 
 @models.command()
 def promote(
-    name: Annotated[str, typer.Argument(help="A model, or an alias.")] = "candidate",
+    name: Annotated[str, typer.Argument(help="A model, an alias, or a starter.")] = "candidate",
     folder: _Folder = None,
     to: Annotated[
         Literal["champion", "candidate"], typer.Option(help="What it becomes.")
@@ -165,7 +165,8 @@ def promote(
 ) -> None:
     """Make a model the champion, if it does no harm; a recorder that runs takes it over.
 
-    It is compared with the model that labels now, on recent logs that it has not learned from.
+    It is compared with the model that labels now, on recent logs that it has not learned from; the
+    starter that the home began with is not.
     """
     from hearthlog.models.modelfile.registry import promote as promote_model
 
@@ -183,7 +184,7 @@ def promote(
 
 @models.command()
 def rollback(folder: _Folder = None) -> None:
-    """Make the champion before the champion again."""
+    """Make the champion before the champion again; before the first it was a starter."""
     from hearthlog.models.modelfile.registry import rollback as roll_back
 
     model, before = roll_back(models_folder(folder))
@@ -195,11 +196,12 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     from hearthlog.analyzer.gate.judge import judge, judged_against
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.judgement import insist
-    from hearthlog.models.modelfile.registry import load
+    from hearthlog.models.modelfile.registry import first_starter, is_starter, load
     from hearthlog.tools.cli.progress import share_done
 
     model = load(folder, name)
-    if anyway:
+    is_first = is_starter(model.name, model.sha256) and model.name == first_starter(folder)
+    if anyway or is_first:
         insist(folder, model.sha256)
         return
     judgement = judged_against(folder, model, home)
@@ -273,12 +275,12 @@ def _recordings(
 
 def _named(folder: Path, name: str) -> "Model":
     """Load a model of the folder, or a starter model."""
-    from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
+    from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.modelfile.registry import load
-    from hearthlog.models.starter import STARTERS
+    from hearthlog.models.starter import STARTERS, starter_file
 
-    if name in STARTERS and not (folder / (name + SUFFIX)).exists():
-        return load_model(Path(name))
+    if name in STARTERS and not folder.is_dir():
+        return load_model(starter_file(name))
     return load(folder, name)
 
 
@@ -371,7 +373,8 @@ def _verdict(comparison: "Comparison") -> str:
 
 
 def _row(entry: "ModelEntry") -> tuple[str, ...]:
-    alias, size = ", ".join(entry.aliases), f"{entry.size / 1e6:.2f} MB"
+    alias = ", ".join((*entry.aliases, *["starter"] * entry.starter))
+    size = f"{entry.size / 1e6:.2f} MB"
     if entry.model is None:
         return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
     description = entry.model.description
@@ -392,6 +395,7 @@ def _as_json(entry: "ModelEntry") -> dict[str, object]:
     result: dict[str, object] = {
         "name": entry.name,
         "aliases": entry.aliases,
+        "starter": entry.starter,
         "bytes": entry.size,
         "problem": entry.problem or None,
     }

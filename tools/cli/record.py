@@ -122,7 +122,7 @@ def record(
     end of another, or a log left by an earlier recorder was damaged, or a new model was refused.
     """
     from hearthlog.recorder.config import NO_MODEL, load_settings
-    from hearthlog.recorder.recording import record_files, record_microphones
+    from hearthlog.recorder.recording import record_files
     from hearthlog.tools.cli.progress import share_done
 
     given = {
@@ -164,13 +164,28 @@ def record(
     elif start is not None or realtime or start_pattern is not None:
         wrong_use("--start, --start-pattern and --realtime go with files")
     else:
-        if sys.stderr.isatty():
-            tell("listening; Ctrl-C completes the log")
-        recording = record_microphones(settings, stop, reload_requests)
+        recording = _listen(settings, stop, reload_requests)
         if reload_requests.restart:
             tell("the configuration was changed; starting again with it")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  as this process was started
     _say(recording, losses)
+
+
+def _listen(
+    settings: "Settings", stop: Flag, reload_requests: "ReloadRequests"
+) -> "RecordingSummary":
+    """Record microphones, and show on a terminal what they hear."""
+    from hearthlog.recorder.recording import record_microphones
+
+    if not sys.stderr.isatty():
+        return record_microphones(settings, stop, reload_requests)
+    from hearthlog.recorder.recording_session import RecorderState
+    from hearthlog.tools.cli.living_line import living_line
+
+    tell("listening; Ctrl-C completes the log")
+    state = RecorderState()
+    with living_line(state, settings):
+        return record_microphones(settings, stop, reload_requests, state)
 
 
 def with_model(settings: "Settings") -> "Settings":

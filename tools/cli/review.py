@@ -14,7 +14,7 @@ from typer.core import TyperCommand
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.text import printable
-from hearthlog.schemas.times import NANOSECONDS, time_text
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
 from hearthlog.tools.cli.options import (
@@ -32,7 +32,11 @@ from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, tell, wrong_use
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from hearthlog.analyzer.logs.labellings import Labellings
+    from hearthlog.analyzer.logs.spans import Spans
+    from hearthlog.analyzer.review.queue.asked import SoundFile
     from hearthlog.analyzer.review.queue.review_list import ReviewSpan
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.session import ReviewItem
@@ -56,7 +60,8 @@ def review(
             "--save",
             "--output",
             "-o",
-            help="Make a Rerun recording, *.rrd, instead; with --queue a label file of its spans.",
+            help="Make a Rerun recording, *.rrd, instead; with --queue a label file of its spans, "
+            "and a folder of their kept sound.",
         ),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
@@ -119,7 +124,7 @@ def review(
 
     chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
     if save is not None and queue is not None:
-        _save_queue(save, logs, chosen)
+        _save_queue(save, logs, chosen, timezone)
         return
     try:
         require("rerun", "rerun_cli")
@@ -303,7 +308,9 @@ def _work(
         sources = find_labellings(*logs)
         labelling = sources.find(microphone, choice.labels)
         if choice.queue is not None:
-            items = review_items(_queue_spans(choice.queue, sources, microphone, labelling, choice))
+            items = review_items(
+                _queue_spans(choice.queue, sources, (microphone, labelling), choice)
+            )
             _tell_fewer(len(items), choice)
     marking = Marking(
         microphone,
@@ -316,39 +323,68 @@ def _work(
     return items, marking
 
 
-def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
-    """Write the spans of a queue as labels that a person corrects where there is no viewer."""
+def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | None) -> None:
+    """Write the spans of a queue, and what sound of them was kept, for who has no viewer."""
     from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.logs.labellings import find_labellings
+    from hearthlog.analyzer.logs.layers import zone_of
+    from hearthlog.analyzer.marks.formats.formats import AUDACITY
     from hearthlog.analyzer.marks.formats.label_files import write_labels
-    from hearthlog.analyzer.review.queue.asked import asked_path, labels_of
+    from hearthlog.analyzer.review.queue.asked import (
+        asked_path,
+        find_kept_sound,
+        label_lines,
+        labels_of,
+        sound_files,
+        sounds_folder,
+        write_sounds,
+    )
     from hearthlog.analyzer.review.queue.review_list import write_list
     from hearthlog.schemas.messages.topics import scenario_name
-    from hearthlog.schemas.storage.new_files import check_new
+    from hearthlog.schemas.storage.new_files import check_new, new_file
 
     if find_format(path) is None:
         wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")
     if len(logs) > 1:
         wrong_use("--save --queue: name one log or folder, as `hearthlog annotate import` takes it")
-    asked = asked_path(path)
-    check_new(asked)
+    asked, folder = asked_path(path), sounds_folder(path)
+    for new in (path, asked, folder):
+        check_new(new)
+    zone = zone_of(logs, timezone)
     sources = find_labellings(*logs)
     microphone = sources.microphone(choice.microphone)
     labelling = sources.find(microphone, choice.labels)
     assert choice.queue is not None
-    spans = _queue_spans(choice.queue, sources, microphone, labelling, choice)
+    kept = find_kept_sound(logs[0], microphone, choice.limits, sources.losses)
+    spans = _queue_spans(choice.queue, sources, (microphone, labelling), choice, kept.time)
     segments = sources.read(microphone, labelling, *choice.limits).labelling
     marks = sorted(mark for span in spans for mark in labels_of(span, segments))
-    write_labels(path, marks, find_coverage(logs[0]))
+    files = sound_files(marks, spans, kept)
+    if files:
+        write_sounds(folder, files, len(marks), kept)
+    if find_format(path) == AUDACITY:
+        with new_file(path) as temporary:
+            text = label_lines(marks, spans, files, folder.name, zone)
+            temporary.write_text(text, "utf-8")
+    else:
+        write_labels(path, marks, find_coverage(logs[0]))
     write_list(asked, spans)
+    clock = [datetime.fromtimestamp(one.start // NANOSECONDS, zone) for one in marks]
     print_table(
-        ("from (UTC)", "seconds", "label"),
+        ("line", "from", "seconds", "label", "sound"),
         [
-            (time_text(one.start)[:19], f"{(one.end - one.start) / NANOSECONDS:.1f}", one.label)
-            for one in marks
+            (
+                str(line),
+                f"{begin:%Y-%m-%d %H:%M:%S}",
+                f"{(one.end - one.start) / NANOSECONDS:.1f}",
+                one.label,
+                "kept" if any(file.first == file.last == line for file in files) else "",
+            )
+            for line, (begin, one) in enumerate(zip(clock, marks, strict=True), 1)
         ],
     )
     _tell_fewer(len(spans), choice)
+    _tell_of_sounds(files, folder, len(marks))
     scenario = scenario_name(labelling)
     of = f" --scenario {scenario}" if scenario else ""
     tell(
@@ -358,15 +394,28 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
     end_with_warnings(sources.losses)
 
 
+def _tell_of_sounds(files: "Sequence[SoundFile]", folder: Path, lines: int) -> None:
+    heard = sum(file.first == file.last for file in files)
+    if not files:
+        tell("no sound of these lines was kept; `hearthlog record --keep-audio unsure` keeps some")
+        return
+    others = "" if heard == lines else "; of the others no sound was kept"
+    tell(f"{folder}: the sound of {heard} of {lines} lines, numbered as they are{others}")
+
+
 def _queue_spans(
-    queue: str, sources: "Labellings", microphone: str, labelling: str, choice: _Choice
+    queue: str,
+    sources: "Labellings",
+    labelled: tuple[str, str],
+    choice: _Choice,
+    audible: "Spans | None" = None,
 ) -> "list[ReviewSpan]":
     from hearthlog.analyzer.review.session.queue_items import queue_spans
 
-    labelled = microphone, labelling
     with share_done("choosing spans") as progress:
+        folder = models_folder()
         return queue_spans(
-            queue, sources, labelled, choice.limits, choice.spans, models_folder(), progress
+            queue, sources, labelled, choice.limits, choice.spans, folder, progress, audible
         )
 
 

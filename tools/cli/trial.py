@@ -25,6 +25,7 @@ def trial_as_json(trial: Trial) -> dict[str, Any]:
         "changes": [change._asdict() for change in changes.pairs()],
         "random": trial.random._asdict(),
         "marks": trial.marks._asdict(),
+        "quiet": trial.quiet._asdict(),
         "verdict": _verdict(trial),
     }
 
@@ -41,6 +42,7 @@ def print_trial(trial: Trial) -> None:
     print()
     for what, right in (
         ("sounds of minutes drawn at random", trial.random),
+        ("silences of minutes drawn at random", trial.quiet),
         ("other marked sounds (marks are where the champion was wrong)", trial.marks),
     ):
         if right.sounds:
@@ -54,7 +56,7 @@ def print_trial(trial: Trial) -> None:
 
 
 def _verdict(trial: Trial) -> str:
-    random, name = trial.random, trial.candidate
+    random, name = trial.random.plus(trial.quiet), trial.candidate
     if not random.sounds:
         return (
             "no minutes drawn at random are reviewed since: which is better cannot be told; "

@@ -39,8 +39,9 @@ def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
         command = shlex.join(["hearthlog", "review", *map(str, home), "--queue", model])
         print(printable(f"hear what changes: `{command}`"))
     _print_right("sounds of the minutes that were drawn at random", evidence.random, verdict)
+    _print_right("silences of these minutes", evidence.quiet, verdict)
     _print_right("other sounds that were marked and not learned from", evidence.marks, verdict)
-    if not evidence.random.sounds:
+    if not evidence.random.sounds + evidence.quiet.sounds:
         print(
             "no minutes of this home that were drawn at random are reviewed: wrong marks cannot be "
             "seen; `hearthlog review logs --queue` asks for some"

@@ -1,4 +1,7 @@
-"""Label tracks of Audacity: start, end and label separated by tabs, of one microphone."""
+"""Label tracks of Audacity: start, end and label separated by tabs, of one microphone.
+
+Times are seconds, or ISO 8601 in files that people correct without Audacity.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

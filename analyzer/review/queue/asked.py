@@ -1,18 +1,35 @@
-"""What a label file was made to ask, in a list beside it: so an import knows what was looked at."""
+"""What a label file was made to ask: its lines, and beside it the sounds and a list of the spans.
 
+By the list an import knows what was looked at.
+"""
+
+import os
+import wave
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime, tzinfo
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.clips import SAMPLE_BYTES, kept_sound, kept_time
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import one, pieces
+from hearthlog.analyzer.logs.spans import Spans, cut, joined, one, pieces
 from hearthlog.analyzer.marks.formats.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan
-from hearthlog.schemas.messages.topics import RELABEL, scenario_name
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import AUDIO_SUFFIX, find_logs
+from hearthlog.schemas.messages.topics import LIVE, RELABEL, labelling_topic, scenario_name
+from hearthlog.schemas.storage.new_files import new_folder
+from hearthlog.schemas.times import NANOSECONDS
 
 _SUFFIX = ".queue.csv"
+_EVER = 1 << 62  # nanoseconds
+_SHORTEST = NANOSECONDS // 10  # sound that is worth a file
+_FULL_SCALE = 32767.0
 
 
 def asked_path(labels: Path) -> Path:
@@ -22,9 +39,204 @@ def asked_path(labels: Path) -> Path:
     ----------
     labels : Path
     """
+    return labels.with_name(_stem(labels) + _SUFFIX)
+
+
+def sounds_folder(labels: Path) -> Path:
+    """Return the path of the folder of sounds beside a label file: `ten` beside `ten.txt`.
+
+    Parameters
+    ----------
+    labels : Path
+    """
+    return labels.with_name(_stem(labels))
+
+
+def _stem(labels: Path) -> str:
     format_ = find_format(labels)
-    suffix = "" if format_ is None else format_.suffix
-    return labels.with_name(labels.name.removesuffix(suffix) + _SUFFIX)
+    return labels.name.removesuffix("" if format_ is None else format_.suffix)
+
+
+class KeptSound(NamedTuple):
+    """What sound of a microphone was kept.
+
+    Attributes
+    ----------
+    layers : list of Path
+        That hold it.
+    topic : str
+    time : Spans
+    """
+
+    layers: list[Path]
+    topic: str
+    time: Spans
+
+
+class SoundFile(NamedTuple):
+    """The kept sound of a line of a label file, or of the lines of a minute.
+
+    Attributes
+    ----------
+    first, last : int
+        Numbers of the lines, from 1.
+    start, end : int
+        In nanoseconds of UTC.
+    """
+
+    first: int
+    last: int
+    start: int
+    end: int
+
+    def name(self, lines: int) -> str:
+        """Name the file: `07.wav`, or `12-31.wav` for a minute.
+
+        Parameters
+        ----------
+        lines : int
+            That there are in all.
+        """
+        width = max(len(str(lines)), 2)
+        last = f"-{self.last:0{width}}" if self.last > self.first else ""
+        return f"{self.first:0{width}}{last}.wav"
+
+
+def find_kept_sound(
+    logs: Path, microphone: str, limits: tuple[int | None, int | None], losses: list[str]
+) -> KeptSound:
+    """Find what sound of a microphone was kept.
+
+    Parameters
+    ----------
+    logs : Path
+        A log, or a folder of logs.
+    microphone : str
+    limits : (int or None, int or None)
+        Start and end in nanoseconds of UTC; None for all that there is.
+    losses : list of str
+        What cannot be read is appended.
+
+    Raises
+    ------
+    LogError
+        If there is no log.
+    """
+    topic = labelling_topic(microphone, LIVE, "audio")
+    start, end = 0 if limits[0] is None else limits[0], _EVER if limits[1] is None else limits[1]
+    layers, times = [], [Spans(*(np.empty(0, np.int64),) * 2)]
+    near = logs if logs.is_dir() else logs.parent
+    for layer in find_logs(near):
+        if not layer.name.endswith(AUDIO_SUFFIX):
+            continue
+        try:
+            times.append(kept_time([layer], topic, start, end))
+            layers.append(layer)
+        except LogError as error:
+            losses.append(str(error))
+    edges = [np.concatenate(each) for each in zip(*times, strict=True)]
+    return KeptSound(layers, topic, joined(*edges))
+
+
+def sound_files(
+    marks: Sequence[Mark], asked: Iterable[ReviewSpan], kept: KeptSound
+) -> list[SoundFile]:
+    """List the lines of a label file of which sound was kept, and the minutes.
+
+    Parameters
+    ----------
+    marks : sequence of Mark
+        The lines, in their order.
+    asked : iterable of ReviewSpan
+    kept : KeptSound
+    """
+    lines = [SoundFile(n, n, mark.start, mark.end) for n, mark in enumerate(marks, 1)]
+    minutes = [SoundFile(*_lines_of(span, marks), span.start, span.end) for span in _drawn(asked)]
+    files = [*lines, *(one for one in minutes if one.last > one.first)]
+    return [one for one in files if cut(kept.time, one.start, one.end).length >= _SHORTEST]
+
+
+def write_sounds(folder: Path, files: Sequence[SoundFile], lines: int, kept: KeptSound) -> None:
+    """Write sounds as WAV files into a new folder, for the user alone; where there is none silence.
+
+    Parameters
+    ----------
+    folder : Path
+    files : sequence of SoundFile
+    lines : int
+        Of the label file.
+    kept : KeptSound
+
+    Raises
+    ------
+    LogError
+        If the folder exists or cannot be written, or the sound cannot be read.
+    """
+    with new_folder(folder) as temporary:
+        temporary.chmod(0o700)
+        for file in files:
+            rate, samples = kept_sound(kept.layers, kept.topic, file.start, file.end)
+            path = temporary / file.name(lines)
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "wb") as stream, wave.open(stream, "wb") as sound:
+                sound.setparams((1, SAMPLE_BYTES, rate, 0, "NONE", ""))
+                sound.writeframes((samples * _FULL_SCALE).astype("<i2").tobytes())
+
+
+def label_lines(
+    marks: Sequence[Mark],
+    asked: Iterable[ReviewSpan],
+    files: Iterable[SoundFile],
+    folder: str,
+    zone: tzinfo,
+) -> str:
+    """Write labels for people with an editor: times of the clock, and which file to listen to.
+
+    An import reads the first three columns.
+
+    Parameters
+    ----------
+    marks : sequence of Mark
+        In the order of time.
+    asked : iterable of ReviewSpan
+    files : iterable of SoundFile
+    folder : str
+        Name of theirs.
+    zone : tzinfo
+        Of the home.
+    """
+    notes: dict[int, list[str]] = {}
+    minutes = [_lines_of(span, marks) for span in _drawn(asked)]
+    for first, last in minutes:
+        notes.setdefault(first, []).append(f"a minute drawn at random, to line {last}")
+    for file in files:
+        notes.setdefault(file.first, []).append(f"{folder}/{file.name(len(marks))}")
+    return "".join(
+        "\t".join(
+            [_clock(mark.start, zone), _clock(mark.end, zone), mark.label]
+            + ([", ".join(notes[number])] if number in notes else [])
+        )
+        + "\n"
+        for number, mark in enumerate(marks, 1)
+    )
+
+
+def _clock(nanoseconds: int, zone: tzinfo) -> str:
+    """Write a time of the clock on the wall, with its offset: no moment is meant twice."""
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    text = datetime.fromtimestamp(seconds, zone).isoformat()
+    decimals = f"{rest:09}".rstrip("0")
+    return f"{text[:19]}.{decimals}{text[19:]}" if decimals else text
+
+
+def _drawn(asked: Iterable[ReviewSpan]) -> list[ReviewSpan]:
+    return [span for span in asked if span.reason == RANDOM]
+
+
+def _lines_of(span: ReviewSpan, marks: Sequence[Mark]) -> tuple[int, int]:
+    """Return the first and the last line of a span."""
+    lines = [number for number, mark in enumerate(marks, 1) if _answers(mark, span)]
+    return lines[0], lines[-1]
 
 
 def chosen_as(span: ReviewSpan) -> str:

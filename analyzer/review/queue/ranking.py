@@ -10,7 +10,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY
 from hearthlog.analyzer.evaluation.event_scores import events_of
 from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Labellings, NamedLabelling
-from hearthlog.analyzer.logs.spans import Spans
+from hearthlog.analyzer.logs.spans import Spans, pieces
 from hearthlog.analyzer.review.queue.coverage import cover, sample
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     JudgeableSpans,
@@ -97,6 +97,7 @@ def make_queue(  # noqa: PLR0913
     count: int,
     ranking: str | None = None,
     models: Path = DEFAULT_FOLDER,
+    audible: Spans | None = None,
     progress: Progress = ignore_progress,
 ) -> ReviewQueue:
     """Choose the spans from which a model learns most, or whose labels are likely to be wrong.
@@ -122,6 +123,8 @@ def make_queue(  # noqa: PLR0913
         rare classes before others.
     models : Path, optional
         Folder of models, in which the one of the labels is looked for.
+    audible : Spans, optional
+        Time of which sound was kept: `useful` spans that lie in it go first.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
 
@@ -169,7 +172,7 @@ def make_queue(  # noqa: PLR0913
                 some, sources, microphone, model, lambda share: progress((1.0 + share) / 2.0)
             )
 
-        rows = _useful(spans, parts[0], count, sounds)
+        rows = _useful(spans, parts[0], count, sounds, audible)
     else:
         silent = np.array([class_name(name) == SILENCE for name in classes])
         scored = np.where(border_pieces(spans, silent), 0.0, np.stack(parts))
@@ -194,6 +197,7 @@ def _useful(
     uncertain: Float64,
     count: int,
     sounds: Callable[[JudgeableSpans], SpanSounds],
+    audible: Spans | None,
 ) -> Int64:
     """Choose spans that sound like most of what a model is uncertain of, in rare classes more."""
     rows, shares = sample(worth(spans, uncertain))
@@ -202,7 +206,14 @@ def _useful(
     eligible = some.ends - some.starts >= _LONG_ENOUGH
     if not eligible.any():
         eligible[:] = True
-    return rows[cover(points, gamma, shares, eligible, count)]
+    if audible is None:
+        return rows[cover(points, gamma, shares, eligible, count)]
+    kept, row, _ = pieces(some, audible)
+    heard = np.bincount(row, kept.ends - kept.starts, len(some))
+    heard = heard > _MOSTLY * (some.ends - some.starts)
+    first = cover(points, gamma, shares, eligible & heard, count)
+    rest = cover(points, gamma, shares, eligible & ~heard, count - len(first))
+    return rows[np.concatenate([first, rest])]
 
 
 def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:

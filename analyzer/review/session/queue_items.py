@@ -59,6 +59,7 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     count: int | None,
     models: Path = DEFAULT_FOLDER,
     progress: Progress = ignore_progress,
+    audible: Spans | None = None,
 ) -> list[ReviewSpan]:
     """Choose spans of a labelling for a review.
 
@@ -81,6 +82,8 @@ def queue_spans(  # noqa: PLR0913, PLR0917
         are compared with.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
+    audible : Spans, optional
+        As of `make_queue`.
 
     Returns
     -------
@@ -133,6 +136,7 @@ def queue_spans(  # noqa: PLR0913, PLR0917
             count=wanted - len(drawn_at_random),
             ranking=queue,
             models=models,
+            audible=audible,
             progress=progress,
         )
     except DataError:
