@@ -1,5 +1,6 @@
 """Write an MCAP file that says, when it is finished, what is in its messages."""
 
+from collections.abc import Iterable
 from itertools import chain, zip_longest
 from typing import BinaryIO
 
@@ -67,6 +68,11 @@ class CountedWriter(ChunkWriter):
         if record is not None:
             super().add_metadata(METADATA, record)
         super().finish()
+
+    def copy_large_chunk(self, chunk: StoredChunk, length: int, data: Iterable[bytes]) -> None:
+        """Write a chunk of another file; what it says is not counted."""
+        self._give_up()
+        super().copy_large_chunk(chunk, length, data)
 
     def _put(self, chunk: StoredChunk) -> int:
         length = super()._put(chunk)

@@ -11,8 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.chunk_table import not_empty
-from hearthlog.schemas.mcap.chunks import TopicChoice, is_chosen, read_chunks, repeated_chunks
+from hearthlog.schemas.mcap.chunk_table import by_start, not_empty
+from hearthlog.schemas.mcap.chunks import (
+    TopicChoice,
+    in_parts,
+    is_chosen,
+    read_chunks,
+    repeated_chunks,
+)
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
@@ -115,10 +121,30 @@ class _Query(NamedTuple):
 
     def chunks(self, file: LogFile) -> NDArray[np.void]:
         """Return the chunks that may hold a message of the query."""
-        chunks = not_empty(file.chunks)
-        chunks = chunks[(chunks["end"] >= self.start) & (chunks["start"] < self.end)][:: self.every]
+        chunks = self._in_span(not_empty(file.chunks))[:: self.every]
         if self.once:
             chunks = chunks[~repeated_chunks(file, chunks)]
+        chosen = self._of_topics(file, chunks)
+        parts = self._in_parts(file, chosen)
+        return chosen if parts is chosen else self._of_topics(file, self._in_span(parts))
+
+    def _in_span(self, chunks: NDArray[np.void]) -> NDArray[np.void]:
+        return chunks[(chunks["end"] >= self.start) & (chunks["start"] < self.end)]
+
+    def _in_parts(self, file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
+        """Divide large chunks into parts; those that are damaged are left out if they may be."""
+        try:
+            return in_parts(file, chunks)
+        except LogError as error:
+            if self.on_damage is None:
+                raise
+            if len(chunks) == 1:
+                self.on_damage(file.path, error)
+                return chunks[:0]
+        each = [self._in_parts(file, chunks[i : i + 1]) for i in range(len(chunks))]
+        return by_start(np.concatenate(each))
+
+    def _of_topics(self, file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
         if self.topics is None:
             return chunks
         others = {

@@ -21,6 +21,9 @@ CHUNKS = np.dtype(
         ("start", "<i8"),  # log time of its first message, in nanoseconds
         ("end", "<i8"),  # and of its last
         ("channels", "<i8"),  # a place in `LogFile.channel_sets`
+        # Byte of the content at which a part of a large chunk begins, whose other numbers are those
+        # of the part; -1: all of the chunk. Length and that of the indexes are 0 of a part.
+        ("part", "<i8"),
     ]
 )
 LAST_TIME = (1 << 63) - 2  # ns; later log times, as of clocks that ran below zero, are not read
@@ -62,6 +65,7 @@ class ChunkRow:
         It does if it begins where the run ends, and the run is not too long yet.
         """
         is_next = self.offset + self.length == location.offset and not self.late
+        is_next &= location.length < _RUN_LIMIT
         return self.index_length < 0 and is_next and self.length < _RUN_LIMIT
 
     def extend(self, message: "ChunkRow") -> None:

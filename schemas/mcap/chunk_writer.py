@@ -5,7 +5,7 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 
 import zlib
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import BinaryIO
 
@@ -96,23 +96,28 @@ class ChunkWriter:
         """
         record = records.Attachment(create_time, log_time, name, media_type, data)
         self.copy_attachment(
-            encode(record),
+            [encode(record)],
             records.AttachmentIndex(0, 0, log_time, create_time, len(data), name, media_type),
         )
 
-    def copy_attachment(self, record: bytes | memoryview, index: records.AttachmentIndex) -> None:
+    def copy_attachment(
+        self, record: Iterable[bytes | memoryview], index: records.AttachmentIndex
+    ) -> None:
         """Write an attachment as another file holds it.
 
         Parameters
         ----------
-        record : bytes-like
-            The whole record, with opcode and length.
+        record : iterable of bytes-like
+            The whole record, with opcode and length, in one or more pieces.
         index : mcap.records.AttachmentIndex
             What the index will say of it; offset and length are replaced by those in this file.
         """
         offset = self._stream.tell()
-        self._stream.write(record)
-        self._attachments.append(replace(index, offset=offset, length=len(record)))
+        length = 0
+        for piece in record:
+            self._stream.write(piece)
+            length += len(piece)
+        self._attachments.append(replace(index, offset=offset, length=length))
 
     def copy_record(self, record: bytes) -> None:
         """Write a record of a kind that no index lists, as another file holds it.
@@ -243,6 +248,21 @@ class ChunkWriter:
         self.flush()
         self._put(chunk)
 
+    def copy_large_chunk(self, chunk: StoredChunk, length: int, data: Iterable[bytes]) -> None:
+        """Write a chunk of another file as `copy_chunk` does, without having all of it at once.
+
+        Parameters
+        ----------
+        chunk : StoredChunk
+            Its own data are not used.
+        length : int
+            Bytes of the data.
+        data : iterable of bytes
+            Pieces of the compressed records.
+        """
+        self.flush()
+        self._put_pieces(chunk, length, data)
+
     def join_chunk(self, chunk: StoredChunk, span: int, dropped: Collection[int] = ()) -> None:
         """Append the records of another file's chunk to the chunk in progress.
 
@@ -313,12 +333,18 @@ class ChunkWriter:
 
     def _put(self, chunk: StoredChunk) -> int:
         """Write a chunk and its message index; return the bytes of the first."""
+        return self._put_pieces(chunk, len(chunk.data), [chunk.data])
+
+    def _put_pieces(
+        self, chunk: StoredChunk, length: int, data: Iterable[bytes | memoryview]
+    ) -> int:
         text = len(chunk.compression)
         head = formats.CHUNK.pack(chunk.start, chunk.end, chunk.size, chunk.crc, text)
-        head += chunk.compression + formats.UINT64.pack(len(chunk.data))
+        head += chunk.compression + formats.UINT64.pack(length)
         offset = self._stream.tell()
-        self._stream.write(HEAD.pack(Opcode.CHUNK, len(head) + len(chunk.data)) + head)
-        self._stream.write(chunk.data)
+        self._stream.write(HEAD.pack(Opcode.CHUNK, len(head) + length) + head)
+        for piece in data:
+            self._stream.write(piece)
         first = self._stream.tell()
         index_offsets = {}
         for channel, entries in chunk.entries.items():
@@ -332,7 +358,7 @@ class ChunkWriter:
                 chunk_length=first - offset,
                 chunk_start_offset=offset,
                 compression=chunk.compression.decode(),
-                compressed_size=len(chunk.data),
+                compressed_size=length,
                 message_end_time=chunk.end,
                 message_index_length=self._stream.tell() - first,
                 message_index_offsets=index_offsets,

@@ -6,6 +6,7 @@ from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +19,17 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.chunk_table import LAST_TIME, not_empty
+from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, by_start, not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
-from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_HEAD
+from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
+from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
 
 _LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
+_LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
+_STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
@@ -64,9 +68,16 @@ def read_chunks(
         If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
         is of a channel that no sound chunk defines.
     """
-    if not len(chunks):
-        return []
-    batch = _read(file, chunks)
+    chunks = in_parts(file, chunks)
+    apart = (chunks["part"] >= 0) | (chunks["size"] > LIMIT)
+    read = [] if apart.all() else _messages(file, _read(file, chunks[~apart]), topics)
+    for number in np.flatnonzero(apart).tolist():
+        read += _read_part(file, chunks[number : number + 1], topics)
+    return read
+
+
+def _messages(file: LogFile, batch: "_Batch", topics: TopicChoice | None) -> list[RawMessages]:
+    """Find the messages of some topics in chunks that were read."""
     indices = batch.indices(_other_channels(file, topics))
     if not indices.keys() <= file.channels.keys():
         _define(file, indices.keys())
@@ -104,9 +115,108 @@ def read_in_batches(
         If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
         is of a channel that no sound chunk defines.
     """
+    chunks = in_parts(file, chunks)
     batches = np.cumsum(chunks["size"] + chunks["length"]) // BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
         yield read_chunks(file, batch, topics)
+
+
+def in_parts(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
+    """Divide chunks that are larger than `LIMIT` into parts, and compare them with their checksums.
+
+    Parameters
+    ----------
+    file : LogFile
+        Log of the chunks. Channels and schemas that the divided ones define are added to its own.
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], of dtype `CHUNKS`
+        By start time, if there is a large one; a message that is larger than `LIMIT` is a part.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, or one of the large chunks is damaged.
+    """
+    large = (chunks["part"] < 0) & (chunks["index_length"] >= 0)
+    large &= (chunks["size"] > LIMIT) | (chunks["length"] > LIMIT)
+    if not large.any():
+        return chunks
+    divided = [_parts(file, int(offset)) for offset in chunks["offset"][large].tolist()]
+    return by_start(np.concatenate([chunks[~large], *divided]))
+
+
+def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
+    """Divide a large chunk into parts, and add what it defines to the file."""
+    rows = array("q")
+    try:
+        for part in read_parts(ContentStream(file.read, offset)):
+            if part.size > LIMIT:
+                opcode, _, channel, _, time, _ = MESSAGE.unpack(part.content)
+                if opcode != Opcode.MESSAGE:
+                    continue
+                channels, times = np.array([channel]), np.array([time], np.uint64)
+            else:
+                _add_definitions(file, part.content, part.others)
+                heads = gather_heads(part.content, np.frombuffer(part.messages, np.int64))
+                channels, times = heads["channel"], heads["log_time"].astype(np.uint64)
+            if not len(times):
+                continue
+            span = int(times.min()), int(times.max())
+            file.late |= span[1] > LAST_TIME
+            ids = file.channel_set(frozenset(np.unique(channels).tolist()))
+            rows.extend([offset, 0, 0, part.size, *(min(time, LAST_TIME) for time in span)])
+            rows.extend([ids, part.first])
+    except (McapError, UnicodeDecodeError) as error:
+        raise file.damaged(offset, error) from error
+    return np.frombuffer(rows, CHUNKS)
+
+
+def _read_part(
+    file: LogFile, row: NDArray[np.void], topics: TopicChoice | None
+) -> list[RawMessages]:
+    """Read the messages of a part of a large chunk; one that is too large is left out."""
+    offset, first, size = (int(row[name][0]) for name in ("offset", "part", "size"))
+    if size > LIMIT:
+        (channel,) = file.channel_sets[int(row["channels"][0])] or _channel_of(file, offset)
+        topic = file.channels[channel].topic if channel in file.channels else f"channel {channel}"
+        if is_chosen(topic, topics):
+            warnings.warn(
+                HearthlogWarning(_LARGE, f"{file.path}: {topic}", each=True), stacklevel=2
+            )
+        return []
+    if topics is not None and not callable(topics) and not topics:
+        return []
+    try:
+        content = _part_content(file, offset, first, size)
+    except McapError as error:
+        raise file.damaged(offset, error) from error
+    if len(content) < size:
+        raise file.damaged(offset, "a chunk is shorter than it was")
+    row = row.copy()
+    row["index_length"] = -1  # so that its records are gone through
+    buffer, start = np.frombuffer(content, np.uint8), np.zeros(1, np.int64)
+    return _messages(file, _Batch(file, row, np.array([size]), buffer, buffer, start), topics)
+
+
+def _channel_of(file: LogFile, offset: int) -> tuple[int]:
+    """Read the channel of a message outside of chunks."""
+    return (MESSAGE.unpack(file.read(offset, MESSAGE.size))[2],)
+
+
+def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
+    """Decompress a part of a large chunk; where the last one ended, decompression goes on."""
+    with file.lock:
+        before = [s for s in file.streams if s.offset == offset and s.position <= first]
+        stream = max(before, key=attrgetter("position"), default=None)
+        if stream is None:
+            stream = ContentStream(file.read, offset)
+        others = [other for other in file.streams if other is not stream]
+        file.streams = [*others[1 - _STREAMS :], stream]
+        stream.skip(first - stream.position)
+        return stream.read(size)
 
 
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
@@ -262,6 +372,18 @@ def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
     return chunk_head(content), content
 
 
+def _add_definitions(
+    file: LogFile, content: bytes | memoryview, places: Sequence[tuple[int, int]]
+) -> None:
+    """Add the schemas and channels to a file that are at some places of a chunk."""
+    for start, end in places:
+        record = parse(content[start], bytes(content[start + HEAD.size : end]))
+        if isinstance(record, records.Schema):
+            file.schemas.setdefault(record.id, record)
+        elif isinstance(record, records.Channel):
+            file.channels.setdefault(record.id, record)
+
+
 def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.void]]:
     """Go through the records of a chunk: add its definitions to the file, make its index."""
     starts = array("q")
@@ -269,11 +391,7 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
         if opcode == Opcode.MESSAGE and end - start >= MESSAGE_HEAD.itemsize:
             starts.append(start)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            record = parse(opcode, bytes(content[start + HEAD.size : end]))
-            if isinstance(record, records.Schema):
-                file.schemas.setdefault(record.id, record)
-            elif isinstance(record, records.Channel):
-                file.channels.setdefault(record.id, record)
+            _add_definitions(file, content, [(start, end)])
     made = index_messages(content, np.frombuffer(starts, np.int64))
     return {channel: np.frombuffer(rows, formats.INDEX_ENTRIES) for channel, rows in made.items()}
 

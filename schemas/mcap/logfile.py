@@ -1,6 +1,7 @@
 """What one log consists of, from its index, or by walking from record to record."""
 
 import struct
+import threading
 import warnings
 import zlib
 from array import array
@@ -35,8 +36,9 @@ from hearthlog.schemas.mcap.formats import (
     UINT16,
     not_mcap,
 )
+from hearthlog.schemas.mcap.large_chunks import ContentStream
 from hearthlog.schemas.mcap.record_walk import read_records, walk_records
-from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
+from hearthlog.schemas.mcap.records import LIMIT, TOO_LARGE, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
@@ -99,6 +101,8 @@ class LogFile:
         self.chunks = np.empty(0, CHUNKS)
         self._end = len(MAGIC)  # of the records that were scanned
         self._sets: dict[frozenset[int], int] = {}
+        self.streams: list[ContentStream] = []  # of large chunks that are being read
+        self.lock = threading.Lock()  # of `streams`
         try:
             self._check_magic()
             if indexed:
@@ -190,7 +194,8 @@ class LogFile:
             If it is larger than `LIMIT`, damaged, or cannot be read.
         """
         if location.length > LIMIT:
-            raise self.damaged(location.offset, "a record claims to be too large")
+            what = "an attachment" if location.opcode == Opcode.ATTACHMENT else "a record"
+            raise LogError(f"{self.path}: {what} at byte {location.offset}: {TOO_LARGE}")
         content = self.read(location.offset, location.length)[HEAD.size :]
         try:
             return parse(location.opcode, content)
@@ -376,7 +381,7 @@ class LogFile:
         if row.late:
             self.late = True
             row.end = self._last_time(row)
-        rows.extend([*row.numbers(), self._channel_set(frozenset(row.channels))])
+        rows.extend([*row.numbers(), self.channel_set(frozenset(row.channels)), -1])
 
     def _last_time(self, row: ChunkRow) -> int:
         """Find the last log time of a chunk up to `LAST_TIME` by the message indexes behind it."""
@@ -407,7 +412,8 @@ class LogFile:
         except McapError as error:
             raise self.damaged(location.offset, error) from error
 
-    def _channel_set(self, ids: frozenset[int]) -> int:
+    def channel_set(self, ids: frozenset[int]) -> int:
+        """Return the place of a set of channels in `channel_sets`, where it is added if need be."""
         if ids not in self._sets:
             self._sets[ids] = len(self.channel_sets)
             self.channel_sets.append(ids)

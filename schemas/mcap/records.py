@@ -1,7 +1,7 @@
 """MCAP at the level of its records: framing, parsing and decompression, within limits.
 
 A file may come from anywhere: no length that it claims is believed before it is checked, and no
-record or chunk may be larger than `LIMIT`.
+record may be larger than `LIMIT`. A larger chunk is read in parts.
 """
 
 import struct
@@ -19,7 +19,8 @@ from mcap.records import McapRecord
 
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER_SIZE, HEAD, MAGIC, UINT64
 
-LIMIT = 100 << 20  # bytes; ours are below 2 MiB
+LIMIT = 100 << 20  # bytes that are held at once; ours are below 2 MiB
+TOO_LARGE = f"it is larger than hearthlog reads at once ({LIMIT >> 20} MiB)"
 _CLASSES: dict[int, Any] = {
     Opcode.HEADER: records.Header,
     Opcode.FOOTER: records.Footer,
@@ -136,6 +137,27 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
     McapError
         If it is shorter than it claims, or claims records larger than `LIMIT`.
     """
+    head = begun_chunk_head(content)
+    if head.data.stop > len(content):
+        raise McapError("a chunk is shorter than it claims")
+    if head.size > LIMIT:
+        raise McapError(TOO_LARGE)
+    return head
+
+
+def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
+    """Read the head of a chunk from the beginning of its content, whatever it claims.
+
+    Parameters
+    ----------
+    content : bytes-like
+        The chunk's record, without opcode and length, at least up to its compressed records.
+
+    Raises
+    ------
+    McapError
+        If it is too short.
+    """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)
         first = CHUNK.size + length
@@ -144,10 +166,6 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
     except struct.error as error:
         raise McapError("a chunk is too short") from error
     first += UINT64.size
-    if first + stored > len(content):
-        raise McapError("a chunk is shorter than it claims")
-    if size > LIMIT:
-        raise McapError("a chunk claims to be too large")
     return ChunkHead(start, end, size, crc, compression, slice(first, first + stored))
 
 

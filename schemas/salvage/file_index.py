@@ -30,6 +30,8 @@ from hearthlog.schemas.mcap.records import read_footer
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
+    LargeAttachment,
+    LargeChunk,
     UnknownRecord,
     WholeAttachment,
     WholeChunk,
@@ -184,11 +186,17 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int, *, moved: bo
 
 
 def _name_of(
-    record: records.MetadataIndex | records.AttachmentIndex | records.Metadata | WholeAttachment,
+    record: records.MetadataIndex
+    | records.AttachmentIndex
+    | records.Metadata
+    | WholeAttachment
+    | LargeAttachment,
 ) -> str:
     if isinstance(record, records.MetadataIndex | records.Metadata):
         return f"the metadata {record.name!r}"
-    name = record.index_record.name if isinstance(record, WholeAttachment) else record.name
+    if isinstance(record, WholeAttachment | LargeAttachment):
+        record = record.index_record
+    name = record.name
     return f"the attachment {name!r}"
 
 
@@ -241,9 +249,9 @@ class MetRecords:
             Of any kind.
         """
         record = whole.record
-        if isinstance(record, records.Metadata | WholeAttachment):
+        if isinstance(record, records.Metadata | WholeAttachment | LargeAttachment):
             self._names[_name_of(record)] -= 1
-        elif isinstance(record, WholeChunk):
+        elif isinstance(record, WholeChunk | LargeChunk):
             self._meet_chunk(whole, record.stored)
 
     def _meet_chunk(self, whole: WholeRecord, chunk: StoredChunk) -> None:

@@ -6,6 +6,7 @@ add up to the length before it, or to less: the format allows that records grow 
 
 import struct
 import zlib
+from collections import Counter, defaultdict
 from contextlib import suppress
 
 import numpy as np
@@ -15,16 +16,35 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.mcap.chunk_records import index_messages
 from hearthlog.schemas.mcap.chunk_table import LAST_TIME
-from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES, MAGIC, MESSAGE_INDEX, UINT64
-from hearthlog.schemas.mcap.raw_messages import gather_heads
+from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.mcap.formats import (
+    CHUNK,
+    HEAD,
+    INDEX_ENTRIES,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    UINT32,
+    UINT64,
+)
+from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
-from hearthlog.schemas.salvage.whole_records import WholeChunk, WholeRecord
+from hearthlog.schemas.salvage.whole_records import (
+    LargeAttachment,
+    LargeChunk,
+    WholeChunk,
+    WholeRecord,
+)
 from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 _VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # have lengths inside
+_LARGE = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT}  # may be larger than `LIMIT`
+_ATTACHMENT_HEAD = 1 << 16  # bytes in which names and times of a large attachment end
+_PIECE = 1 << 20  # bytes
 _UNKNOWN_CHAIN = 16  # records of unknown kinds in a row
 _LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format may add
 
@@ -169,7 +189,9 @@ class RecordVerifier:
                 return bool(SHORTEST[data[0]] < UNKNOWN) or MAGIC.startswith(data)
             opcode, length = HEAD.unpack(data)
             if opcode <= Opcode.DATA_END or data == MAGIC[: HEAD.size]:
-                return bool(SHORTEST[opcode] <= length <= LIMIT) or data.startswith(MAGIC)
+                fits = opcode in _LARGE and offset + HEAD.size + length <= self.end
+                most = self.end if fits else LIMIT
+                return bool(SHORTEST[opcode] <= length <= most) or data.startswith(MAGIC)
             offset += HEAD.size + length  # it is known by what follows alone
             if offset >= self.end:
                 return offset == self.end
@@ -209,6 +231,10 @@ class RecordVerifier:
         outer, inner = self.ends(offset)
         end = outer if self._is_padded(inner, outer) else inner
         wrong = "" if end == outer else "the length of a record"
+        if opcode == Opcode.ATTACHMENT and inner == outer and inner - offset > LIMIT:
+            if outer > self.end or not self.plausible(outer):
+                raise McapError("a record claims to be longer than the file")
+            return WholeRecord(offset, outer, self._large_attachment(offset, outer))
         if inner - offset > LARGEST[opcode]:
             raise McapError("a record claims to be too large")
         if inner > self.end:
@@ -259,8 +285,10 @@ class RecordVerifier:
         exact = padded or (opcode == Opcode.CHUNK and inner == outer)
         if not crc and not exact:
             raise McapError("the head of a chunk is damaged")
-        if size > LIMIT:
-            raise McapError("a chunk claims to be too large")
+        if max(size, stored) > LIMIT:
+            if not exact or outer > self.end:
+                raise McapError("the head of a chunk is damaged")
+            return WholeRecord(offset, outer, self._large_chunk(offset))
         compression = head[name : first - UINT64.size]
         claim = ChunkHead(start, end, size, 0, compression, slice(None))
         # One of two lengths may be wrong. Decompressors overlook what follows their data, so the
@@ -281,27 +309,71 @@ class RecordVerifier:
         span = whole_records.span_of(entries)
         agrees = not entries or span == (start, end)
         wrong = "" if exact and agrees else "the head of a chunk"
-        late: dict[int, int] = {}
-        if span[1] > LAST_TIME:
-            times = gather_heads(content, messages)["log_time"].astype(np.uint64)
-            starts = messages[times > LAST_TIME]
-            late = {
-                channel: len(rows) // INDEX_ENTRIES.itemsize
-                for channel, rows in index_messages(content, starts).items()
-            }
-            content = whole_records.without_messages(content, starts)
-            messages, others = whole_records.split_content(content)
-            entries = index_messages(content, messages)
-            span = whole_records.span_of(entries)
         definitions = whole_records.read_definitions(content, others)
-        if late:
-            chunk = compress_chunk(memoryview(content), span, entries)._replace(raw=None)
-        else:
-            chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
-        whole = WholeChunk(chunk, definitions, leading, late)
+        stored_chunk = StoredChunk(compression, data, size, checksum, *span, entries)
+        whole = WholeChunk(stored_chunk, definitions, leading)
+        if span[1] > LAST_TIME:
+            whole = whole_records.without_late(whole, content, messages)
         behind = outer if padded else offset + first + number
         return WholeRecord(offset, behind, whole, wrong, proved=bool(crc) or agrees)
+
+    def _large_chunk(self, offset: int) -> LargeChunk:
+        """Go through a chunk that is too large for the memory."""
+        stream = ContentStream(self.read, offset)
+        entries: defaultdict[int, bytearray] = defaultdict(bytearray)
+        definitions: list[Definition] = []
+        unread: Counter[int] = Counter()
+        leading = 0
+        for part in read_parts(stream):
+            self.inner += len(part.messages) + len(part.others)
+            if self.inner > (1 << 20) + 4 * self.end:
+                raise McapError("the file holds more messages than one of its size can")
+            if part.size > LIMIT:
+                opcode, _, channel, _, time, _ = MESSAGE.unpack(part.content)
+                if opcode == Opcode.MESSAGE:
+                    entries[channel] += INDEX_ENTRY.pack(time, part.first)
+                    unread[channel] += 1
+                continue
+            starts = np.frombuffer(part.messages, np.int64)
+            others = np.array([start for start, _ in part.others], np.int64)
+            if not entries:
+                leading += int((others < starts[0]).sum()) if len(starts) else len(others)
+            definitions += whole_records.read_definitions(part.content, others)
+            for channel, rows in index_messages(part.content, starts).items():
+                moved = np.frombuffer(rows, INDEX_ENTRIES).copy()
+                moved["offset"] += part.first
+                entries[channel] += moved.tobytes()
+        head = stream.head
+        span = whole_records.span_of(entries)
+        stored = StoredChunk(head.compression, b"", head.size, stream.check(), *span, entries)
+        first = offset + HEAD.size
+        data = first + head.data.start, first + head.data.stop
+        return LargeChunk(stored, data, definitions, leading, unread)
+
+    def _large_message(self, offset: int, end: int) -> LargeChunk:
+        """Make a chunk of a message outside of chunks that is too large to be read."""
+        _, _, channel, _, time, _ = MESSAGE.unpack(self.read(offset, MESSAGE.size))
+        if time > LAST_TIME:
+            raise McapError("a log time is out of range")
+        entries = {channel: INDEX_ENTRY.pack(time, 0)}
+        stored = StoredChunk(b"", b"", end - offset, self._crc(offset, end), time, time, entries)
+        return LargeChunk(stored, (offset, end), [], 0, Counter({channel: 1}))
+
+    def _large_attachment(self, offset: int, end: int) -> LargeAttachment:
+        """Check an attachment that is too large to be read."""
+        index = whole_records.index_attachment(self.read(offset, _ATTACHMENT_HEAD))
+        (crc,) = UINT32.unpack(self.read(end - UINT32.size, UINT32.size))
+        if crc not in {0, self._crc(offset + HEAD.size, end - UINT32.size)}:
+            raise McapError("an attachment has another checksum than it claims")
+        return LargeAttachment(index, (offset, end))
+
+    def _crc(self, start: int, end: int) -> int:
+        """Return the checksum of some bytes of the file."""
+        crc = 0
+        for place in range(start, end, _PIECE):
+            crc = zlib.crc32(self.read(place, min(_PIECE, end - place)), crc)
+        return crc
 
     def _unknown(self, offset: int, opcode: int, length: int) -> WholeRecord:
         """Read a record of a kind that MCAP leaves to others, unless it was one of a known kind."""
@@ -352,7 +424,7 @@ class RecordVerifier:
     def _message(self, offset: int, chained: int) -> WholeRecord:
         opcode, length = self.head(offset)
         end = offset + HEAD.size + length
-        if length > LIMIT:
+        if length > LIMIT and chained > 1:
             raise McapError("a record claims to be too large")
         if end > self.end:
             raise McapError("a record claims to be longer than the file")
@@ -366,6 +438,8 @@ class RecordVerifier:
             if opcode != Opcode.MESSAGE:
                 break
             follower += HEAD.size + length
+        if end - offset > LIMIT:
+            return WholeRecord(offset, end, self._large_message(offset, end))
         raw = self.read(offset, end - offset)
         return WholeRecord(offset, end, whole_records.read_message(raw))
 

@@ -10,10 +10,11 @@ from typing import BinaryIO
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, stem
-from hearthlog.schemas.mcap.chunks import read_in_batches
+from hearthlog.schemas.mcap.chunks import in_parts, read_in_batches
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import MAGIC, not_mcap
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, TopicRecovery
@@ -159,12 +160,16 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
     LogError
         If it is damaged or cannot be read, or does not hold the messages that were recovered.
     """
-    expected = Counter({name: topic.messages + topic.stated for name, topic in topics.items()})
+    expected = Counter(
+        {name: each.messages + each.stated - each.unread for name, each in topics.items()}
+    )
     counts: Counter[str] = Counter()
     with LogFile(path) as file:
         for location in file.record_locations:
-            file.record(location)
-        for batch in read_in_batches(file, file.chunks):
+            if location.length <= LIMIT:
+                file.record(location)
+        chunks = in_parts(file, file.chunks)
+        for batch in read_in_batches(file, chunks[chunks["size"] <= LIMIT]):
             for messages in batch:
                 counts[messages.channel.topic] += len(messages)
     if counts != expected:

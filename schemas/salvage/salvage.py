@@ -9,11 +9,13 @@ the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, 
 """
 
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, Self
 
+import numpy as np
 from mcap import records
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -29,7 +31,10 @@ from hearthlog.schemas.salvage.index_claims import IndexClaims
 from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
+    LargeAttachment,
+    LargeChunk,
     UnknownRecord,
+    Whole,
     WholeAttachment,
     WholeChunk,
     WholeRecord,
@@ -45,7 +50,7 @@ _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADAT
 
 _LATE = "log times after the year 2262"
 
-Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk | UnknownRecord
+Piece = records.Metadata | records.Message | Whole
 
 
 class _Places(NamedTuple):
@@ -143,7 +148,7 @@ class Salvage:
 
         Yields
         ------
-        mcap.records.Metadata, mcap.records.Message, WholeAttachment, WholeChunk or UnknownRecord
+        mcap.records.Metadata, mcap.records.Message, or what is in `Whole`
             Chunks have been compared with their checksums, and have the message index that they
             should have. They hold no messages of undefined channels: where there are such, the
             other messages come one by one.
@@ -185,7 +190,7 @@ class Salvage:
                 self._claims.add_index(channel, entries)
             return
         self._claims.close(whole.offset)
-        if isinstance(whole.record, WholeChunk):
+        if isinstance(whole.record, WholeChunk | LargeChunk):
             self._claims.add_chunk(whole.end, whole.record.stored)
 
     def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> WholeRecord:
@@ -212,12 +217,12 @@ class Salvage:
     def _count_kept(self, whole: WholeRecord) -> None:
         """Count the bytes that will be kept of a record; raise McapError if they are too many."""
         record, size = whole.record, _KEPT_EACH
-        if isinstance(record, WholeChunk):
+        if isinstance(record, WholeChunk | LargeChunk):
             size += 16 * len(record.stored.entries)
             size += sum(_size(definition) for definition in record.definitions)
         elif isinstance(record, Definition):
             size += _size(record)
-        elif isinstance(record, WholeAttachment):
+        elif isinstance(record, WholeAttachment | LargeAttachment):
             size += len(record.index_record.name) + len(record.index_record.media_type)
         elif isinstance(record, records.Metadata):
             size += len(record.name)
@@ -355,13 +360,40 @@ class Salvage:
         elif isinstance(record, WholeChunk):
             self._ended, self._astray, self._has_chunks = False, False, True
             yield from self._take_chunk(record, whole)
+        elif isinstance(record, LargeChunk):
+            self._ended = False
+            self._has_chunks |= record.data[0] != whole.offset
+            yield from self._take_large(record, whole)
         elif isinstance(record, records.Message):
             self._ended = False
             yield from self._take_message(record, whole)
-        elif isinstance(record, records.Metadata | WholeAttachment) or (
+        elif isinstance(record, records.Metadata | WholeAttachment | LargeAttachment) or (
             isinstance(record, UnknownRecord) and not self._ended
         ):
             yield record
+
+    def _take_large(self, chunk: LargeChunk, whole: WholeRecord) -> Iterator[Piece]:
+        """Yield a chunk that is copied as it is, if all its channels are defined."""
+        for record in chunk.definitions:
+            if not self.definitions.add(record):
+                self.definitions.doubt(record)
+        late: Counter[int] = Counter()
+        unknown = 0
+        for number in chunk.stored.entries:
+            times = chunk.stored.times(number).astype(np.uint64)
+            late[number] = int((times > LAST_TIME).sum())
+            if not self.definitions.defines(number):
+                span = int(times.min()), int(times.max())
+                self._damages.add_unnamed(number, len(times), span, whole)
+                unknown += 1
+        self._add_late(whole, +late)
+        if chunk.stored.entries and not unknown:
+            yield chunk
+
+    def stored(self, start: int, end: int) -> Iterator[bytes]:
+        """Read some bytes of the file, a megabyte at a time."""
+        for place in range(start, end, _WINDOW):
+            yield self._file.read(place, min(_WINDOW, end - place))
 
     def _take_message(self, message: records.Message, whole: WholeRecord) -> Iterator[Piece]:
         """Yield a message outside of chunks, if its channel is defined and its time can be read."""

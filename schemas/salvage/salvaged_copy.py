@@ -5,11 +5,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO, Protocol
 
+import numpy as np
 from mcap.records import Channel, Header, Message
 
 from hearthlog.schemas.logs import provenance, rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.messages.gaps import LOG_DAMAGED, encode_gap
 from hearthlog.schemas.progress import Progress
@@ -18,6 +20,8 @@ from hearthlog.schemas.salvage.gap_channel import gap_channel
 from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames
 from hearthlog.schemas.salvage.salvage import Piece, Salvage
 from hearthlog.schemas.salvage.whole_records import (
+    LargeAttachment,
+    LargeChunk,
     UnknownRecord,
     WholeAttachment,
     WholeChunk,
@@ -34,6 +38,7 @@ class TopicRecovery:
     stated: int = 0  # gaps that were not in the log, and say what could not be saved
     expected: int | None = None  # messages that there should be, if the index of the log says so
     end: int = 0  # log time of the last message, in nanoseconds
+    unread: int = 0  # of the messages: copied, and larger than is read
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,7 @@ class SalvagedCopy:
         self._written: set[tuple[type, int]] = set()
         self._counts: Counter[int] = Counter()
         self._stated: Counter[int] = Counter()  # gaps that were not in the log
+        self._unread: Counter[int] = Counter()
         self._ends: dict[int, int] = {}
         self._span = (1 << 63, 0)
 
@@ -166,6 +172,7 @@ class SalvagedCopy:
             topic = topics.setdefault(channel.topic, TopicRecovery(kind))
             topic.messages += self._counts[number] - self._stated[number]
             topic.stated += self._stated[number]
+            topic.unread += self._unread[number]
             topic.end = max(topic.end, self._ends.get(number, 0))
             if expected is not None and not self._drops(number):
                 topic.expected = (topic.expected or 0) + expected.get(number, 0)
@@ -194,10 +201,12 @@ class SalvagedCopy:
             for lost in self._search.before(piece):
                 self._add_gap(lost)
             self._add_message(piece)
+        elif isinstance(piece, LargeChunk):
+            self._add_large(piece)
         elif isinstance(piece, UnknownRecord):
             self._writer.copy_record(piece.record)
-        elif isinstance(piece, WholeAttachment):
-            self._writer.copy_attachment(piece.record, piece.index_record)
+        elif isinstance(piece, WholeAttachment | LargeAttachment):
+            self._writer.copy_attachment(self._record_of(piece), piece.index_record)
         elif piece.name == provenance.METADATA and self._selection is not None:
             self._writer.add_metadata(piece.name, {**piece.metadata, **self._selection.note})
         elif piece.name == rosbag2.METADATA:
@@ -225,6 +234,23 @@ class SalvagedCopy:
         for number in kept:
             times = chunk.times(number)
             self._count(number, len(times), int(times.min()), int(times.max()))
+
+    def _record_of(self, piece: WholeAttachment | LargeAttachment) -> Iterable[bytes]:
+        if isinstance(piece, WholeAttachment):
+            return [piece.record]
+        return self._salvage.stored(*piece.data)
+
+    def _add_large(self, piece: LargeChunk) -> None:
+        """Copy a chunk that was not opened."""
+        chunk, (start, end) = piece.stored, piece.data
+        self._define(chunk.entries, piece.definitions[: piece.leading])
+        self._writer.copy_large_chunk(chunk, end - start, self._salvage.stored(start, end))
+        self._unread.update(piece.unread)
+        for number in chunk.entries:
+            times = chunk.times(number)
+            times = times[times.astype(np.uint64) <= LAST_TIME]
+            if len(times):
+                self._count(number, len(times), int(times.min()), int(times.max()))
 
     def _drops(self, number: int) -> bool:
         if self._selection is None:

@@ -1,5 +1,6 @@
 """Records of a damaged file that are whole, and what is in them."""
 
+import struct
 import zlib
 from array import array
 from collections.abc import Iterator, Mapping
@@ -12,11 +13,13 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.mcap.chunk_records import iterate_records
+from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
+from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, INDEX_ENTRIES, MESSAGE, UINT32, UINT64
+from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import parse
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 
 _DEFINITIONS_LIMIT = 1 << 19
@@ -29,6 +32,23 @@ class WholeChunk(NamedTuple):
     definitions: list[Definition]
     leading: int  # how many of them stand before the first message
     late: Mapping[int, int] = {}  # by channel: messages that were left out of it for their log time
+
+
+class LargeChunk(NamedTuple):
+    """A chunk that is too large to be read at once, or a message that is to become one."""
+
+    stored: StoredChunk  # without its data
+    data: tuple[int, int]  # bytes of the file at which these begin, and before which they end
+    definitions: list[Definition]
+    leading: int  # how many of them stand before the first message
+    unread: Mapping[int, int]  # by channel: messages that are themselves too large
+
+
+class LargeAttachment(NamedTuple):
+    """An attachment that is too large to be read."""
+
+    index_record: records.AttachmentIndex
+    data: tuple[int, int]  # bytes of the file at which it begins, and before which it ends
 
 
 class UnknownRecord(NamedTuple):
@@ -49,10 +69,12 @@ class WholeRecord(NamedTuple):
 
     offset: int
     end: int
-    # None for a message index
-    record: McapRecord | WholeChunk | WholeAttachment | UnknownRecord | None
+    record: "McapRecord | Whole | None"  # None for a message index
     corrected: str = ""  # what of its head was wrong
     proved: bool = True  # False: without a checksum, what is in it may be wrong instead
+
+
+Whole = WholeChunk | LargeChunk | WholeAttachment | LargeAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
@@ -91,13 +113,29 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
     return np.frombuffer(messages, np.int64), np.frombuffer(definitions, np.int64)
 
 
-def without_messages(content: bytes, starts: Int64) -> bytes:
-    """Copy the records of a chunk without the messages that begin at certain bytes, ascending."""
+def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChunk:
+    """Leave out of a chunk the messages whose log times are after `LAST_TIME`.
+
+    Parameters
+    ----------
+    chunk : WholeChunk
+    content : bytes
+        Its records, uncompressed.
+    messages : np.ndarray [shape=(m,)], int64
+        As `split_content` returns it.
+    """
+    times = gather_heads(content, messages)["log_time"].astype(np.uint64)
+    starts = messages[times > LAST_TIME]
+    late = index_messages(content, starts)
     parts, place = [], 0
     for start in starts.tolist():
         parts.append(content[place:start])
         place = start + HEAD.size + HEAD.unpack_from(content, start)[1]
-    return b"".join([*parts, content[place:]])
+    content = b"".join([*parts, content[place:]])
+    entries = index_messages(content, split_content(content)[0])
+    stored = compress_chunk(memoryview(content), span_of(entries), entries)._replace(raw=None)
+    counts = {channel: len(rows) // INDEX_ENTRIES.itemsize for channel, rows in late.items()}
+    return chunk._replace(stored=stored, late=counts)
 
 
 def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
@@ -133,12 +171,12 @@ def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
     return definitions
 
 
-def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
+def span_of(entries: Mapping[int, bytes | bytearray]) -> tuple[int, int]:
     """Find the first and the last log time of a message index.
 
     Parameters
     ----------
-    entries : mapping of int to bytes
+    entries : mapping of int to bytes-like
         By channel: rows of dtype `INDEX_ENTRIES`.
 
     Returns
@@ -207,10 +245,31 @@ def read_attachment(raw: bytes) -> WholeAttachment:
     (crc,) = UINT32.unpack(record[-UINT32.size :])
     if crc not in {0, zlib.crc32(record[HEAD.size : -UINT32.size])}:
         raise McapError("an attachment has another checksum than it claims")
-    log_time, create_time, name = ATTACHMENT.unpack_from(record, HEAD.size)
-    first = HEAD.size + ATTACHMENT.size + name
-    (media,) = UINT32.unpack_from(record, first)
+    return WholeAttachment(raw, index_attachment(raw))
+
+
+def index_attachment(raw: bytes) -> records.AttachmentIndex:
+    """Make the index record of an attachment, with an offset and a length of 0.
+
+    Parameters
+    ----------
+    raw : bytes
+        The record up to the data of the attachment, or more of it.
+
+    Raises
+    ------
+    McapError
+        If the record ends before that.
+    UnicodeDecodeError
+        If a text in it is not UTF-8.
+    """
+    record = memoryview(raw)
+    try:
+        log_time, create_time, name = ATTACHMENT.unpack_from(record, HEAD.size)
+        first = HEAD.size + ATTACHMENT.size + name
+        (media,) = UINT32.unpack_from(record, first)
+        (size,) = UINT64.unpack_from(record, first + 4 + media)
+    except struct.error as error:
+        raise McapError("an attachment is damaged") from error
     texts = str(record[first - name : first], "utf-8"), str(record[first + 4 :][:media], "utf-8")
-    (size,) = UINT64.unpack_from(record, first + 4 + media)
-    index = records.AttachmentIndex(0, 0, log_time, create_time, size, *texts)
-    return WholeAttachment(raw, index)
+    return records.AttachmentIndex(0, 0, log_time, create_time, size, *texts)
