@@ -5,12 +5,15 @@ import struct
 from functools import partial
 
 import pytest
+import zstandard
 from bags import INT32, STRING, T0, Bag, definition, int32, string
-from mcap.writer import IndexType
+from mcap.reader import SeekingReader
+from mcap.writer import CompressionType, IndexType
 from spliced import run
 
 import hearthlog as package
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.messages.type_definitions import message_type
 
@@ -398,3 +401,79 @@ def test_what_else_a_bag_may_be_is_named(tmp_path, hearthlog, name, start, what)
         assert (done.returncode, what in done.stderr) == (1, True)
     assert what in hearthlog("doctor", path).stdout
     assert what in hearthlog("info", path.parent).stderr
+
+
+# What is larger than fits into the memory
+
+LARGE = 101 << 20  # bytes
+
+
+@pytest.fixture(scope="module", params=[CompressionType.ZSTD, CompressionType.LZ4], ids=str)
+def large_chunk(request, tmp_path_factory):
+    """A bag with one chunk of 101 MiB: a text a second, and a number with every tenth of them."""
+    path = tmp_path_factory.mktemp("large") / "large.mcap"
+    bag = Bag(path, request.param, chunk_size=1 << 30)
+    texts, numbers = bag.channel("/s", STRING), bag.channel("/i", INT32)
+    for i in range(110):
+        bag.add(texts, string("x" * (LARGE // 109)), T0 + i * 10**9)
+        if i % 10 == 0:
+            bag.add(numbers, int32(i), T0 + i * 10**9 + 1)
+    return bag.close()
+
+
+def test_a_chunk_above_the_limit_is_read_in_parts(large_chunk, hearthlog):
+    logs = package.open_logs(large_chunk)
+    assert logs.columns("/i")["data"].tolist() == list(range(0, 110, 10))
+    pieces = [part for batch in iterate_messages([large_chunk], ["/s"]) for part in batch]
+    assert sum(map(len, pieces)) == 110
+    assert max(len(part.buffer) for part in pieces) < 16 << 20
+    assert hearthlog("doctor", large_chunk).returncode == 3
+
+
+def test_a_chunk_above_the_limit_is_recovered_as_it_is(large_chunk, hearthlog, tmp_path):
+    copy = tmp_path / "copy.mcap"
+    done = hearthlog("recover", large_chunk, "--output", copy)
+    assert (done.returncode, done.stderr) == (
+        0,
+        f"hearthlog: {large_chunk}: 121 of 121 messages saved\n",
+    )
+    assert package.open_logs(copy).columns("/i")["data"].tolist() == list(range(0, 110, 10))
+
+
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}], ids=["chunk", "no chunk"])
+def test_a_message_above_the_limit_is_left_out_and_recovered(tmp_path, hearthlog, options):
+    path, copy = tmp_path / "image.mcap", tmp_path / "copy.mcap"
+    bag = Bag(path, **options)
+    texts, images = bag.channel("/s", STRING), bag.channel("/image", "std_msgs/msg/UInt8MultiArray")
+    bag.add(texts, string("first"), T0)
+    bag.add(images, bytes(LARGE), T0 + 1)
+    bag.add(texts, string("last"), T0 + 2)
+    bag.writer.add_attachment(T0, T0, "film", "video/mp4", bytes(LARGE))
+    bag.close()
+    done = hearthlog("cat", path)
+    assert [line.rpartition("=")[2] for line in done.stdout.splitlines()] == ["first", "last"]
+    assert done.returncode == 3
+    assert done.stderr == (
+        f"hearthlog: {path}: /image: messages of more than 100 MiB are left out: larger than "
+        "hearthlog reads\n"
+    )
+    assert hearthlog("cat", path, "--topics", "/s").returncode == 0
+    done = hearthlog("recover", path, "--output", copy)
+    assert (done.returncode, done.stderr) == (0, f"hearthlog: {path}: 3 of 3 messages saved\n")
+    with copy.open("rb") as stream:
+        reader = SeekingReader(stream, record_size_limit=1 << 30)
+        sizes = [len(message.data) for _, _, message in reader.iter_messages()]
+        assert [len(each.data) for each in reader.iter_attachments()] == [LARGE]
+    assert sorted(sizes) == sorted([len(string("first")), LARGE, len(string("last"))])
+
+
+def test_a_chunk_that_claims_to_be_large_and_is_not_is_damaged(tmp_path, hearthlog):
+    path = tmp_path / "claim.mcap"
+    head = MAGIC + record(1, text("ros2") + text("x")) + defined(1, "/i") + loose(1, 7, T0)
+    content = zstandard.compress(bytes(LARGE))
+    chunk = struct.pack("<QQQII", T0, T0, LARGE, 0, 4) + b"zstd"
+    chunk += struct.pack("<Q", len(content)) + content
+    path.write_bytes(head + record(6, chunk) + record(15, bytes(4)) + record(2, bytes(20)) + MAGIC)
+    done = hearthlog("cat", path)
+    assert (done.returncode, "damaged at byte" in done.stderr) == (1, True)
+    assert hearthlog("recover", path, "--output", tmp_path / "copy.mcap").returncode == 3

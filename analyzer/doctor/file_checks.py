@@ -162,6 +162,7 @@ def _walk(
     for record in walk:
         if walk.losses > losses:
             losses = walk.losses
+            data.definitions.incomplete |= walk.skipped
             _hand_on([*data.finish(cut=True), None], checks)
         if (
             summary is None

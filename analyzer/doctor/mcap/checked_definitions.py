@@ -88,6 +88,7 @@ class CheckedDefinitions(Definitions):
         super().__init__()
         self.ours = ours  # whether hearthlog made this file
         self.profile = ""  # of the header
+        self.incomplete = False  # whether there may be more, in what was too large to be checked
         self._size = 0
         self._findings = findings
 
@@ -158,7 +159,8 @@ class CheckedDefinitions(Definitions):
         if not self._keeps(size, offset):
             return False
         self.add(channel)
-        if channel.schema_id and channel.schema_id not in self.schemas:
+        is_defined = channel.schema_id in {0, *self.schemas}
+        if not is_defined and not self.incomplete:
             what = f"{topic} has schema {channel.schema_id}, which is not defined before it"
             error("schema-missing", what, RECOVER, offset=offset)
         if not channel.message_encoding:

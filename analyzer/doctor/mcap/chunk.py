@@ -19,7 +19,13 @@ from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress
+from hearthlog.schemas.mcap.records import (
+    LIMIT,
+    ChunkHead,
+    begun_chunk_head,
+    chunk_head,
+    decompress,
+)
 
 
 class Chunk:
@@ -57,6 +63,12 @@ class Chunk:
         self._index_offsets: list[tuple[int, int]] = []  # channel, and offset of its message index
         self._index_length = 0
         try:
+            self._head = begun_chunk_head(record.content)
+            if self._head.size > LIMIT:
+                what = f"a chunk of {self._head.size} bytes, uncompressed: not checked"
+                findings.warning("too-large", what, offset=self.offset)
+                definitions.incomplete = True
+                return
             self._head = chunk_head(record.content)
             unchecked = self._head._replace(crc=0)  # a wrong checksum has a rule of its own
             self._records = decompress(unchecked, record.content)
@@ -297,6 +309,8 @@ def check_channels(
     numbers = content.heads["channel"]
     for channel in np.flatnonzero(np.bincount(numbers)).tolist():
         if channel not in definitions.channels:
+            if definitions.incomplete:
+                continue
             what = f"messages of channel {channel}, which is not defined"
             findings.error("channel-missing", what, RECOVER, offset=offset)
         elif channel in new and (content.starts[numbers == channel] < new[channel]).any():

@@ -195,6 +195,8 @@ class DataSection:
             kept.setdefault(name, []).append(content)
 
     def _add_index(self, record: Record) -> None:
+        if self._chunk is None and self.definitions.incomplete:
+            return  # its chunk was too large
         if self._chunk is None:
             what = "a message index that does not stand behind a chunk"
             self.findings.error("message-index-place", what, RECOVER, offset=record.offset)

@@ -46,6 +46,7 @@ class RecordWalk:
         self, source: ByteSource, findings: Findings, offsets: Sequence[int], *, finished: bool
     ) -> None:
         self.losses = 0  # how often something was passed over
+        self.skipped = False  # whether something was too large to be checked
         self._source = source
         self._findings = findings
         self._finished = finished
@@ -69,6 +70,7 @@ class RecordWalk:
                     return
             elif length > LIMIT:
                 self.losses += 1
+                self.skipped = True
                 what = f"a record of {length} bytes is larger than hearthlog reads: not checked"
                 self._findings.warning("too-large", what, offset=offset)
                 source.skip(offset + HEAD.size + length)
