@@ -527,6 +527,17 @@ def test_a_wrong_wish_gets_one_line(hearthlog, tmp_path, arguments, status, line
     assert done.stdout == ""
 
 
+def test_labels_as_others_write_them_are_called_by_the_nearest_name(hearthlog, tmp_path):
+    odd = [(at("09:10"), 30.0, "Türklingel", 0.9), (at("09:20"), 30.0, "=cmd|'/c calc'!A1", 0.9)]
+    write_day(tmp_path / "logs", DAY, odd, hours=[9])
+    output = tmp_path / "day.html"
+    done = hearthlog("report", tmp_path / "logs", "--day", DAY, "-o", output)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "is called other here, and 1 more so: no name of a class" in done.stderr
+    assert "Tuerklingel" in text_of(output.read_text())
+    assert "cmd" not in text_of(output.read_text())
+
+
 def test_logs_without_labels_or_without_anything_say_what_to_do(hearthlog, tmp_path):
     write_day(tmp_path / "mute", DAY, hours=[9], gaps=[(at("09:00"), HOUR, "gone")])
     done = hearthlog("report", tmp_path / "mute")

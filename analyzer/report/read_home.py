@@ -1,7 +1,7 @@
 """Read the logs of a home for a report: segments, with what a reviewer says; gaps; trouble."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,8 +21,9 @@ from hearthlog.analyzer.logs.labelling import (
 )
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.spans import Spans, common, joined, one
+from hearthlog.analyzer.marks.formats.class_names import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
-from hearthlog.models.classes import CLASS_NAME, class_name
+from hearthlog.models.classes import CLASS_NAME, OTHER, class_name
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer
@@ -104,8 +105,7 @@ def read_home(
     DataError
         If there is no such labelling, or no label at all in these days.
     LogError
-        If segments overlap, begin before 1970, are of different types, or have labels that are
-        too many or cannot be names of classes.
+        If segments overlap, begin before 1970, are of different types, or have too many labels.
     """
     layer = _layer(logs, labelling)
     home = HomeData(losses=list(logs.losses))
@@ -121,7 +121,7 @@ def read_home(
             parts.setdefault((entry.node, microphone_of(columns.topic)), []).append(columns)
         progress((i + 1) / len(labelled))
     for source in sorted(parts):
-        home.labelled[source] = home.segments[source] = _labelling(parts[source])
+        home.labelled[source] = home.segments[source] = _labelling(home, parts[source])
     marks, reviewed = _reviews(home, logs.between(since, close[1], REVIEW_LAYER), labelling)
     for source in marks.keys() | reviewed.keys():
         own = marks.get(source, [])
@@ -204,13 +204,26 @@ def _segments(
         home.lose(str(error))
 
 
-def _labelling(parts: Sequence[Columns]) -> Labelling:
+def _labelling(home: HomeData, parts: Sequence[Columns]) -> Labelling:
     """Join the segments of a microphone; each class has one name, whatever logs call it."""
     segments = join(parts)
-    labels = unified(labelling_of(segments))
+    labels = _as_classes(home, segments.topic, unified(labelling_of(segments)))
     classes = all_classes(segments.topic, (), labels.labels)
     check_labelling(segments.topic, labels.starts, classes)
     return labels
+
+
+def _as_classes(home: HomeData, topic: str, labels: Labelling) -> Labelling:
+    """Give labels that cannot be names of classes the nearest names that can."""
+    odd = sorted(label for label in set(labels.labels) if not CLASS_NAME.fullmatch(label))
+    if not odd:
+        return labels
+    near = find_class_names(odd, None).folded
+    names = {label: near.get(label, OTHER) for label in odd}
+    more = f", and {len(odd) - 1} more so" if len(odd) > 1 else ""
+    home.lose(f"{topic}: {odd[0][:64]!r} is called {names[odd[0]]} here{more}: no name of a class")
+    called = np.array([names.get(label, label) for label in labels.labels], object)
+    return replace(labels, labels=called)
 
 
 def _reviews(
