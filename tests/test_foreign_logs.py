@@ -7,12 +7,15 @@ from functools import partial
 import pytest
 import zstandard
 from bags import INT32, STRING, T0, Bag, definition, int32, string
-from mcap.reader import SeekingReader
-from mcap.writer import CompressionType, IndexType
+from mcap.reader import SeekingReader, make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from spliced import run
 
 import hearthlog as package
+from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_infos
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.messages.type_definitions import message_type
@@ -401,6 +404,25 @@ def test_what_else_a_bag_may_be_is_named(tmp_path, hearthlog, name, start, what)
         assert (done.returncode, what in done.stderr) == (1, True)
     assert what in hearthlog("doctor", path).stdout
     assert what in hearthlog("info", path.parent).stderr
+
+
+# Features without the record that names their set
+
+
+def test_features_that_were_copied_alone_are_of_the_set_whose_names_they_have(recorded, tmp_path):
+    (log, *_), path = find_logs(recorded), tmp_path / "features.mcap"
+    with log.open("rb") as source, path.open("wb") as target:
+        writer = Writer(target)
+        writer.start("ros2", "mcap go")
+        number = None
+        for schema, channel, message in make_reader(source).iter_messages(["/mic/features"]):
+            if number is None:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                number = writer.register_channel(channel.topic, "cdr", kind, channel.metadata)
+            writer.add_message(number, message.log_time, message.data, message.publish_time)
+        writer.finish()
+    (info,) = read_recorder_infos(path, "features")
+    assert features_of(info).name == DEFAULT.name
 
 
 # What is larger than fits into the memory

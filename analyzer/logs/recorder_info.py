@@ -10,12 +10,14 @@ from mcap import records
 from mcap.opcode import Opcode
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.home33 import HOME33
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.feature_record import (
@@ -39,6 +41,7 @@ TYPES = {
     "audio": (message_types.RAW_AUDIO, CLIP_FIELDS),
     "info": (message_types.STREAM_INFO, _INFO),
 }
+_UNNAMED = "?"  # a feature set of which a log has no more than the names of its features
 _METHODS = {"auros21": "room21", "home33": "room"}  # which learns best, of the sets of ours
 _DIGEST = re.compile("[0-9a-f]{64}")
 _FIRST: Mapping[str, Collection[str]] = {
@@ -148,7 +151,7 @@ def _info_of(
         node=node,
         microphone=microphone,
         device=info.get("device", ""),
-        feature_set=info.get("feature_set", ""),
+        feature_set=info.get("feature_set") or _set_of_names(file, topic(microphone, "features")),
         model=info.get("model", ""),
         model_sha256=digest if _DIGEST.fullmatch(digest) else "",
         configuration=_configuration(path, attachments),
@@ -160,6 +163,17 @@ def _info_of(
         first_frame=first,
         has_directions=kind == "features" and _has_topic(file, topic(microphone, "direction")),
     )
+
+
+def _set_of_names(file: LogFile, name: str) -> str:
+    """Name the feature set whose features a channel names; empty if it names none.
+
+    Programs that copy topics leave metadata records behind, but not the names.
+    """
+    channels = (channel for channel in file.channels.values() if channel.topic == name)
+    names = next((array_names(channel.metadata, "values") for channel in channels), [])
+    ours = {each.feature_names: each.name for each in (HOME33, AUROS21)}
+    return ours.get(tuple(names), _UNNAMED) if names else ""
 
 
 def _has_topic(file: LogFile, name: str) -> bool:
@@ -222,6 +236,8 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
         If the set is not installed, cannot be imported, or is installed in another version.
     """
     name = origin.feature_set or AUROS21.name
+    if name == _UNNAMED:
+        raise LogError(f"{origin.path}: does not say of which feature set its features are")
     try:
         features = feature_set(name)
     except ModelError as error:

@@ -241,10 +241,11 @@ class SummarySection:
 
     def _count(self, kind: type, defined: Iterable[int], said: int) -> int:
         """Count definitions; whether those in the summary alone are counted, writers choose."""
-        in_data = set(defined) - {0}
+        none = {0} if kind is Schema else set()  # what the number 0 means of a channel's schema
+        in_data = set(defined) - none
         if said == len(in_data):  # libmcap leaves them out, and so does `ros2 bag record`
             return said
-        return len((in_data | self._copies[kind].keys()) - {0})
+        return len((in_data | self._copies[kind].keys()) - none)
 
     def _check_offsets(self) -> None:
         for offset, group in self._offsets:
