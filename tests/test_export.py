@@ -748,6 +748,35 @@ def test_one_bad_topic_or_message_is_left_out_of_every_format(hearthlog, tmp_pat
         assert arrays["data"].tolist() == [5]
 
 
+def test_texts_that_are_not_utf_8_are_readable_in_a_ros_1_bag(hearthlog, tmp_path):
+    texts = b"caf\xe9", b"caf\xc3\xa9"
+    payloads = [struct.pack("<I", len(text) + 1) + text + b"\0" for text in texts]
+    rows = [("std_msgs/msg/String", "string data\n", payload) for payload in payloads]
+    log = changing(tmp_path / "x.mcap", *rows)
+    result = hearthlog("export", log, "-o", tmp_path / "x.bag")
+    assert result.returncode == 3
+    assert "? stands for what cannot be read in texts of /m" in result.stderr
+    with AnyReader([tmp_path / "x.bag"]) as reader:
+        found = [reader.deserialize(data, c.msgtype).data for c, _, data in reader.messages()]
+    assert found == ["caf?", "café"]
+
+
+def test_a_topic_that_rosbag2_cannot_describe_is_left_out_unless_there_is_no_other(
+    hearthlog, tmp_path
+):
+    one, other = (
+        (f"std_msgs/msg/{kind}", f"{kind.lower()} data\n", b"\1") for kind in ("Int8", "Byte")
+    )
+    two = changing(tmp_path / "two.mcap", one, other)
+    changing(tmp_path / "good.mcap", one, topic="/good")
+    assert hearthlog("export", two, "-o", tmp_path / "a", "--format", "rosbag2").returncode == 1
+    result = hearthlog("export", tmp_path, "-o", tmp_path / "b", "--format", "rosbag2")
+    assert (result.returncode, result.stderr.count("\n")) == (3, 1)
+    assert result.stderr.startswith("hearthlog: /m: channels of different types")
+    with rosbag2.Reader(tmp_path / "b") as bag:
+        assert [connection.topic for connection, _, _ in bag.messages()] == ["/good"]
+
+
 def test_a_type_whose_name_is_code_is_refused(refused, tmp_path):
     with (tmp_path / "x.mcap").open("xb") as stream:
         writer = ChunkWriter(stream)
