@@ -31,6 +31,19 @@ def shortened(text: str, length: int) -> str:
     return printable(text if len(text) <= length else text[: length - 1] + "…")
 
 
+def abridged(names: Sequence[str], most: int = 20) -> str:
+    """List names, of many the first: `a, b and 998 more`.
+
+    Parameters
+    ----------
+    names : sequence of str
+    most : int
+        How many are listed.
+    """
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 def listed(names: Sequence[str], last: str = "or") -> str:
     """List names in a sentence: `a, b or c`.
 

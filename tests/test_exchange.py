@@ -160,6 +160,34 @@ def test_a_file_that_says_when_it_begins_fits_when_older_logs_are_gone(tmp_path,
     assert new_marks(found, SOME) == []
 
 
+@pytest.mark.parametrize(
+    "declared",
+    ["UTF-8", "UTV-8", "ISO-8859-1", "utf-7", "shift_jis", "idna", "hex", "rot13", "UTF-16"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_what_an_elan_file_says_of_its_encoding_changes_no_name(tmp_path, declared, encoding):
+    heard = heard_in(tmp_path)
+    mark = SOME[0]._replace(reviewer="Jörg 日本")
+    write_labels(tmp_path / "written.eaf", [mark], heard)
+    text = (tmp_path / "written.eaf").read_text("utf-8")
+    assert 'encoding="UTF-8"' in text
+    path = tmp_path / "labels.eaf"
+    path.write_bytes(text.replace("UTF-8", declared).encode(encoding))
+    ((_, (found,)),) = read_labels(path, heard).items()
+    assert (found.reviewer, found.label) == ("Jörg 日本", mark.label)
+
+
+@pytest.mark.parametrize(
+    "name", ["=1+1", "@SUM(A1)", "+x", "-x", "'=x", "''@", "'x", "-5", "\uff1dx"]
+)
+def test_a_name_that_a_spreadsheet_would_run_is_disarmed_in_csv_and_read_as_it_was(tmp_path, name):
+    path = tmp_path / "labels.csv"
+    mark = SOME[0]._replace(reviewer=name)
+    assert there_and_back(path, [mark], heard_in(tmp_path)) == [mark]
+    (row,) = csv.DictReader(path.read_text().splitlines())
+    assert row["reviewer"] == (name if name in {"'x", "-5"} else f"'{name}")
+
+
 def test_pympi_reads_what_elan_would(tmp_path):
     path = tmp_path / "labels.eaf"
     write_labels(path, SOME, heard_in(tmp_path))

@@ -3,9 +3,15 @@
 import csv
 import io
 import json
+import resource
 import shutil
+import signal
 import struct
+import subprocess
+import time
+from contextlib import nullcontext
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,16 +19,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import soundfile
+from conftest import HEARTHLOG
 from logreader import LogReader
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from spliced import raw_messages, run, small_disk, write_log
 
+from hearthlog import open_logs
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds, time_message
 from hearthlog.schemas.messages.topics import Topic
@@ -201,6 +211,245 @@ def test_npz_of_arrays_of_different_lengths(exported, tmp_path):
             *range(5)
         ]
         assert arrays["header.frame_id"].tolist() == ["", "x", "xx"]
+
+
+def changing(path, *definitions, topic="/m"):
+    """A log of messages of one type, which is defined anew before each of them."""
+    with path.open("xb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("ros2", "test")
+        for time, (name, text, data) in enumerate(definitions):
+            schema = writer.register_schema(name, "ros2msg", text.encode())
+            channel = writer.register_channel(topic, "cdr", schema, {})
+            writer.add_message(channel, time, b"\0\1\0\0" + data, time)
+        writer.finish()
+    return path
+
+
+OWN = "my_msgs/msg/M"
+INNER = f"{'=' * 80}\nMSG: my_msgs/I\n"
+CHANGES = {
+    "fields that changed places": (
+        [("int32 a\nint32 b\n", struct.pack("<2i", 1, 2)),
+         ("int32 b\nint32 a\n", struct.pack("<2i", 2, 1))],
+        {"a": [1, 1], "b": [2, 2]},
+    ),
+    "fields of a message that changed places": (
+        [(f"I left\n{INNER}int32 a\nint32 b\n", struct.pack("<2i", 1, 2)),
+         (f"I left\n{INNER}int32 b\nint32 a\n", struct.pack("<2i", 2, 1))],
+        {"left.a": [1, 1], "left.b": [2, 2]},
+    ),
+    "another name": (
+        [("int32 a\n", struct.pack("<i", 1)), ("int32 b\n", struct.pack("<i", 2))],
+        {"a": [1, None], "b": [None, 2]},
+    ),
+    "an appended field, and a wider one": (
+        [("int32 a\n", struct.pack("<i", 1)),
+         ("int64 a\nstring s\n", struct.pack("<qI2s", 2**60 + 1, 2, b"x\0"))],
+        {"a": [1, 2**60 + 1], "s": [None, "x"]},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_type_that_changed_gives_one_table_by_the_names_of_its_fields(
+    hearthlog, tmp_path, change
+):
+    definitions, expected = CHANGES[change]
+    log = changing(tmp_path / "x.mcap", *((OWN, *each) for each in definitions))
+    is_complete = None not in [value for values in expected.values() for value in values]
+    outputs = [tmp_path / f"x.{form}" for form in ("parquet", "csv", "npz")]
+    for output in outputs:
+        result = hearthlog("export", log, "-o", output)
+        assert result.returncode == (0 if is_complete else 3)
+        assert bool(result.stderr) != is_complete
+        for name, values in expected.items():  # what is missing is named
+            assert (None in values) == (
+                name in result.stderr.strip().partition("others: ")[2].split(", ")
+            )
+    frame = pd.read_parquet(outputs[0], dtype_backend="pyarrow").iloc[:, 3:]
+    assert {name: frame[name].tolist() for name in frame} == {
+        name: [pd.NA if value is None else value for value in values]
+        for name, values in expected.items()
+    }
+    with outputs[1].open() as stream:
+        rows = [list(row.items())[3:] for row in csv.DictReader(stream)]
+    assert rows == [
+        [(name, "" if values[i] is None else f"{values[i]}") for name, values in expected.items()]
+        for i in range(2)
+    ]
+    with np.load(outputs[2]) as arrays:
+        for name, values in expected.items():
+            there = [i for i, value in enumerate(values) if value is not None]
+            assert arrays[name].tolist() == [values[i] for i in there]
+            if len(there) < len(values):
+                assert arrays[f"{name}.rows"].tolist() == there
+    context = nullcontext() if is_complete else pytest.warns(HearthlogWarning, match="2 ways")
+    with context:
+        table, frame = open_logs(log).arrow("/m"), open_logs(log).pandas("/m")
+    assert table.select(list(expected)).to_pydict() == expected
+    for name, values in expected.items():
+        assert [None if pd.isna(value) else value for value in frame[name]] == values
+
+
+@pytest.mark.parametrize(
+    ("second", "why"),
+    [
+        (("std_msgs/msg/Int32", "int32 data\n", struct.pack("<i", 5)), "has messages of"),
+        (
+            ("std_msgs/msg/Int64", "string data\n", struct.pack("<I2s", 2, b"x\0")),
+            "int64 and string",
+        ),
+        (("std_msgs/msg/Int64", "float64 data\n", struct.pack("<d", 0.5)), "int64 and float64"),
+    ],
+)
+def test_messages_for_which_there_is_no_one_table_are_in_tables_of_their_own(
+    hearthlog, refused, tmp_path, second, why
+):
+    first = "std_msgs/msg/Int64", "int64 data\n", struct.pack("<q", 2**60 + 1)
+    log = changing(tmp_path / "x.mcap", first, second)
+    for form in ("parquet", "csv", "npz"):
+        message = refused(log, f"x.{form}")
+        assert message.startswith("/m: ")
+        assert why in message
+        assert message.endswith(f"with --format {form}, for a file of each")
+        result = hearthlog("export", log, "-o", tmp_path / form, "--format", form)
+        assert result.returncode == 3
+        assert why in result.stderr
+        other = f"m_{second[0].replace('/', '_')}"
+        assert {path.stem for path in (tmp_path / form).iterdir()} == {"m", other}
+    assert "1152921504606846977" in (tmp_path / "csv" / "m.csv").read_text()
+    with pytest.raises(LogError, match="which is no table; choose other logs"):
+        open_logs(log).arrow("/m")
+    assert "which is no table" in hearthlog("cat", log, "--format", "csv").stderr
+
+
+def test_rows_of_two_definitions_are_in_the_order_of_time(hearthlog, tmp_path):
+    a, b = (OWN, "int32 a\n", struct.pack("<i", 1)), (OWN, "int32 b\n", struct.pack("<i", 2))
+    log = changing(tmp_path / "x.mcap", a, b, a, b, b, a)
+    for form in ("parquet", "csv", "npz"):
+        hearthlog("export", log, "-o", tmp_path / f"x.{form}")
+    expected = [1, None, 1, None, None, 1]
+    table = pq.read_table(tmp_path / "x.parquet")
+    assert table["a"].to_pylist() == expected
+    assert table["log_time"].cast(pa.int64()).to_pylist() == [0, 1, 2, 3, 4, 5]
+    assert pd.read_csv(tmp_path / "x.csv")["a"].tolist() == pytest.approx(
+        [np.nan if value is None else value for value in expected], nan_ok=True
+    )
+    with np.load(tmp_path / "x.npz") as arrays:
+        assert arrays["b.rows"].tolist() == [1, 3, 4]
+        assert arrays["log_time"].astype(int).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_topic_that_a_format_has_no_place_for_is_left_out(hearthlog, tmp_path):
+    rows = [np.zeros(n) for n in (1, 2)]
+    topics = {
+        "/x": [(1, message("std_msgs/msg/Bool", data=True))],
+        "/y": [
+            (i * 10**9, message("std_msgs/msg/Float64MultiArray",
+                                layout=message("std_msgs/msg/MultiArrayLayout", dim=[],
+                                               data_offset=0), data=row))
+            for i, row in enumerate(rows)
+        ],
+    }  # fmt: skip
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for number in range(2):  # what is wider comes later
+        part = {topic: found[number : number + 1] for topic, found in topics.items()}
+        write_log(logs / f"{number}.mcap", {topic: each for topic, each in part.items() if each})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hearthlog.schemas.logs.merged_reading._BATCH", 1)
+        result = hearthlog("export", logs, "-o", tmp_path / "csv", "--format", "csv")
+    assert result.returncode == 3
+    assert "/y: data[1] is not in all messages, which CSV has no column for" in result.stderr
+    assert [path.name for path in (tmp_path / "csv").iterdir()] == ["x.csv"]
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv", "npz"])
+def test_thousands_of_topics_need_few_open_files_and_read_the_logs_once(
+    hearthlog, tmp_path, form, monkeypatch
+):
+    flag = message("std_msgs/msg/Bool", data=True)
+    log = write_log(tmp_path / "x.mcap", {f"/t{i}": [(i, flag)] for i in range(100)})
+    opened = []
+    monkeypatch.setattr(LogFile, "__enter__", lambda file: opened.append(file) or file)
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE, (len(list(Path("/proc/self/fd").iterdir())) + 30, limits[1])
+    )
+    try:
+        result = hearthlog("export", log, "-o", tmp_path / form, "--format", form)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert len(list((tmp_path / form).iterdir())) == 100
+    assert len(opened) < 10
+
+
+def test_an_export_that_is_killed_leaves_nothing(tmp_path):
+    topics = {f"/t{i}": [(i, message("std_msgs/msg/Bool", data=True))] for i in range(1000)}
+    log = write_log(tmp_path / "x.mcap", topics)
+    command = [*HEARTHLOG, "export", log, "-o", tmp_path / "out", "--format", "csv"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        while not (begun := list(tmp_path.glob(".out.*/t1.csv"))) and process.poll() is None:
+            time.sleep(0.01)
+        process.terminate()
+        message_text = process.stderr.read()
+    assert begun
+    assert (process.returncode, message_text) == (128 + signal.SIGTERM, "")
+    assert list(tmp_path.iterdir()) == [log]
+
+
+def test_npz_of_more_than_memory_should_hold_is_read_in_several_passes(
+    recorded, exported, monkeypatch
+):
+    expected = exported(recorded, "once", "--format", "npz")
+    monkeypatch.setattr("hearthlog.analyzer.export.npz._MEMORY", 1 << 20)
+    found = exported(recorded, "passes", "--format", "npz")
+    assert sorted(p.name for p in found.iterdir()) == sorted(p.name for p in expected.iterdir())
+    for path in expected.iterdir():
+        assert (found / path.name).read_bytes()[100:] == path.read_bytes()[100:]
+
+
+def test_texts_that_a_spreadsheet_would_run_are_disarmed(exported, hearthlog, tmp_path):
+    texts = [
+        "=1+1",
+        "+1 234",
+        "-x",
+        "@SUM(A1)",
+        "\tx",
+        "'=x",
+        "\uff1d1",
+        "-5",
+        "+.5e-3",
+        "a=b",
+        "'x",
+        "",
+    ]
+    log = write_log(
+        tmp_path / "x.mcap",
+        {"/x": [(i, message("std_msgs/msg/String", data=text)) for i, text in enumerate(texts)]},
+    )
+    path = exported(log, "x.csv")
+    with path.open() as stream:
+        found = [row["data"] for row in csv.DictReader(stream)]
+    assert found == ["'=1+1", "'+1 234", "'-x", "'@SUM(A1)", "'\tx", "''=x", "'\uff1d1", *texts[7:]]
+    assert hearthlog("cat", log, "--format", "csv").stdout == path.read_text()
+
+
+def test_an_image_is_one_column(exported, tmp_path):
+    image = message(
+        "sensor_msgs/msg/Image", header=header(7, ""), height=2, width=4000, encoding="mono8",
+        is_bigendian=0, step=4000, data=np.arange(8000, dtype=np.uint8),
+    )  # fmt: skip
+    depths = message("sensor_msgs/msg/ChannelFloat32", name="", values=np.ones(5000, np.float32))
+    log = write_log(tmp_path / "x.mcap", {"/image": [(1, image)], "/depth": [(1, depths)]})
+    for topic, path in (("/image", "data"), ("/depth", "values")):
+        frame = open_logs(log).pandas(topic)
+        assert len(frame.columns) < 10
+        assert len(frame[path].iloc[0]) == {"data": 8000, "values": 5000}[path]
+    text = exported(log, "x.csv", "--topics", "/depth").read_text()
+    assert text.splitlines()[0] == '"log_time","publish_time","sequence","name","values"'
 
 
 def test_audacity_labels_are_in_seconds_of_the_sound(recorded, exported):
@@ -445,6 +694,87 @@ def test_a_ros_1_bag_of_types_that_only_the_file_knows(exported, tmp_path):
             content = reader.deserialize(raw, connection.msgtype)
             assert (content.a, content.b.tolist()) == (7, [-5, 3])
         assert reader.message_count == 2
+
+
+def test_what_differs_in_comments_bounds_and_constants_is_one_ros_1_connection(exported, tmp_path):
+    texts = ("int32 x\n", "# metres\nint32 x # later\n", "int32 MOST=5\nint32 x\n")
+    log = changing(tmp_path / "x.mcap", *((OWN, text, struct.pack("<i", 7)) for text in texts))
+    bounded = [
+        (OWN, f"{kind} x\n", struct.pack("<I2s", 2, b"a\0")) for kind in ("string", "string<=5")
+    ]
+    for source in (log, changing(tmp_path / "y.mcap", *bounded)):
+        path = exported(source, f"{source.stem}.bag")
+        with AnyReader([path]) as reader:
+            assert len(reader.connections) == 1
+            found = [reader.deserialize(data, c.msgtype).x for c, _, data in reader.messages()]
+        assert found == ([7, 7, 7] if source == log else ["a", "a"])
+
+
+def test_a_ros_1_bag_that_would_need_two_definitions_leaves_one_out(hearthlog, tmp_path):
+    own = (OWN, "int32 a\n", struct.pack("<i", 1)), (OWN, "int32 b\n", struct.pack("<i", 2))
+    nested = "my_msgs/msg/N", f"M m\n{'=' * 80}\nMSG: my_msgs/M\nint64 a\n", struct.pack("<q", 3)
+    wide = "my_msgs/msg/W", "wstring w\n", struct.pack("<I", 0)
+    for number, other in enumerate((own[1], nested, wide)):
+        log = changing(tmp_path / f"{number}.mcap", own[0], other)
+        result = hearthlog("export", log, "-o", tmp_path / f"{number}.bag")
+        assert result.returncode == 3
+        assert result.stderr.count("\n") == 1
+        assert ": left out" in result.stderr
+        with AnyReader([tmp_path / f"{number}.bag"]) as reader:
+            ((connection, time, data),) = reader.messages()
+            assert (time, reader.deserialize(data, connection.msgtype).a) == (0, 1)
+
+
+def test_one_bad_topic_or_message_is_left_out_of_every_format(hearthlog, tmp_path):
+    good = "std_msgs/msg/Int32", "int32 data\n", struct.pack("<i", 5)
+    whole = changing(tmp_path / "1.mcap", good, (*good[:2], b"\5"), topic="/good")
+    bad = changing(tmp_path / "2.mcap", ("my_msgs/msg/Secret", "", b"abcd"), topic="/bad")
+    for form in ("parquet", "csv", "npz", "bag"):
+        output = tmp_path / (f"x.{form}" if form == "bag" else form)
+        options = () if form == "bag" else ("--format", form)
+        (logs := tmp_path / f"logs-{form}").mkdir()
+        for log in (whole, bad):
+            shutil.copy(log, logs)
+        result = hearthlog("export", logs, "-o", output, *options)
+        assert (result.returncode, result.stderr.count("\n")) == (3, 2)
+        assert "my_msgs/msg/Secret: left out" in result.stderr
+        assert "such messages of /good are left out" in result.stderr
+        if form == "bag":
+            with AnyReader([output]) as reader:
+                assert [time for _, time, _ in reader.messages()] == [0]
+        else:
+            assert [path.name for path in output.iterdir()] == [f"good.{form}"]
+    with np.load(tmp_path / "npz" / "good.npz") as arrays:
+        assert arrays["data"].tolist() == [5]
+
+
+def test_texts_that_are_not_utf_8_are_readable_in_a_ros_1_bag(hearthlog, tmp_path):
+    texts = b"caf\xe9", b"caf\xc3\xa9"
+    payloads = [struct.pack("<I", len(text) + 1) + text + b"\0" for text in texts]
+    rows = [("std_msgs/msg/String", "string data\n", payload) for payload in payloads]
+    log = changing(tmp_path / "x.mcap", *rows)
+    result = hearthlog("export", log, "-o", tmp_path / "x.bag")
+    assert result.returncode == 3
+    assert "? stands for what cannot be read in texts of /m" in result.stderr
+    with AnyReader([tmp_path / "x.bag"]) as reader:
+        found = [reader.deserialize(data, c.msgtype).data for c, _, data in reader.messages()]
+    assert found == ["caf?", "café"]
+
+
+def test_a_topic_that_rosbag2_cannot_describe_is_left_out_unless_there_is_no_other(
+    hearthlog, tmp_path
+):
+    one, other = (
+        (f"std_msgs/msg/{kind}", f"{kind.lower()} data\n", b"\1") for kind in ("Int8", "Byte")
+    )
+    two = changing(tmp_path / "two.mcap", one, other)
+    changing(tmp_path / "good.mcap", one, topic="/good")
+    assert hearthlog("export", two, "-o", tmp_path / "a", "--format", "rosbag2").returncode == 1
+    result = hearthlog("export", tmp_path, "-o", tmp_path / "b", "--format", "rosbag2")
+    assert (result.returncode, result.stderr.count("\n")) == (3, 1)
+    assert result.stderr.startswith("hearthlog: /m: channels of different types")
+    with rosbag2.Reader(tmp_path / "b") as bag:
+        assert [connection.topic for connection, _, _ in bag.messages()] == ["/good"]
 
 
 def test_a_type_whose_name_is_code_is_refused(refused, tmp_path):

@@ -36,11 +36,11 @@ def schema_of(table: Table, selection: Selection) -> pa.Schema:
     selection : Selection
         Whose `hearthlog` records are among the metadata.
     """
-    channels = [channel for channel, _ in table.channels]
-    agreed = set.intersection(*(set(channel.metadata.items()) for channel in channels))
+    first, *others = [channel.metadata for channel, _ in table.channels]
+    agreed = {k: v for k, v in first.items() if all(other.get(k) == v for other in others)}
     own = {"topic": table.topic, "hearthlog": json.dumps(selection.metadata)}
     columns = _HEADS | {column_name(path): type_of(field) for path, field in table.fields.items()}
-    return pa.schema(columns.items(), metadata=dict(agreed) | own)
+    return pa.schema(columns.items(), metadata=agreed | own)
 
 
 def column_name(path: str) -> str:

@@ -27,10 +27,10 @@ from hearthlog.schemas.messages.fields import (
 from hearthlog.schemas.messages.message_types import number_type
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.text import abridged, listed
 
 MOST_COLUMNS = 4096  # of an array whose elements have no names; images have more
-_NAMED = 8  # fields, or topics, in a line
+_NAMED = 8  # fields in a line
 
 
 class Table(NamedTuple):
@@ -152,10 +152,9 @@ def warn_of_changes(tables: Sequence[Table]) -> None:
     for table in tables:
         optional = optional_fields(table.definitions)
         if optional:
-            more = [f"{len(optional) - _NAMED} more"] if len(optional) > _NAMED else []
             text = (
-                f"{table.type} is defined in {len(table.definitions)} ways: not all messages have "
-                f"{listed(optional[:_NAMED] + more)}, where they are empty"
+                f"{table.type} is defined in {len(table.definitions)} ways; not in all messages, "
+                f"and empty in the others: {abridged(optional, _NAMED)}"
             )
             warnings.warn(HearthlogWarning(text, table.topic), stacklevel=2)
     if len(tables) > 1:
@@ -180,7 +179,7 @@ def one_table(tables: Sequence[Table], remedy: str) -> Table:
 def _why_apart(tables: Sequence[Table]) -> str:
     types = list(dict.fromkeys(table.type for table in tables))
     if len(types) > 1:
-        return f"has messages of {listed(types)}"
+        return f"has messages of {listed(types, 'and')}"
     try:
         common_fields([fields for table in tables for fields in table.definitions])
     except LogError as error:

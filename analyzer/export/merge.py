@@ -244,15 +244,28 @@ class _Log:
     def _topics(self) -> dict[str, rosbag2.TopicCount] | None:
         """Describe the topics for rosbag2; None if it cannot describe them."""
         topics: dict[str, rosbag2.TopicCount] = {}
+        channels: dict[str, list[Described]] = {}
         for number, (channel, schema) in self._described.items():
-            metadata = bag_metadata(channel)
             name = "" if schema is None else schema.name
-            topic = topics.setdefault(channel.topic, rosbag2.TopicCount(name, metadata))
-            same = (topic.type, topic.channel_metadata) == (name, metadata)
-            if not same or channel.message_encoding != ENCODING:
-                return None
-            topic.messages += self._counts[number]
-        return topics
+            topic = rosbag2.TopicCount(name, bag_metadata(channel))
+            topics.setdefault(channel.topic, topic).messages += self._counts[number]
+            channels.setdefault(channel.topic, []).append((channel, schema))
+        return topics if all(map(is_for_rosbag2, channels.values())) else None
+
+
+def is_for_rosbag2(channels: Sequence[Described]) -> bool:
+    """Tell whether rosbag2 has one description for the channels of a topic.
+
+    Parameters
+    ----------
+    channels : sequence of (Channel, Schema or None)
+    """
+    described = [
+        ("" if schema is None else schema.name, bag_metadata(channel))
+        for channel, schema in channels
+    ]
+    encodings = {channel.message_encoding for channel, _ in channels}
+    return encodings == {ENCODING} and all(each == described[0] for each in described)
 
 
 def _profile(logs: Sequence[Path]) -> str:

@@ -3,9 +3,11 @@
 import re
 import warnings
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag1,
@@ -23,16 +25,18 @@ from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import held_count
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.logs.columns import without_unreadable
+from hearthlog.schemas.logs.columns import decode, unreadable, without_unreadable
 from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.message_types import typestore
-from hearthlog.schemas.messages.type_definitions import defined_types
+from hearthlog.schemas.messages.type_definitions import defined_types, message_type
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _HEADER = "std_msgs/msg/Header"
 _NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
 _TIME_LIMIT = NANOSECONDS << 32  # the year 2106
+_NOT_READ = re.compile("[\udc80-\udcff]")
 _LITTLE_ENDIAN = b"\x00\x01"
 
 
@@ -88,7 +92,7 @@ class _Bag:
             topic = self._topic(each)
             if topic is None:
                 continue
-            messages = self._in_time(without_unreadable(each))
+            messages = self._in_time(_readable(each))
             ends = messages.offsets + messages.sizes
             places = zip(messages.offsets.tolist(), ends.tolist(), strict=True)
             payloads = (messages.buffer[first:end].tobytes() for first, end in places)
@@ -125,7 +129,8 @@ class _Bag:
     def _topic(self, messages: RawMessages) -> _Topic | None:
         """Find the connection for messages; None if the bag has no place for them."""
         channel, schema = messages.channel, messages.schema
-        assert schema is not None  # the channel can be decoded
+        if schema is None or unreadable(channel, schema):
+            return None  # which was said of its topic
         latching = int(held_count(channel) > 0)
         key = channel.topic, schema.name, schema.encoding, schema.data, latching
         if key not in self._topics:
@@ -177,6 +182,43 @@ class _Bag:
             self._writer.connections.append(connection)
             self._connections[key] = connection
         return self._connections[key]
+
+
+def _readable(raw: RawMessages) -> RawMessages:
+    """Leave out messages that are not of their type, and texts that readers of bags would refuse.
+
+    Question marks, of one byte, stand for what is not UTF-8.
+    """
+    try:
+        decode([raw])
+    except LogError:
+        raw = without_unreadable(raw)
+    else:
+        return raw
+    try:
+        decode([raw])
+    except LogError as error:
+        text = f"? stands for what cannot be read in texts of {raw.channel.topic}"
+        warnings.warn(HearthlogWarning(text, str(error)), stacklevel=2)
+    else:
+        return raw
+    assert raw.schema is not None
+    kind = message_type(raw.schema.name, raw.schema.encoding, raw.schema.data)
+    payloads = [b""] * len(raw)
+    for _, rows, block in rows_by_layout(kind, raw.buffer, raw.offsets, raw.sizes):
+        for name in block.dtype.names or ():
+            if block.dtype[name].kind == "V" and block.dtype[name].names is None:
+                for row, value in enumerate(block[name]):
+                    text = value.tobytes().decode(errors="surrogateescape")
+                    block[name][row] = _NOT_READ.sub("?", text).encode()
+        for row, payload in zip(rows.tolist(), block, strict=True):
+            payloads[row] = payload.tobytes()
+    ends = np.cumsum([len(payload) for payload in payloads])
+    return replace(
+        raw,
+        buffer=np.frombuffer(b"".join(payloads), np.uint8),
+        offsets=ends - raw.sizes,
+    )
 
 
 def _without_bounds(fields: Sequence[Any]) -> list[Any]:

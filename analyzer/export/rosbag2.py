@@ -1,22 +1,32 @@
 """Logs as a rosbag2 folder."""
 
+import warnings
+
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
-from hearthlog.analyzer.export.merge import write_log
+from hearthlog.analyzer.export.merge import is_for_rosbag2, write_log
 from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.progress import Progress
+
+_NO_PLACE = (
+    "channels of different types or qualities of service, or without ROS 2 messages, for which "
+    "rosbag2 has no place"
+)
 
 
 def _save(selection: Selection, files: OutputFiles, progress: Progress) -> int:
-    """Write a log and `metadata.yaml`; raise LogError if rosbag2 cannot tell its channels apart."""
+    """Write a log and `metadata.yaml`, without topics whose channels rosbag2 cannot tell apart."""
+    topics = [topic for topic, channels in selection.channels.items() if is_for_rosbag2(channels)]
+    if selection.channels and not topics:
+        raise LogError(_NO_PLACE)
+    for topic in selection.channels.keys() - topics:
+        warnings.warn(HearthlogWarning(f"{_NO_PLACE}: left out", topic, each=True), stacklevel=2)
+    if len(topics) < len(selection.channels):
+        selection = selection.only(topics)
     log = files.path / f"{files.output.name}.mcap"
     with log.open("xb") as stream:
         record, repeated = write_log(selection, stream, log.name, progress)
-    if record is None:
-        raise LogError(
-            "a topic has channels of different types or qualities of service, or no ROS 2 "
-            "messages, which rosbag2 has no way to say; choose others with --topics"
-        )
+    assert record is not None  # each topic has one description
     information = record["serialized_metadata"]  # JSON, which is YAML too
     text = f"rosbag2_bagfile_information: {information}\n"
     (files.path / "metadata.yaml").write_text(text, "utf-8")

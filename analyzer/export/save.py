@@ -11,6 +11,7 @@ from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.new_files import new_file, new_folder
+from hearthlog.schemas.text import abridged
 
 
 def exportable(selection: Selection, format_: ExportFormat) -> Selection:
@@ -40,7 +41,7 @@ def exportable(selection: Selection, format_: ExportFormat) -> Selection:
         if any(is_compatible(*described, exporter.type, exporter.fields) for described in same)
     }
     if selection.logs and not topics:
-        names = ", ".join(selection.channels)
+        names = abridged(list(selection.channels))
         raise LogError(f"no topic of type {exporter.type}; there are {names}")
     return selection.only(topics)
 

@@ -24,6 +24,7 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
+from hearthlog.schemas.text import abridged
 
 _LAST = (1 << 63) - 1  # log time
 _NAMED = 5  # topics of which none can be decoded
@@ -178,7 +179,7 @@ class Selection:
 
     def nothing(self) -> LogError:
         """Make the error that says that the selection has no message."""
-        topics = "" if not self.topics else f" of {', '.join(sorted(self.topics))}"
+        topics = "" if not self.topics else f" of {abridged(sorted(self.topics))}"
         where = "these logs" if self.start is None and self.end is None else "this span of time"
         return LogError(f"no message{topics} in {where}; `hearthlog info` shows what there is")
 
@@ -323,6 +324,6 @@ def _matching(patterns: Sequence[str], topics: Iterable[str]) -> frozenset[str]:
     for pattern in patterns:
         fitting = [topic for topic in names if fnmatchcase(topic, pattern)]
         if not fitting:
-            raise LogError(f"no topic {pattern}; there are {', '.join(names)}")
+            raise LogError(f"no topic {pattern}; there are {abridged(names)}")
         matching.update(fitting)
     return frozenset(matching)

@@ -3,6 +3,7 @@
 import codecs
 import csv
 import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,29 @@ FORMULA = r"^'*[=+\-@\t\r\n＝＋－＠]"  # noqa: RUF001  wide ones, too
 NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 _MOST_LINES = 1_000_000  # blank ones too: each takes a microsecond
 _LONGEST = 1 << 20  # characters of a record: fields take fifty times as much memory
+
+
+def disarmed(text: str) -> str:
+    """Put an apostrophe before a text that a spreadsheet would take for a formula.
+
+    Parameters
+    ----------
+    text : str
+        A field of CSV.
+    """
+    is_formula = re.match(FORMULA, text) and not re.fullmatch(NUMBER, text)
+    return f"'{text}" if is_formula else text
+
+
+def without_disarming(text: str) -> str:
+    """Return a text as it was before `disarmed`.
+
+    Parameters
+    ----------
+    text : str
+        A field of CSV.
+    """
+    return text[1:] if text.startswith("'") and re.match(FORMULA, text) else text
 
 
 def read_text(path: Path, what: str, size_limit: int) -> str:

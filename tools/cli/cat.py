@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from hearthlog.schemas.text import abridged
 from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
 
@@ -32,7 +33,7 @@ def cat(
 
     selection = select(logs, topics or [], *parse_span(start, end)).decodable()
     if output_format == "csv" and len(selection.channels) > 1:
-        names = ", ".join(sorted(selection.channels))
+        names = abridged(sorted(selection.channels))
         wrong_use(f"csv is for one topic: choose one with --topics ({names})")
     if output_format == "csv":
         _print_table(selection)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from hearthlog.analyzer.export.formats import FORMATS
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.text import abridged, listed
 from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
 
@@ -73,7 +73,7 @@ def export(
         wrong_use(f"--output {output}: a {format_.name} is one file, *.{format_.name}")
     selection = exportable(select(logs, topics or [], *parse_span(start, end)), format_)
     if one_file and format_.by_topic and len(selection.channels) > 1:
-        names = ", ".join(sorted(selection.channels))
+        names = abridged(sorted(selection.channels))
         wrong_use(f"{output} is for one topic: choose one with --topics ({names})")
     with share_done("exporting") as progress:
         repeated = save(selection, output, format_, progress, folder=not one_file)

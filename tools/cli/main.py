@@ -1,7 +1,9 @@
 """The command `hearthlog`: its verbs, and how errors reach the user."""
 
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -76,11 +78,33 @@ def _options(
 
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
-    with checked_output(), _warnings_shown() as warned:
+    with _ended_by_signals(), checked_output(), _warnings_shown() as warned:
         app = make_app(_wanted_verbs())
         status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as an error does, so that temporary files are removed.
+
+    A verb that does otherwise sets handlers of its own.
+    """
+
+    def end(number: int, _: object) -> None:
+        sys.exit(128 + number)
+
+    ours = threading.current_thread() is threading.main_thread()
+    numbers = [signal.SIGTERM, signal.SIGHUP] if ours else []
+    numbers = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _wanted_verbs() -> Iterable[str]:

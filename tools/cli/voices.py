@@ -157,6 +157,7 @@ def _write_turns(output: Path, speech: "HomeSpeech", voices: "Voices", of: "Int6
     import csv
 
     from hearthlog.analyzer.discover.voice_summary import spoken_spans
+    from hearthlog.analyzer.logs.text_files import disarmed
     from hearthlog.schemas.storage.new_files import new_file
     from hearthlog.schemas.times import time_text
 
@@ -169,7 +170,7 @@ def _write_turns(output: Path, speech: "HomeSpeech", voices: "Voices", of: "Int6
         for microphone, spans in spoken_spans(speech, voices, of).items():
             columns = spans.starts.tolist(), spans.ends.tolist(), spans.texts.tolist()
             for start, end, text in zip(*columns, strict=True):
-                table.writerow((time_text(start), time_text(end), microphone, text))
+                table.writerow((time_text(start), time_text(end), microphone, disarmed(text)))
 
 
 def _print(summaries: "Sequence[VoiceSummary]", speech: "HomeSpeech", zone: "tzinfo") -> None:

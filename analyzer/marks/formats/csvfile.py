@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.logs.coverage import Coverage
+from hearthlog.analyzer.logs.text_files import disarmed
 from hearthlog.analyzer.marks.formats.labels import made_text
 from hearthlog.analyzer.marks.formats.tables import read
 from hearthlog.analyzer.marks.marks import Mark
@@ -29,7 +30,7 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
     Returns
     -------
     str
-        The text of the file.
+        The text of the file; an apostrophe stands before what a spreadsheet would run.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -37,5 +38,6 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
     for mark in marks:
         start, end = time_text(mark.start), time_text(mark.end)
         origin = mark.reviewer, made_text(mark), mark.corrects
-        table.writerow([start, end, mark.label, mark.microphone, *origin])
+        texts = mark.label, mark.microphone, *origin
+        table.writerow([start, end, *map(disarmed, texts)])
     return text.getvalue()

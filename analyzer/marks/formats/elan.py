@@ -6,15 +6,16 @@ Times in ELAN are whole milliseconds.
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
+from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 from xml.sax import SAXParseException
 from xml.sax.handler import ContentHandler
-from xml.sax.xmlreader import AttributesImpl, Locator
+from xml.sax.xmlreader import AttributesImpl, InputSource, Locator
 
 from defusedxml.common import DefusedXmlException
-from defusedxml.sax import parseString
+from defusedxml.sax import parse
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
@@ -151,7 +152,9 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
         line = text.count("\n", 0, endless.start()) + 1
         raise DataError(f"{path}:{line}: is no document of ELAN")
     try:
-        parseString(text.encode(), document, forbid_dtd=True)
+        source = InputSource()
+        source.setCharacterStream(StringIO(text))  # decoded, so that no declaration counts
+        parse(source, document, forbid_dtd=True)
     except SAXParseException as error:
         line = error.getLineNumber() or 1
         raise DataError(f"{path}:{line}: is not XML ({error.getMessage()})") from error

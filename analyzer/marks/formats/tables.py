@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.text_files import csv_rows
+from hearthlog.analyzer.logs.text_files import csv_rows, without_disarming
 from hearthlog.analyzer.marks.formats.labels import (
     Choice,
     FileLabel,
@@ -28,6 +28,7 @@ _NAMES: Mapping[str, Sequence[str]] = {
     "corrects": ("corrects",),
 }
 COLUMNS = tuple(_NAMES)
+_TEXTS = set(COLUMNS[3:])
 _NUMBERS = ("start", "end", "duration")
 _SELECTION = "selection"  # a number, in tables of Raven
 _UNIT = re.compile(r"(\((s|sec)\)|\[(s|sec)\])$")
@@ -105,6 +106,8 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
             if row[_SELECTION] and identity in seen:
                 continue
             seen.add(identity)
+        if delimiter != "\t":
+            row |= {name: without_disarming(row[name]) for name in row.keys() & _TEXTS}
         yield _label(where, number, row, number_of)
 
 
