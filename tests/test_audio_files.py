@@ -469,6 +469,15 @@ def test_other_words_on_standard_error_are_kept_while_mp3_is_read(sound, tmp_pat
     assert capfd.readouterr().err == "hearthlog: said\n"
 
 
+def test_a_name_that_is_not_utf_8_is_recorded(hearthlog, wav, tmp_path):
+    path = wav("a.wav").rename(
+        Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff_20260301_070000.wav"))
+    )
+    result = hearthlog("record", path, "--model", "none", "-o", tmp_path / "logs")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert features(tmp_path / "logs")[1][0] == read_time("2026-03-01T07:00:00")
+
+
 def test_hidden_files_and_folders_are_not_looked_at(wav, tmp_path):
     kept = wav("b/a.wav")
     wav("b/._a.wav"), wav("b/.c/a.wav")

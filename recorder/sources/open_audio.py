@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from threading import RLock
 from typing import NamedTuple
@@ -123,10 +124,17 @@ def audio_seconds(path: Path) -> float:
         As `open_audio`.
     """
     with open_audio(path) as audio:
-        frames = audio.frames
-        if frames is None:
-            frames = sum(len(block) for block in audio.blocks(0, math.inf))
-        return float(frames / audio.rate)
+        if audio.frames is not None:
+            return float(audio.frames / audio.rate)
+    status = path.stat()
+    return _decoded_seconds(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(256)
+def _decoded_seconds(path: Path, _time: int, _size: int) -> float:
+    """Return the length of a file that has to be decoded for that, once as it is."""
+    with open_audio(path) as audio:
+        return float(sum(len(block) for block in audio.blocks(0, math.inf)) / audio.rate)
 
 
 def is_audio(name: str) -> bool:
@@ -188,10 +196,10 @@ def _check_rate(path: Path, rate: int) -> None:
 
 def _opened(path: Path, complaints: list[bytes]) -> soundfile.SoundFile:
     with _without_mpg123(path, complaints):
-        sound = soundfile.SoundFile(path)
+        sound = soundfile.SoundFile(os.fsencode(path))
     if sound.frames >= _NO_LENGTH:
         sound.close()
-        return _Unseekable(path)
+        return _Unseekable(os.fsencode(path))
     if sound.frames == 0 and (mended := _mended_wav(path)) is not None:
         sound.close()
         return soundfile.SoundFile(mended)
