@@ -356,6 +356,15 @@ def test_a_wav_file_that_was_never_completed_is_read_to_its_end(sound, tmp_path,
     assert path.read_bytes() == before
 
 
+def test_a_large_wav_file_that_was_never_completed_is_read_to_its_end(sound, tmp_path):
+    path = tmp_path / "a.wav"
+    data = bytes_of(sound, "RF64")
+    assert data[12:16] == b"ds64"
+    path.write_bytes(data[:20] + bytes(24) + data[44:])
+    np.testing.assert_array_equal(heard(path)[: len(sound)], sound)
+    assert len(heard(path)) < len(sound) + 100, "libsndfile writes a chunk behind it"
+
+
 def test_a_wav_file_of_no_samples_is_not_taken_for_one_that_was_not_completed(tmp_path):
     path = tmp_path / "a.wav"
     path.write_bytes(bytes_of(np.empty(0)) + b"LIST\x04\0\0\0INFO")
@@ -411,6 +420,16 @@ def test_what_libsndfile_cannot_read_is_read_by_ffmpeg(wav, sound, tmp_path, suf
     if suffix == "oga":  # FLAC in Ogg
         np.testing.assert_array_equal(samples, sound)
         np.testing.assert_array_equal(heard(path, start=0.5, end=1.0), sound[8000:16_000])
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("suffix", ["aac", "caf", "mka", "oga"])
+def test_what_ffmpeg_reads_of_a_cut_file_is_said_to_be_cut(wav, tmp_path, suffix):
+    path = converted(wav("a.wav", 8), tmp_path / f"b.{suffix}")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 1])
+    faults = []
+    assert 2 * RATE < len(heard(path, incomplete=faults.append)) < 6 * RATE
+    assert "cut short" in faults[0]
 
 
 @needs_ffmpeg
