@@ -356,6 +356,15 @@ def test_a_wav_file_that_was_never_completed_is_read_to_its_end(sound, tmp_path,
     assert path.read_bytes() == before
 
 
+def test_a_large_wav_file_that_was_never_completed_is_read_to_its_end(sound, tmp_path):
+    path = tmp_path / "a.wav"
+    data = bytes_of(sound, "RF64")
+    assert data[12:16] == b"ds64"
+    path.write_bytes(data[:20] + bytes(24) + data[44:])
+    np.testing.assert_array_equal(heard(path)[: len(sound)], sound)
+    assert len(heard(path)) < len(sound) + 100, "libsndfile writes a chunk behind it"
+
+
 def test_a_wav_file_of_no_samples_is_not_taken_for_one_that_was_not_completed(tmp_path):
     path = tmp_path / "a.wav"
     path.write_bytes(bytes_of(np.empty(0)) + b"LIST\x04\0\0\0INFO")
@@ -414,6 +423,16 @@ def test_what_libsndfile_cannot_read_is_read_by_ffmpeg(wav, sound, tmp_path, suf
 
 
 @needs_ffmpeg
+@pytest.mark.parametrize("suffix", ["aac", "caf", "mka", "oga"])
+def test_what_ffmpeg_reads_of_a_cut_file_is_said_to_be_cut(wav, tmp_path, suffix):
+    path = converted(wav("a.wav", 8), tmp_path / f"b.{suffix}")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 1])
+    faults = []
+    assert 2 * RATE < len(heard(path, incomplete=faults.append)) < 6 * RATE
+    assert "cut short" in faults[0]
+
+
+@needs_ffmpeg
 def test_a_file_that_leads_ffmpeg_elsewhere_is_refused(wav, tmp_path):
     other = wav("a.wav")
     path = tmp_path / "playlist.wav"
@@ -467,6 +486,15 @@ def test_other_words_on_standard_error_are_kept_while_mp3_is_read(sound, tmp_pat
     for _ in read_audio(tmp_path / "a.mp3"):
         os.write(2, b"hearthlog: said\n")
     assert capfd.readouterr().err == "hearthlog: said\n"
+
+
+def test_a_name_that_is_not_utf_8_is_recorded(hearthlog, wav, tmp_path):
+    path = wav("a.wav").rename(
+        Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff_20260301_070000.wav"))
+    )
+    result = hearthlog("record", path, "--model", "none", "-o", tmp_path / "logs")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert features(tmp_path / "logs")[1][0] == read_time("2026-03-01T07:00:00")
 
 
 def test_hidden_files_and_folders_are_not_looked_at(wav, tmp_path):

@@ -93,6 +93,16 @@ def test_a_broker_that_is_not_there_is_said_in_one_line_and_found_when_it_comes(
             flush_until(connection, lambda: listener.values.get(ALIVE) == "online")
 
 
+def test_a_refused_password_is_said_in_one_line_and_no_other_reason_after_it(tmp_path):
+    broker = Broker(tmp_path, "allow_anonymous false\n")
+    try:
+        with connected(broker) as (connection, said):
+            flush_until(connection, lambda: len(said) > 1)  # it is tried again
+    finally:
+        broker.kill()
+    assert all(": refused: Not authorized; see user, password_file" in line for line in said)
+
+
 def test_a_second_bridge_of_the_same_name_is_said_to_be_one(broker):
     with (
         connected(broker) as (first, said),

@@ -98,7 +98,8 @@ def test_what_the_recorder_said_of_itself_is_said_once(hearthlog, tmp_path):
     assert recording.returncode == 0, recording.stderr
     (findings,) = examine(tmp_path / "logs")
     assert findings.counts == {("warning", "health"): 1}
-    assert "the microphone clips: turn its volume down [health]" in str(findings.shown[0])
+    expected = "the file clips: check with what it was recorded, and how [health]"
+    assert expected in str(findings.shown[0])
 
 
 def test_a_log_that_was_put_together_again_is_the_same(recorded, tmp_path):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import OK, Event, Gap, SourceHealth
+from hearthlog.recorder.events import OK, READING, Event, Gap, SourceHealth
 from hearthlog.recorder.sources.decoding import check_channels, read_audio
 from hearthlog.recorder.sources.file_times import FileTime
 from hearthlog.recorder.sources.framing import frames_of
@@ -138,7 +138,7 @@ class FileSource:
             if stop.is_set():
                 return
             if self.frames >= report:
-                yield SourceHealth(int(stamps[0]), OK, "reading", {"device": self.device})
+                yield SourceHealth(int(stamps[0]), OK, READING, {"device": self.device})
                 report = self.frames + _HEALTH_FRAMES
             yield frames
             next_frame += len(item)
@@ -163,9 +163,9 @@ class FileSource:
                 rest = len(held) - len(held) % FRAME_SAMPLES
                 if rest:
                     yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
-                yield _Pause(moment.start, f"between the files {before} and {path.name}")
+                yield _Pause(moment.start, f"between the files {before} and {_text(path)}")
                 held, samples, begin = held[:0], 0, moment.start
-            before = path.name
+            before = _text(path)
             for block in read_audio(path, channels=self._channels, incomplete=self._faults.append):
                 samples += len(block)
                 held = np.concatenate([held, block])
@@ -256,5 +256,10 @@ def files_below(folder: Path) -> Iterator[Path]:
 def _name(paths: Sequence[Path]) -> str:
     """Name the files in a few words, since every diagnostic message repeats them."""
     if len(paths) == 1:
-        return paths[0].name
-    return f"{paths[0].name} … {paths[-1].name} ({len(paths)} files)"
+        return _text(paths[0])
+    return f"{_text(paths[0])} … {_text(paths[-1])} ({len(paths)} files)"
+
+
+def _text(path: Path) -> str:
+    """Return the name of a file as a log can have it, in UTF-8."""
+    return path.name.encode(errors="replace").decode()

@@ -222,7 +222,7 @@ def _start_decoding(path: Path) -> subprocess.Popen[bytes]:
         env=os.environ | {"LC_ALL": "C"},
         start_new_session=True,  # Ctrl-C is for the recorder
     )
-    with suppress(ProcessLookupError):  # which has threads, so that nothing runs before the start
+    with suppress(ProcessLookupError):  # not between fork and exec: this process has threads
         resource.prlimit(process.pid, resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (0, 0))
     return process

@@ -5,10 +5,12 @@ import mmap
 import os
 import re
 import shlex
+import struct
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from threading import RLock
 from typing import NamedTuple
@@ -32,6 +34,7 @@ _SUFFIXES = frozenset(
 _NO_LENGTH = 1 << 62  # libsndfile says more frames where a header has no length
 _MOST_BYTES = 0x7FFF_0000  # a header that claims more has no length
 _LEAST_BYTES = 1600  # less is missing where programs count or pad in their own way
+_LEAST_SECONDS = 0.1  # as far as lengths in headers are right
 _CLAIMED = re.compile(r"^ *(?:data|SSND|Data Size|riff) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
 _CLAIMED_RF64 = re.compile(r"frame count (\d+) does not match value from 'ds64' chunk of (\d+)")
 _NOT_MP3 = {b"RIFF", b"RF64", b"riff", b"fLaC", b"OggS", b"FORM", b"caff", b".snd"}  # begin so
@@ -123,10 +126,17 @@ def audio_seconds(path: Path) -> float:
         As `open_audio`.
     """
     with open_audio(path) as audio:
-        frames = audio.frames
-        if frames is None:
-            frames = sum(len(block) for block in audio.blocks(0, math.inf))
-        return float(frames / audio.rate)
+        if audio.frames is not None:
+            return float(audio.frames / audio.rate)
+    status = path.stat()
+    return _decoded_seconds(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(256)
+def _decoded_seconds(path: Path, _time: int, _size: int) -> float:
+    """Return the length of a file that has to be decoded for that, once as it is."""
+    with open_audio(path) as audio:
+        return float(sum(len(block) for block in audio.blocks(0, math.inf)) / audio.rate)
 
 
 def is_audio(name: str) -> bool:
@@ -188,10 +198,10 @@ def _check_rate(path: Path, rate: int) -> None:
 
 def _opened(path: Path, complaints: list[bytes]) -> soundfile.SoundFile:
     with _without_mpg123(path, complaints):
-        sound = soundfile.SoundFile(path)
+        sound = soundfile.SoundFile(os.fsencode(path))
     if sound.frames >= _NO_LENGTH:
         sound.close()
-        return _Unseekable(path)
+        return _Unseekable(os.fsencode(path))
     if sound.frames == 0 and (mended := _mended_wav(path)) is not None:
         sound.close()
         return soundfile.SoundFile(mended)
@@ -215,8 +225,11 @@ def _mended_wav(path: Path) -> _View | None:
     with path.open("rb") as file:
         view = _View(file.fileno(), 0, access=mmap.ACCESS_COPY)
     place = 12
-    while view[:4] == b"RIFF" and place + 8 < len(view):
+    while view[:4] in {b"RIFF", b"RF64"} and place + 8 < len(view):
         name, size = view[place : place + 4], int.from_bytes(view[place + 4 : place + 8], "little")
+        if name == b"data" and view[:4] == b"RF64" and view[12:16] == b"ds64":
+            view[20:36] = struct.pack("<QQ", len(view) - 8, len(view) - place - 8)
+            return view
         if name == b"data" and size == 0 and not _is_chunk(view, place + 8):
             view[place + 4 : place + 8] = b"\xff" * 4
             return view
@@ -257,8 +270,9 @@ def _by_libsndfile(
             return ""
         if hidden:
             return f"does not say how long it is; install ffmpeg, which reads {hidden:.0f} s more"
-        is_mp3 = sound.format == "MP3"  # its length may be an estimate
-        is_short = frames is not None and place < frames and not is_mp3
+        is_mp3 = sound.subtype.startswith("MPEG")  # its length may be an estimate
+        missing = 0 if frames is None or is_mp3 else frames - place
+        is_short = missing > _LEAST_SECONDS * sound.samplerate
         if is_broken or is_short or (is_mp3 and any(map(_BROKEN_MP3.search, complaints))):
             return _damage(place / sound.samplerate)
         return _cut(path, sound, place / sound.samplerate)
@@ -282,8 +296,7 @@ def _read(
 
 def _cut(path: Path, sound: soundfile.SoundFile, seconds: float) -> str:
     """Say that a file ends before its sound does, if it does."""
-    is_open = sound.format == "OGG" and not _is_ended(path)
-    if is_open or _claims_more(sound.extra_info):
+    if _claims_more(sound.extra_info) or _is_cut(path):
         return f"is cut short: its sound ends at {seconds:.2f} s"
     return ""
 
@@ -342,13 +355,22 @@ def _claims_more(log: str) -> bool:
     return any(int(claimed) > int(found) for found, claimed in _CLAIMED_RF64.findall(log))
 
 
-def _is_ended(path: Path) -> bool:
-    """Whether the last page of an Ogg file says that it is the last one."""
-    with path.open("rb") as file:
-        file.seek(max(path.stat().st_size - _OGG_PAGE, 0))
-        tail = file.read()
-    place = tail.rfind(b"OggS")
-    return place >= 0 and bool(tail[place + 5 : place + 6] and tail[place + 5] & _OGG_END)
+def _is_cut(path: Path) -> bool:
+    """Whether an Ogg file has no last page, or a CAF file less sound than its header claims."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
+        if view[:4] == b"OggS":
+            place = view.rfind(b"OggS", len(view) - min(len(view), _OGG_PAGE))
+            flags = view[place + 5 : place + 6] if place >= 0 else b""
+            return not flags or not flags[0] & _OGG_END
+        place = 8
+        while view[:4] == b"caff" and place + 12 <= len(view):
+            size = int.from_bytes(view[place + 4 : place + 12], signed=True)
+            if size < 0:  # unknown
+                return False
+            if view[place : place + 4] == b"data":
+                return place + 12 + size > len(view)
+            place += 12 + size
+    return False
 
 
 @contextmanager
@@ -417,8 +439,12 @@ def _by_ffmpeg(path: Path, decoder: FileDecoder) -> OpenAudio:
                 yield block[skipped:]
 
     def fault() -> str:
-        if place >= end or not (reason or decoder.fault()):
+        if place >= end:
             return ""
-        return _damage(place / decoder.rate)
+        if reason or decoder.fault():
+            return _damage(place / decoder.rate)
+        return (
+            f"is cut short: its sound ends at {place / decoder.rate:.2f} s" if _is_cut(path) else ""
+        )
 
     return OpenAudio(decoder.rate, decoder.channels, None, blocks, fault)

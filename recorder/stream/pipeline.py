@@ -14,14 +14,14 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.direction.geometry import ArrayGeometry
-from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
+from hearthlog.recorder.events import OK, READING, WARNING, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.direction_messages import ArrayDirections, direction_messages
 from hearthlog.recorder.stream.feature_messages import FeatureMessages
 from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
-from hearthlog.recorder.stream.sound_watch import SoundWatch
+from hearthlog.recorder.stream.sound_watch import SoundWatch, problem_of_file
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY, RollingStatistics
 from hearthlog.recorder.stream.veil import Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
@@ -325,6 +325,7 @@ class Pipeline:
         if not problem and self._directions is not None:
             problem = self._directions.problem()
         if health.level == OK and problem:
+            problem = problem_of_file(problem) if health.summary == READING else problem
             return replace(health, level=WARNING, summary=problem)
         return health
 

@@ -31,6 +31,18 @@ FAINT = "a whole day was 30 dB fainter than before: is the microphone covered or
 LOUD = "the room is as loud as most sounds: turn the microphone down, or put it elsewhere"
 
 
+def problem_of_file(problem: str) -> str:
+    """Say what is wrong with the sound of an audio file.
+
+    Parameters
+    ----------
+    problem : str
+        As if a microphone were heard now.
+    """
+    what = problem.partition(":")[0].replace("the microphone", "the file")
+    return f"{what}: check with what it was recorded, and how"
+
+
 class SoundWatch:
     """Watches the sound of one microphone."""
 
