@@ -209,7 +209,7 @@ class _Figures(Collector):
 
     def _of_microphones(self) -> Iterator[Metric]:
         node = self._home.node
-        microphones = self._news.state.microphones.values()
+        microphones = self._news.state.present()
 
         def each(value: Callable[[Any], float]) -> list[tuple[tuple[str, ...], float]]:
             return [((node, microphone.name), value(microphone)) for microphone in microphones]

@@ -123,7 +123,7 @@ function showLane({ svg, cells }, it, gaps, day, width) {
   set(moment, "d", `M${day.now * width} 0V${LANE}`);
   [it.today, it.night, it.last].forEach((value, index) => {
     cells[index].className = value ? "" : "none";
-    write(cells[index], String(value || (index < 2 ? 0 : "not lately")));
+    write(cells[index], String(value ?? "not known") || "not lately");
   });
 }
 
