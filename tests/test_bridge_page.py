@@ -486,6 +486,39 @@ def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_n
     assert (lane["today"], lane["night"], lane["told"]) == (0, 1, "Music: never today")
 
 
+@pytest.mark.parametrize(
+    ("first", "gap", "today_known", "night_known"),
+    [
+        (-12, None, True, True),
+        (-1, None, True, True),  # 7 of the 9 hours of the night
+        (1, None, True, False),
+        (9, None, True, False),  # a recorder that was started this morning
+        (-12, (-2, 1), True, False),
+        (-12, (-2, 10), False, False),
+    ],
+)
+def test_a_0_is_said_only_where_it_was_listened_for(first, gap, today_known, night_known):
+    begin, hour = at(UTC, 2026, 5, 5), 3600 * NANOSECONDS
+    state = HomeState()
+    state.push([segments("mic", (begin + first * hour, begin + first * hour + 9, "music"))])
+    if gap:
+        start, end = (begin + edge * hour for edge in gap)
+        times = np.array([end])
+        fields = {"header.stamp": np.array([start]), "duration": np.array([end - start])}
+        state.push([Columns("/mic/gap", message_types.GAP, {}, times, times, times, fields)])
+    (microphone,) = state.microphones.values()
+    microphone.classes, microphone.seen = ["silence", "coughing"], time.monotonic()
+    now = today(begin + 10 * hour, UTC)
+    lanes = {
+        each["words"]: each for each in day_picture([microphone], now, UTC)["rooms"][0]["lanes"]
+    }
+    cough = lanes["Coughing"]
+    assert cough["today"] == (0 if today_known else None)
+    assert cough["night"] == (0 if night_known else None)
+    assert ("not known" in cough["told"]) == (not today_known)
+    assert lanes["Music"]["night"] == (1 if -2 <= first < 7 else lanes["Coughing"]["night"])
+
+
 def test_what_was_not_heard_is_marked_as_such():
     begin = at(UTC, 2026, 5, 5)
     hour = 3600 * NANOSECONDS
@@ -699,6 +732,8 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     assert [name for role, name in tree if role == "region"] == regions
     images = [name for role, name in tree if role == "image"]
     assert len(images) == len(GENERAL) - 1
+    cells = [name for role, name in tree if role in {"cell", "gridcell"}]
+    assert "not known" in cells  # of the last night, before which nothing was recorded
     assert any(name.startswith("Coughing: once today, last at ") for name in images)
     assert "Crying: never today" in images
     buttons = [name for role, name in tree if role == "DisclosureTriangle"]

@@ -56,7 +56,10 @@ def rows_of(page):
     """The cells of the rows of all tables, by the first of each."""
     found = {}
     for row in re.findall(r"<tr.*?</tr>", page, re.DOTALL):
-        cells = [text_of(cell) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, re.DOTALL)]
+        cells = [
+            " ".join(re.sub(r"<[^>]*>", " ", cell).split())
+            for cell in re.findall(r"<t[hd].*?</t[hd]>", row, re.DOTALL)
+        ]
         found.setdefault(cells[0], cells[1:])
     return found
 
@@ -239,15 +242,14 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     unknown = [day.count("yelling"), day.minutes("music"), day.night_count("coughing"), day.quiet]
     unknown += [day.night_sound, day.night_stretches, day.first, day.last]
     assert unknown == [None] * 8
-    rows = rows_of(page_of(tmp_path, tmp_path))
+    page = page_of(tmp_path, tmp_path)
+    rows = rows_of(page)
     for title in ("Longest quiet stretch, 07:00 to 22:00", "First lively time", "Times with sound"):
         assert rows[title] == ["not known"]
-    assert rows["Yelling"] == ["not known", "not known"]
+    assert rows["Shouting"] == ["not known", "not known"]
     assert rows["Behaviour: shouting"][1] == "not known"
     assert rows["Coughing"] == ["under 1 min", "1"]
-    text = text_of(page_of(tmp_path, tmp_path, DAY - timedelta(days=6), 7))
-    assert "0 min" not in text
-    assert "It was quiet" not in text
+    assert "It was quiet" not in page
 
 
 @pytest.mark.parametrize(("last", "known"), [(16, False), (18, True)])
