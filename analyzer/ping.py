@@ -1,10 +1,17 @@
 """A sign of life to a watchdog on the network, which raises the alarm when it stays away."""
 
+import urllib.error
 import urllib.request
+from http.client import HTTPException
+from pathlib import Path
 from threading import Thread
 from urllib.parse import urlsplit
 
+from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.storage.small_file import read_whole
+
 _SECONDS = 15.0
+_LONGEST = 1 << 12  # bytes of a file
 
 
 def is_ping_address(url: str) -> bool:
@@ -14,8 +21,35 @@ def is_ping_address(url: str) -> bool:
     ----------
     url : str
     """
-    parts = urlsplit(url)
-    return parts.scheme in {"http", "https"} and bool(parts.hostname)
+    try:
+        parts = urlsplit(url)
+        is_whole = parts.scheme in {"http", "https"} and bool(parts.hostname)
+        _ = parts.port
+    except ValueError:
+        return False
+    return is_whole and url.isascii() and url.isprintable() and " " not in url
+
+
+def read_ping_address(file: Path) -> str:
+    """Read a file of one line with an address: who knows it could ping in the place of the box.
+
+    Parameters
+    ----------
+    file : Path
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or has no such address.
+    """
+    data = read_whole(file, "file of a ping address", _LONGEST, DataError)
+    url = data.decode("utf-8-sig", "replace").strip()
+    if not is_ping_address(url):
+        raise DataError(
+            f"{file}: has no address that can be asked for; write one such as "
+            "https://hc-ping.com/your-uuid on one line"
+        )
+    return url
 
 
 def ping(url: str, *, is_well: bool) -> str:
@@ -40,9 +74,14 @@ def ping(url: str, *, is_well: bool) -> str:
                 url if is_well else f"{url.rstrip('/')}/fail", timeout=_SECONDS
             ):
                 problems.clear()
-        except (OSError, ValueError) as error:
+        except urllib.error.HTTPError as error:
+            problems[:] = [f"status {error.code}"]
+        except (OSError, ValueError, HTTPException) as error:
             reason = getattr(error, "reason", None) or error
-            problems[:] = [str(getattr(reason, "strerror", None) or reason)]
+            # What others say may have the address in it, which is a secret.
+            is_late = isinstance(reason, TimeoutError)
+            what = "timed out" if is_late else getattr(reason, "strerror", None)
+            problems[:] = [what or type(reason).__name__]
 
     thread = Thread(target=ask, daemon=True)
     thread.start()

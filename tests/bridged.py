@@ -79,7 +79,9 @@ def _counts(segments, zone, root: str) -> dict[str, str]:
         begun = [datetime.fromtimestamp(start / NANOSECONDS, zone) for start in events.starts]
         topic = f"{root}/class/{label}"
         values[f"{topic}/count_today"] = str(sum(start >= midnight for start in begun))
-        values[f"{topic}/count_night"] = str(sum(night <= start < morning for start in begun))
+        # The homes here were heard for seconds: that there was nothing in a night is not known.
+        of_night = sum(night <= start < morning for start in begun)
+        values[f"{topic}/count_night"] = str(of_night or None)
         last = int(events.ends[-1]) // 1_000_000
         moment = datetime.fromtimestamp(last // 1000, zone).replace(microsecond=last % 1000 * 1000)
         values[f"{topic}/last_heard"] = moment.isoformat(timespec="milliseconds")

@@ -37,7 +37,7 @@ class Ending(NamedTuple):
     @property
     def wrong(self) -> list[str]:
         """Topics whose value is another, or that should say nothing."""
-        nothing = {"OFF", "0"}
+        nothing = {"OFF", "0", "None"}
         return [
             topic
             for topic in self.found.keys() | self.expected.keys()

@@ -6,12 +6,14 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from livehome import LiveHome, midday_zone
 from viewers import free_port, patiently
 
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.analyzer.bridge.settings import PageSettings
@@ -56,16 +58,17 @@ PALE_TEXTS = """
 class Served:
     """A home whose log is being written, and its page."""
 
-    def __init__(self, folder, **options):
+    def __init__(self, folder, settings=None, **options):
+        self.settings = settings or {}
         self.log = LiveHome(folder / "logs", **options)
         self.home = Home(folder / "logs", "home", midday_zone())
         self.state, self.said, self.port = folder / "state", [], free_port()
         self._start()
 
     def _start(self):
-        settings = PageSettings(port=self.port)
-        page = HomePage(settings, self.home, self.state, self.said.append)
-        self.url = self.said[-1].partition(": ")[2]
+        settings = PageSettings(port=self.port, **self.settings)
+        page = self._page = HomePage(settings, self.home, self.state, self.said.append)
+        self.url = (self.state / "page-address").read_text().strip()
         self.token = self.url.partition("=")[2]
         now = today(time.time_ns(), self.home.zone)
         self._stop = threading.Event()
@@ -84,6 +87,14 @@ class Served:
     def close(self):
         self.end()
         self.log.close()
+
+    def open_pages(self):
+        """How many browsers get the news."""
+        return server._MOST_STREAMS - self._page._server.streams._value
+
+    def threads(self):
+        """The threads that answer requests."""
+        return [each for each in threading.enumerate() if "process_request" in each.name]
 
     def connect(self):
         return socket.create_connection(("127.0.0.1", self.port), timeout=30)
@@ -146,12 +157,74 @@ class Served:
 
 
 @contextmanager
-def serving(folder, **options):
-    served = Served(folder, **options)
+def serving(folder, settings=None, **options):
+    served = Served(folder, settings, **options)
     try:
         yield served
     finally:
         served.close()
+
+
+@contextmanager
+def proxying(port, path):
+    """A proxy of its own port that has the page below a path; yields the address."""
+
+    class Proxy(BaseHTTPRequestHandler):
+        def do_GET(self):
+            inside = self.path.removeprefix(path)
+            if inside == self.path or not inside.startswith("/"):
+                self.send_error(404)
+                return
+            body = self.rfile.read(int(self.headers.get("Content-Length", "0")))
+            behind = HTTPConnection("127.0.0.1", port, timeout=30)
+            behind.request(self.command, inside, body, dict(self.headers))
+            answer = behind.getresponse()
+            self.send_response_only(answer.status)
+            for name, value in answer.getheaders():
+                self.send_header(name, value)
+            self.end_headers()
+            with suppress(OSError):
+                while block := answer.read1(65536):
+                    self.wfile.write(block)
+            behind.close()
+
+        def do_POST(self):
+            self.do_GET()
+
+        def log_message(self, *_):
+            pass
+
+    with _answering(Proxy) as address:
+        yield f"{address}{path.removeprefix('/')}/"
+
+
+@contextmanager
+def pages(content):
+    """A server of one page; yields its address."""
+
+    class Pages(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_):
+            pass
+
+    with _answering(Pages) as address:
+        yield address
+
+
+@contextmanager
+def _answering(handler):
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as own:
+        own.daemon_threads = True
+        own.block_on_close = False
+        threading.Thread(target=own.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{own.server_port}/"
+        own.shutdown()
 
 
 class Phone:
@@ -216,6 +289,9 @@ class Phone:
             for node in nodes
             if not node["ignored"]
         ]
+
+    def cookies(self, address):
+        return self._browser.call("Network.getCookies", urls=[address])["cookies"]
 
     def framed(self):
         """The addresses that a frame could not show."""

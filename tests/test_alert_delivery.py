@@ -9,16 +9,23 @@ import threading
 import time
 from contextlib import contextmanager
 from datetime import UTC
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from hearthlog.analyzer.bridge.alerts import output
 from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
-from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.outbox import UNREAD, Outbox
+from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
 from hearthlog.analyzer.bridge.alerts.ring import Ring
+from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.alerts.targets import read_targets
 from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page.page_token import page_token
 
 # Apprise asks for it where there is one.
@@ -190,8 +197,7 @@ def test_the_pauses_after_a_failure_grow_to_a_quarter_of_an_hour_and_begin_anew(
     outbox = Outbox(tmp_path, ["a"], pytest.fail)
     outbox.put([ring(1), ring(2)])
     delivery = Delivery(outbox, [], "home", UTC, lambda _: None)
-    delivery._stop = Stop()
-    delivery._run(Failing())
+    delivery._run(Failing(), Stop())
     pauses = [seconds for seconds in waits if seconds != 0.5]
     assert pauses == [5, 10, 20, 40, 80, 160, 320, 640, 900, 5, 10]
 
@@ -210,6 +216,99 @@ def test_a_line_that_is_no_address_is_named_by_its_number_and_not_told(tmp_path)
         read_targets(file, pytest.fail)
     assert str(error.value).startswith(f"{file}, line 4: no address that Apprise knows")
     assert "hush" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "mark", "end"),
+    [("utf-8", "\ufeff", "\r\n"), ("utf-16-le", "\ufeff", "\r\n"), ("utf-8", "", "\r")],
+)
+def test_a_file_of_addresses_is_read_as_editors_write_it(tmp_path, encoding, mark, end):
+    file = tmp_path / "urls"
+    lines = ["json://127.0.0.1/a", "", "# é", "  json://127.0.0.1/b  ", "json://127.0.0.1/a"]
+    file.write_bytes(f"{mark}{end.join(lines)}{end}".encode(encoding))
+    file.chmod(0o600)
+    assert [each.place[:6] for each in read_targets(file, pytest.fail)] == ["line 1", "line 4"]
+
+
+def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_it_is_mended(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
+    home, said, broker = Home(tmp_path / "logs", "home", UTC), [], []
+    now = time.time_ns()
+    rung = [Ring("it", now + n, f"ring {n}", is_known=True, due=now) for n in (1, 2)]
+
+    def tell(_name, text, _time):
+        broker.append(text)
+        return True
+
+    with server() as (port, good), server() as (other, mended):
+        right, typo = f"json://127.0.0.1:{port}", f"jsno://hush:hush@127.0.0.1:{other}"
+        file = addresses(tmp_path, right, typo)
+        settings = DeliverySettings(urls_file=file)
+        for ring_now in rung:  # before and after a start of the bridge
+            own = AlertsOutput([], settings, home, tmp_path, said.append, tell)
+            own._outbox.put([ring_now])
+            wait_for(partial(_is_told, own, broker))
+            wait_for(lambda: len(good) == 1)
+            assert broker[0].endswith(ring_now.text)
+            assert good[0].endswith(ring_now.text)
+            broker.clear()
+            good.clear()
+            assert mended == []
+            if ring_now is rung[0]:
+                own.close()
+        addresses(tmp_path, right, typo.replace("jsno", "json"))
+        wait_for(lambda: len(mended) == 2)
+        wait_for(lambda: len(own._outbox) == 0)
+        addresses(tmp_path, typo)  # nobody is left but the broker
+        wait_for(lambda: UNREAD in own._outbox._targets)
+        own._outbox.put([rung[0]._replace(text="alone", rule="other")])
+        wait_for(partial(_is_told, own, broker))
+        own.close()
+    assert [text.partition(": ")[2] for text in mended] == ["ring 1", "ring 2"]
+    assert good == []
+    assert {line.partition(";")[0] for line in said} == {
+        f"alerts: {file}, line 3: no address that Apprise knows",
+        f"alerts: {file}, line 2: no address that Apprise knows",
+        f"alerts: {file}: every line of it can be read now",
+    }
+
+
+def _is_told(own, broker):
+    own.update(SimpleNamespace(state=HomeState()))
+    return len(broker) == 1
+
+
+def test_what_waits_for_a_wrong_line_alone_is_dropped_after_a_day(tmp_path):
+    now = time.time_ns()
+    old, recent = (
+        Ring("it", now - hours * 3600 * SECOND, "", is_known=True, due=0) for hours in (25, 23)
+    )
+    outbox = Outbox(tmp_path, ["a", UNREAD], pytest.fail)
+    outbox.put([old, recent])
+    for each in (old, recent):
+        outbox.note_told("a", each)
+    outbox.put([])
+    outbox.set_targets(["b"], now)
+    assert outbox.waiting_for("b", now) == [recent]
+
+
+@pytest.mark.parametrize("content", [None, "", "# nothing\n"])
+def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
+    file, said, told = tmp_path / "urls", [], []
+    if content is not None:
+        file.write_text(content)
+        file.chmod(0o600)
+    settings, home = DeliverySettings(urls_file=file), Home(tmp_path / "logs", "home", UTC)
+    own = AlertsOutput(
+        [], settings, home, tmp_path, said.append, lambda *given: told.append(given) or True
+    )
+    own._outbox.put([ring(1)])
+    own.update(SimpleNamespace(state=HomeState()))
+    own.close()
+    assert len(told) == 1
+    assert said[0].startswith(f"alerts: {file}: no ")
 
 
 def test_a_file_without_an_address_and_one_that_is_not_there_are_refused(tmp_path):
@@ -299,6 +398,7 @@ def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):
 DELIVERING = """
 import sys, time
 from datetime import UTC
+from functools import partial
 from pathlib import Path
 from hearthlog.analyzer.bridge.alerts.delivery import Delivery
 from hearthlog.analyzer.bridge.alerts.outbox import Outbox

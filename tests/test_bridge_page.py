@@ -1,27 +1,34 @@
 """The page of the home: who may read it, what it shows, and how one says what a sound was."""
 
+import dataclasses
 import json
+import socket
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
-from http.client import HTTPConnection, HTTPException
+from http.client import HTTPConnection
+from types import SimpleNamespace
 from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
 from homelife import GENERAL
 from livehome import LiveHome
-from servedhome import JSON, PALE_TEXTS, Phone, serving
+from pydantic import ValidationError
+from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
 from viewers import address_of, browsing, free_port, patiently
 
+from hearthlog.analyzer.bridge import http_server
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
+from hearthlog.analyzer.bridge.http_server import HttpServer
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.outputs import open_outputs
 from hearthlog.analyzer.bridge.page import server
+from hearthlog.analyzer.bridge.page.admission import PageAdmission
 from hearthlog.analyzer.bridge.page.board import Board
 from hearthlog.analyzer.bridge.page.day_picture import day_picture
 from hearthlog.analyzer.bridge.page.health_list import health_list
@@ -67,10 +74,11 @@ def test_without_the_token_one_learns_how_to_get_the_address_and_nothing_else(se
     answers = {served.ask("GET", path, cookie=cookie)[::2] for cookie in cookies}
     answers |= {served.ask("GET", target, cookie=None)[::2] for target in targets}
     answers.add(served.ask("POST", path, "{}", None, Origin=served.url.partition("/?")[0])[::2])
-    ((status, text),) = answers
-    assert status == 403
-    assert "its whole address" in text
-    assert "<" not in text
+    assert {status for status, _ in answers} == {403}
+    for _, text in answers:
+        assert "its whole address" in text
+        assert "<" not in text
+        assert token[:-1] not in text
 
 
 @pytest.mark.parametrize(
@@ -81,6 +89,120 @@ def test_a_name_that_somebody_lets_point_here_gets_nothing(served, host):
         assert served.ask("GET", target, Host=f"{host}:{served.port}")[0] == 403
     assert served.ask("GET", "/", Host="127.0.0.1:9999")[0] == 200  # the other end of a tunnel
     assert served.ask("GET", "/", Host=f"localhost:{served.port}")[0] == 200
+
+
+@pytest.fixture(scope="module")
+def dashboard():
+    """A page of another server of this machine."""
+    with pages(b"<!doctype html><title>Dashboard</title>") as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory, dashboard):
+    names = ["Raspberrypi.local", "home.example:8443"]
+    settings = {"names": names, "frames": [dashboard.rstrip("/")]}
+    with serving(tmp_path_factory.mktemp("named"), settings) as home:
+        home.log.heard("coughing", 90, 3, 0.95)
+        home.log.hears("silence")
+        with home.stream() as part:
+            part("events", lambda events: events["events"])
+        yield home
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("raspberrypi.local:8380", 200),
+        ("RaspberryPi.local", 200),
+        ("home.example:8443", 200),
+        ("home.example", 403),
+        ("home.example:80", 403),
+        ("raspberrypi.local.evil.example", 403),
+        ("evil.example", 403),
+        ("127.0.0.1", 200),
+    ],
+)
+def test_a_name_that_the_configuration_has_opens_the_page(named, host, status):
+    assert named.ask("GET", "/", Host=host)[0] == status
+    assert named.ask("GET", "/", Host=host, cookie=None)[0] == 403
+
+
+def test_who_asks_by_a_name_is_told_so_and_which_key_allows_it(served):
+    whole = f"/?token={served.token}"
+    status, _, text = served.ask("GET", whole, cookie=None, Host="raspberrypi.local:8380")
+    assert status == 403
+    assert 'names = ["raspberrypi.local"] in [bridge.page]' in text
+    assert "its whole address" not in text
+    for host in ("<script>", "a b", "x" * 300, '"', "[::1"):
+        status, _, text = served.ask("GET", whole, cookie=None, Host=host)
+        assert (status, host in text, "in digits" in text) == (403, False, True)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        ("raspberrypi.local", "https://raspberrypi.local", 422),
+        ("127.0.0.1:8380", "https://home.example:8443", 422),  # a proxy that asks by its own
+        ("127.0.0.1:8380", "https://home.example", 403),
+        ("raspberrypi.local", "http://raspberrypi.local:3000", 403),  # another server there
+        ("raspberrypi.local", "ftp://raspberrypi.local", 403),
+        ("127.0.0.1:8380", "http://127.0.0.1:9", 403),  # it may show a frame, and no more
+    ],
+)
+def test_behind_a_proxy_the_page_itself_marks_and_no_other(named, host, origin, status):
+    body = json.dumps({"event": "none", "label": "music"})
+    answer = named.ask("POST", "/mark", body, Host=host, Origin=origin, **JSON)
+    assert answer[0] == status
+    assert ("names" in answer[2]) == (status == 403)
+
+
+def test_the_reasons_of_a_refusal_are_told_apart(served):
+    cookie = served.cookie()
+    until = int(cookie.partition("=")[2].partition("-")[0])
+    told = {
+        name: served.ask("GET", path, cookie=given)[2].partition(".")[0]
+        for name, path, given in [
+            ("nothing", "/", None),
+            ("wrong", f"/?token={served.token[:-1]}", None),
+            ("longer", "/", cookie.replace(str(until), str(until + 9))),
+            ("old", "/", cookie.replace(str(until), "1")),
+            ("broken", "/", f"{cookie}x"),
+        ]
+    }
+    assert told.pop("nothing").startswith("This page opens with its whole address only")
+    assert told.pop("wrong") == "The token in this address is not the one of the page"
+    assert {*told.values()} == {"What this browser remembers of the page is valid no more"}
+
+
+def test_a_cookie_is_void_with_another_key_token_or_port_or_after_a_year(monkeypatch):
+    own = PageAdmission("127.0.0.1", 8380, "x" * 20, b"key")
+    given = own.new_pass()
+    assert own.is_pass(given)
+    others = {"key": b"other"}, {"token": "y" * 20}, {"port": 8381}
+    assert not any(dataclasses.replace(own, **other).is_pass(given) for other in others)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 366 * 86400)
+    assert not own.is_pass(given)
+    texts = "", "-", "-x", "1-", f"{10**30}-x", "é-x", given[:-1]
+    assert not any(map(own.is_pass, texts))
+
+
+@pytest.mark.parametrize(
+    ("table", "what"),
+    [
+        ({"names": ["http://raspberrypi.local"]}, "without http://"),
+        ({"names": ["*"]}, "is no name of a host"),
+        ({"names": ["a b"]}, "is no name of a host"),
+        ({"frames": ["homeassistant.local"]}, "is no address of a page"),
+        ({"frames": ["http://x; script-src *"]}, "is no address of a page"),
+        ({"frames": ["http://ha.local/lovelace"]}, "without a path"),
+        ({"frames": ["*"]}, "is no address of a page"),
+    ],
+)
+def test_names_and_frames_that_are_none_are_refused(table, what):
+    with pytest.raises(ValidationError, match=what):
+        PageSettings.model_validate(table)
 
 
 def test_two_hosts_get_nothing(served):
@@ -106,9 +228,10 @@ def test_another_page_marks_nothing_though_the_browser_sends_the_cookie(served, 
 def test_the_address_gives_a_cookie_that_no_script_reads_and_that_has_no_token(served):
     status, fields, text = served.ask("GET", f"/?token={served.token}", cookie=None)
     assert status == 200
-    assert 'url=/"' in text
+    assert 'url=./"' in text
     rules = {rule.strip() for rule in fields["Set-Cookie"].split(";")[1:]}
-    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= rules
+    assert {"HttpOnly", "SameSite=Strict"} <= rules
+    assert not any(rule.startswith("Path") for rule in rules)  # below a path of a proxy it is that
     assert served.token not in f"{fields}{text}"
     assert served.ask("GET", "/")[0] == 200
 
@@ -163,21 +286,35 @@ def test_a_head_that_is_too_long_is_not_read(served):
     assert not answer.startswith(b"HTTP/1.1 200")
 
 
-def test_too_many_connections_are_turned_away_until_others_end(served):
-    held = [served.connect() for _ in range(server._MOST_CONNECTIONS)]
-    answer = b""
-    with served.connect() as late, suppress(ConnectionError):
-        late.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        answer = late.recv(12)
-    assert answer in {b"", b"HTTP/1.1 503"}
-    for each in held:
-        each.close()
+@pytest.mark.parametrize("so_far", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: "])
+def test_strangers_who_hold_connections_do_not_keep_out_who_has_the_token(served, so_far):
+    cookie = served.cookie()
+    with ExitStack() as held:
+        for _ in range(3):
+            for _ in range(http_server.MOST_ASKING):
+                own = held.enter_context(served.connect())
+                with suppress(ConnectionError):
+                    own.sendall(so_far)
+            assert served.ask("GET", "/", cookie=cookie)[0] == 200
+        with patiently(served.open_stream, bool):
+            assert served.ask("GET", "/", cookie=cookie)[0] == 200
+        assert len(served.threads()) <= http_server.MOST_ASKING + http_server.MOST_ADMITTED
 
-    def answers():
-        with suppress(HTTPException, KeyError):
-            return served.ask("GET", "/")[0]
 
-    assert patiently(answers, lambda status: status == 200)
+def test_one_address_of_the_network_takes_no_place_of_another(monkeypatch):
+    monkeypatch.setattr(http_server, "MOST_ASKING", 4)
+    with ExitStack() as stack:
+        own = HttpServer("127.0.0.1", 0, http_server.HttpHandler)
+        stack.callback(own.end)
+        own.start()
+        first = stack.enter_context(socket.socket())
+        first.bind(("127.0.0.9", 0))
+        first.connect(own.server_address)
+        for _ in range(9):
+            stack.enter_context(socket.create_connection(own.server_address))
+        first.settimeout(0.5)
+        with pytest.raises(TimeoutError):  # it is not ended
+            first.recv(1)
 
 
 def test_too_many_open_pages_leave_room_for_the_page_itself(served):
@@ -190,7 +327,7 @@ def test_too_many_open_pages_leave_room_for_the_page_itself(served):
 
 
 def test_who_sends_a_request_for_ever_is_cut_off(served, monkeypatch):
-    monkeypatch.setattr(server, "_SECONDS", 0.2)
+    monkeypatch.setattr(http_server, "SECONDS", 0.2)
     with served.connect() as connection, suppress(ConnectionError):
         connection.sendall(b"GET / HTTP/1.1\r\n")
         while True:  # until the other side ends: by reset, or by an end
@@ -260,9 +397,23 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path):
     for _ in range(2):
         home = Home(tmp_path, "home", UTC)
         HomePage(PageSettings(port=free_port()), home, tmp_path / "state", said.append).close()
-    (path,) = (tmp_path / "state").iterdir()
-    assert path.stat().st_mode & 0o777 == 0o600
-    assert {line.partition("token=")[2] for line in said} == {path.read_text().strip()}
+    secrets = {path.name: path for path in (tmp_path / "state").iterdir()}
+    assert {*secrets} == {"page-token", "page-cookies", "page-address"}
+    assert {path.stat().st_mode & 0o777 for path in secrets.values()} == {0o600}
+    token = secrets["page-token"].read_text().strip()
+    assert secrets["page-address"].read_text().strip().endswith(f"/?token={token}")
+    # A service would say it to its journal.
+    assert not any(path.read_text().strip() in line for path in secrets.values() for line in said)
+    assert all(str(secrets["page-address"]) in line for line in said)
+
+
+def test_a_terminal_is_shown_the_whole_address(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    said = []
+    HomePage(
+        PageSettings(port=free_port()), Home(tmp_path, "home", UTC), tmp_path, said.append
+    ).close()
+    assert said[0].endswith(f"/?token={(tmp_path / 'page-token').read_text().strip()}")
 
 
 @pytest.mark.parametrize(
@@ -271,7 +422,7 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path):
 def test_a_file_that_has_no_token_is_refused(tmp_path, text):
     file = tmp_path / "token"
     file.write_text(text)
-    with pytest.raises(BridgeError, match="no token of the page"):
+    with pytest.raises(BridgeError, match="has no token"):
         HomePage(PageSettings(token_file=file), Home(tmp_path, "home", UTC), tmp_path, print)
 
 
@@ -333,6 +484,39 @@ def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_n
     (lane,) = day_picture(state.microphones.values(), now, UTC)["rooms"][0]["lanes"]
     assert lane["bars"] == "9" * 30 + "0" * 690
     assert (lane["today"], lane["night"], lane["told"]) == (0, 1, "Music: never today")
+
+
+@pytest.mark.parametrize(
+    ("first", "gap", "today_known", "night_known"),
+    [
+        (-12, None, True, True),
+        (-1, None, True, True),  # 7 of the 9 hours of the night
+        (1, None, True, False),
+        (9, None, True, False),  # a recorder that was started this morning
+        (-12, (-2, 1), True, False),
+        (-12, (-2, 10), False, False),
+    ],
+)
+def test_a_0_is_said_only_where_it_was_listened_for(first, gap, today_known, night_known):
+    begin, hour = at(UTC, 2026, 5, 5), 3600 * NANOSECONDS
+    state = HomeState()
+    state.push([segments("mic", (begin + first * hour, begin + first * hour + 9, "music"))])
+    if gap:
+        start, end = (begin + edge * hour for edge in gap)
+        times = np.array([end])
+        fields = {"header.stamp": np.array([start]), "duration": np.array([end - start])}
+        state.push([Columns("/mic/gap", message_types.GAP, {}, times, times, times, fields)])
+    (microphone,) = state.microphones.values()
+    microphone.classes, microphone.seen = ["silence", "coughing"], time.monotonic()
+    now = today(begin + 10 * hour, UTC)
+    lanes = {
+        each["words"]: each for each in day_picture([microphone], now, UTC)["rooms"][0]["lanes"]
+    }
+    cough = lanes["Coughing"]
+    assert cough["today"] == (0 if today_known else None)
+    assert cough["night"] == (0 if night_known else None)
+    assert ("not known" in cough["told"]) == (not today_known)
+    assert lanes["Music"]["night"] == (1 if -2 <= first < 7 else lanes["Coughing"]["night"])
 
 
 def test_what_was_not_heard_is_marked_as_such():
@@ -548,6 +732,8 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     assert [name for role, name in tree if role == "region"] == regions
     images = [name for role, name in tree if role == "image"]
     assert len(images) == len(GENERAL) - 1
+    cells = [name for role, name in tree if role in {"cell", "gridcell"}]
+    assert "not known" in cells  # of the last night, before which nothing was recorded
     assert any(name.startswith("Coughing: once today, last at ") for name in images)
     assert "Crying: never today" in images
     buttons = [name for role, name in tree if role == "DisclosureTriangle"]
@@ -634,6 +820,45 @@ def test_the_page_says_when_the_box_is_gone_and_goes_on_when_it_is_back(phone, t
         phone.shows("#trouble", "There is no connection to the box. What you see is of 12:")
         home.restart()
         phone.until('document.getElementById("trouble").hidden')
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+def test_a_page_that_is_allowed_shows_it_in_a_frame_also_of_another_site(
+    phone, named, dashboard, host
+):
+    phone._browser.call("Network.clearBrowserCookies")
+    phone._browser.open(dashboard)
+    patiently(named.open_pages, lambda number: number == 0)
+    # By the name that is another site, no browser keeps the cookie.
+    phone.of(
+        "document.body.append(Object.assign(document.createElement('iframe'), "
+        f"{{src: {named.url.replace('127.0.0.1', host)!r}}}))"
+    )
+    patiently(named.open_pages, lambda number: number == 1)
+
+
+def test_a_page_that_is_not_allowed_shows_it_in_no_frame(phone, served, dashboard):
+    phone._browser.open(dashboard)
+    phone.of(
+        "document.body.append(Object.assign(document.createElement('iframe'), "
+        f"{{src: {served.url!r}}}))"
+    )
+    patiently(phone.framed, bool)
+    assert served.open_pages() == 0
+
+
+def test_the_page_works_below_a_path_of_a_proxy_and_leaves_its_cookie_there(phone, named):
+    with proxying(named.port, "/sounds/hearth") as address:
+        phone.open(SimpleNamespace(url=f"{address}?token={named.token}"))
+        assert phone.of("location.href").startswith(address)
+        phone.of('document.querySelector("#events summary").click()')
+        phone.until('document.querySelector("#events fieldset")')
+        phone.of('document.querySelector("#events input[value=silence]").click()')
+        phone.of('document.querySelector("#events form").requestSubmit()')
+        phone.shows("#events", "You said: Nothing")
+        cookies = {cookie["name"]: cookie["path"] for cookie in phone.cookies(address)}
+        assert cookies[f"hearthlog-{named.port}"] == "/sounds/hearth"
+        assert phone.of("seen") == []
 
 
 def test_a_page_elsewhere_can_neither_read_nor_frame_nor_mark(phone, served):

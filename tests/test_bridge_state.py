@@ -154,7 +154,8 @@ def test_a_class_of_any_name_has_a_topic_of_its_own(label):
     assert not {"+", "#", "\x00"} & set(topic)
     assert topic.count("/") == 5
     if label.isprintable():
-        assert topics.parse_class(topic, "on") == ("mic", label)
+        assert topics.parse_told(topics.of_told(label)) == label
+        assert topic.split("/")[-2] == topics.of_told(label).split("/")[-1]
 
 
 @given(st.text(max_size=20))

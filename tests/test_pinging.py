@@ -3,17 +3,21 @@
 import time
 from contextlib import contextmanager
 from datetime import UTC
+from http.client import BadStatusLine, InvalidURL
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 
 import pytest
+from pydantic import ValidationError
 
+from hearthlog.analyzer import ping
 from hearthlog.analyzer.bridge import pinging
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.pinging import Pinging
 from hearthlog.analyzer.bridge.settings import PingSettings
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.ports import free_port
 
 pytestmark = pytest.mark.fast
@@ -96,3 +100,36 @@ def test_a_watchdog_that_is_away_is_said_to_be(often):
         time.sleep(0.02)
     pings.close()
     assert said[0] == "ping: nobody there has taken it (Connection refused); trying again"
+
+
+@pytest.mark.usefixtures("often")
+def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
+    file, said = tmp_path / "url", []
+    with watchdog() as (url, asked):
+        file.write_text(f"\ufeff{url}/a-secret\r\n")
+        settings = PingSettings(url_file=file).model_copy(update={"every_seconds": 0.05})
+        pings = Pinging(settings, said.append)
+        assert last_asked(pings, asked, news(mic=0)) == "/box/a-secret"
+        pings.close()
+    for wrong in ("", "a-secret", "https://", "http://x/a secret", "http://x:y/", "http://[x/"):
+        file.write_text(wrong)
+        with pytest.raises(DataError, match="has no address that can be asked for") as error:
+            Pinging(settings, said.append)
+        assert "secret" not in str(error.value)
+    assert said == []
+
+
+def test_of_a_failure_nothing_is_said_that_has_the_address(monkeypatch):
+    for error in (InvalidURL("/a-secret"), ValueError("/a-secret"), BadStatusLine("/a-secret")):
+        monkeypatch.setattr("urllib.request.urlopen", lambda *_, e=error, **__: raise_it(e))
+        assert ping.ping("http://127.0.0.1/a-secret", is_well=True) == type(error).__name__
+
+
+def raise_it(error):
+    raise error
+
+
+@pytest.mark.parametrize("table", [{}, {"url": "http://x/", "url_file": "/x"}, {"url": "x"}])
+def test_one_address_is_wanted(table):
+    with pytest.raises(ValidationError):
+        PingSettings.model_validate(table)

@@ -2,8 +2,9 @@
 
 import http.client
 import math
+import socket
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from livehome import LiveHome, following
 from prometheus_client.parser import text_string_to_metric_families
 
-from hearthlog.analyzer.bridge import home_state, prometheus
+from hearthlog.analyzer.bridge import home_state, http_server, prometheus
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
@@ -31,10 +32,16 @@ def home(tmp_path):
     home.close()
 
 
+TOKEN = "a-token-of-the-figures"
+
+
 @contextmanager
 def bridged(home, folder, **settings):
-    """A bridge in a thread that gives figures."""
+    """A bridge in a thread that gives figures, with a token."""
     since, said = time.time_ns() - 24 * HOUR, []
+    token = folder / "token"
+    token.write_text(f"{TOKEN}\n")
+    settings = {"token_file": token, "readable_by": "all", **settings}
     place = Home(home.folder, "home", UTC)
     output = PrometheusOutput(PrometheusSettings(**settings), place, folder, since, said.append)
     with following(place, {"prometheus": output}, said):
@@ -43,6 +50,7 @@ def bridged(home, folder, **settings):
 
 
 def ask(port, path="/metrics", **fields):
+    fields = {"Authorization": f"Bearer {TOKEN}", **fields}
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     connection.putrequest("GET", path, skip_host="Host" in fields)
     for name, value in fields.items():
@@ -121,11 +129,18 @@ def test_a_microphone_that_is_away_has_no_level(home, tmp_path, monkeypatch):
         ("/metrics", {"Host": "localhost"}, 200),
         ("/metrics", {"Host": "home.example"}, 403),  # a name that points to this machine
         ("/metrics", {"Origin": "http://127.0.0.1:8000"}, 403),  # a page in a browser
+        ("/metrics", {"Authorization": f"bearer {TOKEN}"}, 401),
+        ("/metrics", {"Authorization": f"Bearer {TOKEN}x"}, 401),
+        ("/metrics", {"Authorization": "Bearer "}, 401),
+        ("/metrics", {"Authorization": ""}, 401),
+        ("/secret", {"Authorization": "x"}, 401),
         ("/", {}, 404),
         ("/../etc/passwd", {}, 404),
     ],
 )
-def test_the_port_answers_who_asks_for_an_address_in_digits(home, tmp_path, path, fields, status):
+def test_the_port_answers_who_has_the_token_and_asks_for_an_address_in_digits(
+    home, tmp_path, path, fields, status
+):
     home.hears("silence")
     port = free_port()
     with bridged(home, tmp_path, port=port):
@@ -157,12 +172,70 @@ def test_a_port_that_is_taken_is_named(home, tmp_path):
         bridged(home, tmp_path, port=port).__enter__()
 
 
+def test_a_port_without_a_token_is_open_for_one_release_more_and_is_said_to_be(home, tmp_path):
+    home.hears("silence")
+    port, said = free_port(), []
+    place = Home(home.folder, "home", UTC)
+    settings = PrometheusSettings(port=port, text_file=tmp_path / "hearthlog.prom")
+    output = PrometheusOutput(settings, place, tmp_path, time.time_ns() - HOUR, said.append)
+    with following(place, {"prometheus": output}, said):
+        wait_for(lambda: known(port))
+        assert ask(port, Authorization="")[0] == 200
+    assert [line.partition(";")[0] for line in said] == [
+        f"bridge.prometheus: every account of this machine may read {tmp_path}/hearthlog.prom",
+        f"bridge.prometheus: every account of this machine may read the figures on port {port}",
+    ]
+    assert "`token_file`" in said[1]
+    assert "readable_by" in said[0]
+
+
+@pytest.mark.parametrize("request_so_far", [b"", b"GET /metrics HTTP/1.1\r\nX: "])
+def test_who_asks_slowly_holds_up_neither_the_others_nor_the_end(home, tmp_path, request_so_far):
+    home.hears("silence")
+    port = free_port()
+    with ExitStack() as slow:
+        with bridged(home, tmp_path, port=port):
+            wait_for(lambda: known(port))
+            for _ in range(2 * http_server.MOST_ASKING):
+                own = slow.enter_context(socket.create_connection(("127.0.0.1", port)))
+                own.sendall(request_so_far)
+            for _ in range(3):
+                assert ask(port)[0] == 200
+            ending = time.monotonic()
+        assert time.monotonic() - ending < 5  # though they are still there
+
+
+def test_a_request_that_does_not_end_is_ended(home, tmp_path, monkeypatch):
+    monkeypatch.setattr(http_server, "SECONDS", 0.5)
+    home.hears("silence")
+    port = free_port()
+    with (
+        bridged(home, tmp_path, port=port),
+        socket.create_connection(("127.0.0.1", port), timeout=10) as own,
+    ):
+        own.sendall(b"GET /metrics HTTP/1.1\r\n")
+        ended = time.monotonic() + 10
+        with suppress(OSError):
+            while time.monotonic() < ended:
+                own.sendall(b"X: y\r\n")  # each read is in time
+                time.sleep(0.1)
+        assert time.monotonic() < ended
+
+
+@pytest.mark.parametrize(("who", "mode"), [("owner", 0o600), ("group", 0o640), ("all", 0o644)])
+def test_a_text_file_is_for_whom_the_configuration_says(home, tmp_path, who, mode):
+    home.hears("silence")
+    path = tmp_path / "hearthlog.prom"
+    with bridged(home, tmp_path, text_file=path, readable_by=who):
+        wait_for(lambda: path.read_text() if path.exists() else "")
+        assert path.stat().st_mode & 0o777 == mode
+
+
 def test_a_text_file_is_there_while_the_bridge_is(home, tmp_path):
     home.heard("coughing", 30)
     home.hears("silence")
     path = tmp_path / "hearthlog.prom"
     with bridged(home, tmp_path, text_file=path):
         found = wait_for(lambda: path.read_text() if path.exists() else "")
-        assert path.stat().st_mode & 0o777 == 0o644  # another user collects it
     assert found["hearthlog_events_total", "coughing", "mic"] == 1
     assert not path.exists()

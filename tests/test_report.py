@@ -52,6 +52,18 @@ def look(root, day=DAY, zone=UTC, labelling="live"):
     return day_of(whole_home(data), day, zone)
 
 
+def rows_of(page):
+    """The cells of the rows of all tables, by the first of each."""
+    found = {}
+    for row in re.findall(r"<tr.*?</tr>", page, re.DOTALL):
+        cells = [
+            " ".join(re.sub(r"<[^>]*>", " ", cell).split())
+            for cell in re.findall(r"<t[hd].*?</t[hd]>", row, re.DOTALL)
+        ]
+        found.setdefault(cells[0], cells[1:])
+    return found
+
+
 def page_of(root, tmp_path, first=DAY, days=1) -> str:
     output = tmp_path / f"page-{first}-{days}.html"
     make_report(find_home_logs([root]), Period(first, days, UTC), output)
@@ -208,12 +220,67 @@ def test_minutes_and_events_are_those_of_the_segments_that_a_recorder_wrote(reco
     for name in day.home.classes:
         own = [segment for segment in said if segment.label == name]
         length = sum(nanoseconds(segment.duration) for segment in own)
+        if not own:  # of a few minutes of a day nobody knows what was not in it
+            assert day.minutes(name) is day.count(name) is None
+            continue
         assert day.minutes(name).minutes == pytest.approx(length / (60 * NANOSECONDS))
         if name != "silence":
-            assert day.count(name).labelled <= len(own)
-            assert bool(day.count(name).labelled) == bool(own)
+            assert 0 < day.count(name).labelled <= len(own)
     text = text_of(page_of(recorded, tmp_path, start))
     assert "Not heard:" in text
+
+
+# What nobody listened to
+
+
+def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_path):
+    events = [(at("12:05"), 3, "coughing", 1.0), (at("12:10"), 90, "speech", 1.0)]
+    write_day(tmp_path, DAY, events, hours=[12])
+    day = look(tmp_path)
+    assert day.count("coughing").labelled == 1
+    assert day.minutes("speech").minutes == pytest.approx(1.5)
+    unknown = [day.count("yelling"), day.minutes("music"), day.night_count("coughing"), day.quiet]
+    unknown += [day.night_sound, day.night_stretches, day.first, day.last]
+    assert unknown == [None] * 8
+    page = page_of(tmp_path, tmp_path)
+    rows = rows_of(page)
+    for title in ("Longest quiet stretch, 07:00 to 22:00", "First lively time", "Times with sound"):
+        assert rows[title] == ["not known"]
+    assert rows["Shouting"] == ["not known", "not known"]
+    assert rows["Behaviour: shouting"][1] == "not known"
+    assert rows["Coughing"] == ["under 1 min", "1"]
+    assert "It was quiet" not in page
+
+
+@pytest.mark.parametrize(("last", "known"), [(16, False), (18, True)])
+def test_a_0_is_said_where_three_quarters_of_the_time_were_heard(tmp_path, last, known):
+    write_day(tmp_path, DAY, hours=range(last))
+    day = look(tmp_path)
+    assert (day.count("coughing") is not None) == known
+    assert (day.minutes("coughing") is not None) == known
+    assert (day.sound is not None) == known
+    assert day.night_count("coughing").labelled == 0  # 7 of its 9 hours
+    assert day.quiet.minutes == 60 * (last - 7)
+
+
+def test_a_lively_time_is_the_first_where_it_was_listened_to_before(tmp_path):
+    events = [(at(f"{hour}:00"), 120, "speech", 1.0) for hour in ("08", "20")]
+    write_day(tmp_path, DAY, events)
+    whole = look(tmp_path)
+    assert (whole.first.text, whole.last.text) == ("08:00", "20:09")
+    write_day(tmp_path / "late", DAY, events, hours=range(8, 24))
+    late = look(tmp_path / "late")
+    assert late.first is None
+    assert late.last.text == "20:09"
+
+
+def test_a_sum_of_days_of_which_most_are_not_known_is_not_0(tmp_path):
+    for ago in range(7):
+        hours = range(24) if ago > 3 else [12]
+        write_day(tmp_path / "logs", DAY - timedelta(days=ago), hours=hours)
+    page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
+    assert rows_of(page)["All days"][0] == ""
+    assert not any(re.fullmatch("0( min)?", cell) for cell in rows_of(page)["All days"])
 
 
 # Nights, quiet, hours

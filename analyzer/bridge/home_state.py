@@ -7,9 +7,13 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from hearthlog.analyzer.bridge.day import Today
 from hearthlog.analyzer.bridge.event_record import PAUSE_SECONDS, Event, EventRecord
 from hearthlog.analyzer.bridge.heard_now import HeardNow
 from hearthlog.analyzer.bridge.listeners import is_of_scenario, listener_of
+from hearthlog.analyzer.logs.spans import joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
@@ -25,6 +29,7 @@ FIELDS = {
 _AWAY_SECONDS = 15.0  # without a word
 _DECIDED = (PAUSE_SECONDS + 5) * NANOSECONDS  # after its end no segment is added to an event
 _MOST_CLASSES = 256
+MOST = 0.75  # of a night that has to be heard for a 0 to be said, as in the report
 
 
 class Health(NamedTuple):
@@ -32,6 +37,13 @@ class Health(NamedTuple):
 
     level: int
     text: str
+
+
+class Known(NamedTuple):
+    """Whether enough was heard to say that there was nothing: today, and in the last night."""
+
+    day: bool
+    night: bool
 
 
 class MicrophoneState:
@@ -72,6 +84,7 @@ class MicrophoneState:
         self.seen = -math.inf  # when a label came, by CLOCK_MONOTONIC
         self._records: dict[str, EventRecord] = {}
         self._unended: set[str] = set()  # classes with an event that may go on
+        self._latest = 0  # when the last segment ended, in nanoseconds of UTC
         self._replaced: list[Event] = []  # that are over, for another one of the class began
 
     def is_listening(self) -> bool:
@@ -109,6 +122,9 @@ class MicrophoneState:
         begun = []
         first = int(columns["header.stamp"][0])
         self.since = min(self.since or first, first)
+        self._latest = max(
+            self._latest, int(np.max(columns["header.stamp"] + columns["duration"], initial=0))
+        )
         names = "header.stamp", "duration", "label", "confidence"
         for start, duration, label, confidence in zip(
             *(columns[name].tolist() for name in names), strict=True
@@ -130,6 +146,39 @@ class MicrophoneState:
         starts, durations = columns["header.stamp"].tolist(), columns["duration"].tolist()
         spans = zip(starts, durations, strict=True)
         self.gaps += [(start, start + length) for start, length in spans if length > 0]
+
+    def counts(self, label: str, today: Today, known: Known) -> tuple[int | None, int | None]:
+        """Count the events of a class that began since midnight, and those of the last night.
+
+        Parameters
+        ----------
+        label : str
+        today : Today
+        known : Known
+            As `known_of` returns it.
+
+        Returns
+        -------
+        int or None, int or None
+            None in the place of a 0 where too little was heard to say that there was none.
+        """
+        day = len(self.events(label, today.midnight))
+        night = sum(event.start < today.morning for event in self.events(label, today.night))
+        return day if day or known.day else None, night if night or known.night else None
+
+    def known_of(self, today: Today) -> Known:
+        """Tell of which times up to now it is known that nothing was heard in them."""
+        night = self._share_heard(today.night, min(today.morning, today.now))
+        return Known(self._share_heard(today.midnight, today.now) > 0, night >= MOST)
+
+    def _share_heard(self, start: int, end: int) -> float:
+        """Return the share of a time, up to now, in which the microphone was heard."""
+        spans = [(start, self.since or end), *self.gaps]
+        if not self.is_listening():
+            spans.append((max(self.heard.time, self._latest), end))
+        inside = [(max(a, start), min(b, end)) for a, b in spans]
+        starts, ends = np.array([(a, b) for a, b in inside if a < b], np.int64).reshape(-1, 2).T
+        return 1 - joined(starts, ends).length / max(end - start, 1)
 
     def ended_events(self) -> list[Event]:
         """Return the events that are over, each once."""
@@ -196,6 +245,10 @@ class HomeState:
     def every(self) -> list[MicrophoneState]:
         """Return the states of the microphones, and those of their scenarios."""
         return [*self.microphones.values(), *self.scenarios.values()]
+
+    def present(self) -> list[MicrophoneState]:
+        """Return the states of the microphones that the recorder has now."""
+        return [each for each in self.microphones.values() if not self.is_left_out(each.name)]
 
     def is_left_out(self, name: str) -> bool:
         """Tell whether the recorder has a microphone, or a scenario of it, no more.

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
@@ -11,8 +11,12 @@ from hearthlog.analyzer.bridge.output import News, Output
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
+from hearthlog.analyzer.extras import remedy
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 
 _OLDEST = 7 * 24 * 3600 * NANOSECONDS  # how far back the log is read at most, at a start
 _EARLIER = 6 * 3600 * NANOSECONDS  # so much longer no event takes, so that those are known whole
@@ -60,8 +64,12 @@ class Reopened(Generic[_Output]):
         self._due = time.monotonic() + _AGAIN_SECONDS
         try:
             self.output = self._make()
+        except ModuleNotFoundError as error:
+            self._say(f"{error.name} is not installed; {remedy(error.name or '')}; trying again")
         except (HearthlogError, OSError) as error:
             self._say(f"{error}; trying again")
+        except Exception as error:  # noqa: BLE001  one that fails must not stop the others
+            self._say(f"{type(error).__name__}: {error}; trying again")
 
 
 def open_outputs(
@@ -84,28 +92,29 @@ def open_outputs(
         By their names.
     since : int
         From when on they have to know the events, in nanoseconds of UTC.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If a package that one needs is not installed.
     """
     moment = today(time.time_ns(), home.zone)
     since = min(moment.midnight, moment.night) - _EARLIER
     outputs: dict[str, Output] = {}
     # Imported here: who wants no broker needs no client of one.
     if (mqtt := settings.mqtt) is not None:
-        from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
 
-        publisher = Reopened(lambda: MqttPublisher(mqtt, home, state_folder, say), say)
+        def publish() -> "MqttPublisher":
+            from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
+
+            return MqttPublisher(mqtt, home, state_folder, say)
+
+        publisher = Reopened(publish, say)
         outputs["mqtt"] = publisher
     if (figures := settings.prometheus) is not None:
-        from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415
-
         first = since
-        outputs["prometheus"] = Reopened(
-            lambda: PrometheusOutput(figures, home, state_folder, first, say), say
-        )
+
+        def count() -> Output:
+            from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415
+
+            return PrometheusOutput(figures, home, state_folder, first, say)
+
+        outputs["prometheus"] = Reopened(count, say)
         kept = kept_until(state_folder / TOTALS, since) - _EARLIER
         since = min(since, max(kept, moment.now - _OLDEST))
     if (page := settings.page) is not None:
@@ -115,7 +124,7 @@ def open_outputs(
     if (watchdog := settings.ping) is not None:
         from hearthlog.analyzer.bridge.pinging import Pinging  # noqa: PLC0415
 
-        outputs["ping"] = Pinging(watchdog, say)
+        outputs["ping"] = Reopened(lambda: Pinging(watchdog, say), say)
     if settings.alert:
         from hearthlog.analyzer.bridge.alerts.output import AlertsOutput  # noqa: PLC0415
 

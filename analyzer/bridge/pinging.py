@@ -6,8 +6,9 @@ from threading import Event as Flag
 from threading import Thread
 
 from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import PingSettings
-from hearthlog.analyzer.ping import ping
+from hearthlog.analyzer.ping import ping, read_ping_address
 
 _ERROR = 2  # level of diagnostics
 _SOON = 10.0  # seconds after the start
@@ -25,10 +26,18 @@ class Pinging:
     settings : PingSettings
     say : callable
         Told what is wrong, in a line.
+
+    Raises
+    ------
+    DataError
+        If the file of the address cannot be used.
     """
 
     def __init__(self, settings: PingSettings, say: Callable[[str], None]) -> None:
         self._settings = settings
+        self._url = settings.url
+        if settings.url_file is not None:
+            self._url = read_ping_address(secret_path(settings.url_file))
         self._say = say
         self._is_well = False
         self._judged = 0.0  # when, by CLOCK_MONOTONIC
@@ -50,6 +59,6 @@ class Pinging:
         while not self._stop.wait(pause):
             pause = self._settings.every_seconds
             if time.monotonic() - self._judged <= _JUDGED_SECONDS:
-                problem = ping(self._settings.url, is_well=self._is_well)
+                problem = ping(self._url, is_well=self._is_well)
                 if problem:
                     self._say(f"ping: nobody there has taken it ({problem}); trying again")

@@ -3,12 +3,13 @@
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from http import HTTPStatus
 from pathlib import Path
-from threading import Lock, Thread
-from typing import Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from secrets import compare_digest
+from threading import Lock
+from typing import Any, cast
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -17,12 +18,14 @@ from prometheus_client.registry import Collector
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import MicrophoneState
+from hearthlog.analyzer.bridge.http_server import TEXT, HttpHandler, HttpServer
 from hearthlog.analyzer.bridge.listeners import (
     is_of_scenario,
     microphone_of_listener,
     scenario_of_listener,
 )
 from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.page.page_token import read_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
 from hearthlog.analyzer.ports import HOST, is_asked_in_digits
@@ -32,7 +35,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
 _LATER = 12 * 3600 * NANOSECONDS  # than its beginning an event may be known
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
-_TIMEOUT_SECONDS = 5.0
+_MODES = {"owner": 0o600, "group": 0o640, "all": 0o644}
 _LABELS = ("node", "microphone", "label")
 _LABELS_OF_SCENARIOS = ("node", "microphone", "scenario", "label")
 
@@ -76,6 +79,12 @@ class PrometheusOutput:
         self._text, self._made = b"", -math.inf  # and when, by CLOCK_MONOTONIC
         self._lock = Lock()
         self._due = 0.0  # by CLOCK_MONOTONIC
+        if settings.text_file is not None and settings.readable_by is None:
+            say(
+                f"bridge.prometheus: every account of this machine may read {settings.text_file}; "
+                'write readable_by = "all" if that is meant, else "owner" or "group": the next '
+                'release takes "owner" if it says nothing'
+            )
         self._server = None if settings.port is None else self._listen(settings.port)
 
     def update(self, news: News) -> None:
@@ -91,50 +100,79 @@ class PrometheusOutput:
             self._text, self._made = text, time.monotonic()
         if self._settings.text_file is not None:
             with replaced_file(self._settings.text_file) as temporary:
+                temporary.touch(0o600)
                 temporary.write_bytes(text)
-                temporary.chmod(0o644)  # who collects it is another user
+                temporary.chmod(_MODES[self._settings.readable_by or "all"])
 
     def close(self) -> None:
         """Answer no more; the text file goes, so that nobody takes it for today's."""
         if self._server is not None:
-            self._server.shutdown()
-            self._server.server_close()
+            self._server.end()
         if self._settings.text_file is not None:
             self._settings.text_file.unlink(missing_ok=True)
 
-    def _listen(self, port: int) -> WSGIServer:
+    def _listen(self, port: int) -> "_Server":
+        token = self._settings.token_file and read_token(self._settings.token_file)
+        if not token:
+            self._say(
+                f"bridge.prometheus: every account of this machine may read the figures on port "
+                f"{port}; name a `token_file`, and the same file as `credentials_file` in "
+                "Prometheus: the next release opens no port without one"
+            )
         try:
-            server = make_server(HOST, port, self._answer, handler_class=_Handler)
+            return _Server(port, token or "", self._current)
         except OSError as error:
             raise BridgeError(
                 f"bridge.prometheus: cannot listen on port {port} ({error.strerror}); take another"
             ) from error
-        Thread(target=server.serve_forever, daemon=True).start()
-        return server
 
-    def _answer(self, request: dict[str, Any], start_response: Callable[..., Any]) -> list[bytes]:
-        """Answer one request; a page of a browser is refused, whatever name it came by."""
-        is_here = is_asked_in_digits(HOST, request.get("HTTP_HOST", ""))
-        if not is_here or "HTTP_ORIGIN" in request:
-            start_response("403 Forbidden", [("Content-Type", _TEXT)])
-            return [b"ask for an address in digits, and from no page\n"]
-        if request["REQUEST_METHOD"] != "GET" or request["PATH_INFO"] != "/metrics":
-            start_response("404 Not Found", [("Content-Type", _TEXT)])
-            return [b"there is /metrics\n"]
+    def _current(self) -> bytes | None:
+        """Return the figures; None if they are old."""
         with self._lock:
-            text, made = self._text, self._made
-        if time.monotonic() - made > _STALE_SECONDS:
-            start_response("503 Service Unavailable", [("Content-Type", _TEXT)])
-            return [b"what is known is old\n"]
-        start_response("200 OK", [("Content-Type", _TEXT)])
-        return [text]
+            is_stale = time.monotonic() - self._made > _STALE_SECONDS
+            return None if is_stale else self._text
 
 
-class _Handler(WSGIRequestHandler):
-    timeout = _TIMEOUT_SECONDS
+class _Server(HttpServer):
+    """Gives figures to who has the token, if there is one."""
 
-    def log_message(self, *_: Any) -> None:
-        """Say nothing of those who ask."""
+    def __init__(self, port: int, token: str, current: Callable[[], bytes | None]) -> None:
+        super().__init__(HOST, port, _Handler)
+        self.expected = f"Bearer {token}".encode() if token else None
+        self.current = current
+        self.start()
+
+
+class _Handler(HttpHandler):
+    """Answers one request; a page of a browser is refused, whatever name it came by."""
+
+    def get(self) -> None:
+        """Send the figures."""
+        server = cast(_Server, self.server)
+        hosts = self.headers.get_all("Host", [])
+        is_here = len(hosts) == 1 and is_asked_in_digits(HOST, hosts[0])
+        if not is_here or "Origin" in self.headers:
+            self._refuse(HTTPStatus.FORBIDDEN, "ask for an address in digits, and from no page")
+            return
+        shown = self.headers.get("Authorization", "").encode("utf-8", "replace")
+        if server.expected is not None and not compare_digest(shown, server.expected):
+            self._refuse(
+                HTTPStatus.UNAUTHORIZED,
+                "show the token of token_file in [bridge.prometheus]: `authorization: "
+                "credentials_file` of Prometheus does",
+                {"WWW-Authenticate": "Bearer"},
+            )
+        elif self.path.partition("?")[0] != "/metrics":
+            self._refuse(HTTPStatus.NOT_FOUND, "there is /metrics")
+        elif not server.admit(self.connection):
+            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE)
+        elif (text := server.current()) is None:
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "what is known is old")
+        else:
+            self.send(HTTPStatus.OK, text, _TEXT)
+
+    def _refuse(self, code: int, text: str, more: Mapping[str, str] | None = None) -> None:
+        self.send(code, f"{text}\n".encode(), TEXT, more)
 
 
 class _Figures(Collector):
@@ -171,7 +209,7 @@ class _Figures(Collector):
 
     def _of_microphones(self) -> Iterator[Metric]:
         node = self._home.node
-        microphones = self._news.state.microphones.values()
+        microphones = self._news.state.present()
 
         def each(value: Callable[[Any], float]) -> list[tuple[tuple[str, ...], float]]:
             return [((node, microphone.name), value(microphone)) for microphone in microphones]

@@ -1,9 +1,17 @@
 """The table `bridge` of the configuration: what a home is told, and where."""
 
+import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
@@ -24,6 +32,26 @@ def _check_host(name: str) -> str:
     if not encoded:
         raise ValueError(f"{name[:64]!r} cannot be the name of a host")
     return name
+
+
+_PLACE = r"[a-z0-9]([a-z0-9.-]{0,251}[a-z0-9])?(:[0-9]{1,5})?"
+
+
+def _check_name(name: str) -> str:
+    if not re.fullmatch(_PLACE, name.lower()):
+        raise ValueError(
+            f"{name[:64]!r} is no name of a host; write one as raspberrypi.local, without http://"
+        )
+    return name.lower()
+
+
+def _check_origin(origin: str) -> str:
+    if not re.fullmatch(f"https?://{_PLACE}", origin.lower()):
+        raise ValueError(
+            f"{origin[:64]!r} is no address of a page's server; write one as "
+            "http://homeassistant.local:8123, without a path"
+        )
+    return origin.lower()
 
 
 class _Table(BaseModel):
@@ -63,6 +91,14 @@ class PrometheusSettings(_Table):
         default=None, description="For the textfile collector of node_exporter; ends in .prom."
     )
     port: _Port | None = Field(default=None, description="On loopback; none: no port.")
+    token_file: Path | None = Field(
+        default=None,
+        description="Of one line, which who asks on the port has to show: the `credentials_file` "
+        "of Prometheus.",
+    )
+    readable_by: Literal["owner", "group", "all"] | None = Field(
+        default=None, description="Who of this machine may read `text_file`."
+    )
 
 
 class PageSettings(_Table):
@@ -77,13 +113,33 @@ class PageSettings(_Table):
         description="Of one line, which the address of the page has to have; by default one is "
         "made in the folder of the state.",
     )
+    names: list[Annotated[str, AfterValidator(_check_name)]] = Field(
+        default=[],
+        description="By which it may be opened, beside addresses in digits, as "
+        '["raspberrypi.local"]; with a port where that of a proxy has one.',
+    )
+    frames: list[Annotated[str, AfterValidator(_check_origin)]] = Field(
+        default=[],
+        description='Pages that may show it in a frame, as ["http://homeassistant.local:8123"].',
+    )
 
 
 class PingSettings(_Table):
     """A watchdog on the network that raises the alarm when it hears nothing."""
 
-    url: str = Field(pattern=r"^https?://[^/\s]+", description="As of healthchecks.io.")
+    url: str = Field(
+        default="", pattern=r"^$|^https?://[^/\s]+", description="As of healthchecks.io."
+    )
+    url_file: Path | None = Field(
+        default=None, description="Of one line, with that address: who knows it can ping, too."
+    )
     every_seconds: float = Field(default=60.0, ge=5.0, le=86_400, description="Between pings.")
+
+    @model_validator(mode="after")
+    def _check_address(self) -> Self:
+        if bool(self.url) == (self.url_file is not None):
+            raise ValueError("give either url or url_file")
+        return self
 
 
 class BridgeSettings(_Table):

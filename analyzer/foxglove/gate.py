@@ -3,6 +3,7 @@
 import asyncio
 import socket
 from asyncio import StreamReader, StreamWriter, Task
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Thread
@@ -26,6 +27,9 @@ Refused = Callable[[RefusedError], None]
 class Gate:
     """Takes connections in a thread of its own, and pipes those that are admitted.
 
+    So many may ask at a time: another one takes the place of the oldest of the address that has
+    most of them, so that nobody keeps out who has the token by connections that say nothing.
+
     Parameters
     ----------
     listener : socket.socket
@@ -48,7 +52,7 @@ class Gate:
         self._behind = behind
         self._admission = admission
         self._refused = refused
-        self._asking: set[Task[None]] = set()
+        self._asking: dict[Task[None], str] = {}  # and their addresses, the oldest first
         self._looking: set[Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = Thread(target=self._run, name="gate", daemon=True)
@@ -76,16 +80,18 @@ class Gate:
     async def _accept(self) -> None:
         while True:
             try:
-                connection, _ = await self._loop.sock_accept(self._listener)
+                connection, address = await self._loop.sock_accept(self._listener)
             except OSError:  # too many files are open, or it was gone already
                 await asyncio.sleep(1)
                 continue
             if len(self._asking) >= _MOST_ASKING:
-                connection.close()
-                continue
+                ((most, _),) = Counter(self._asking.values()).most_common(1)
+                oldest = next(task for task, host in self._asking.items() if host == most)
+                del self._asking[oldest]
+                oldest.cancel()
             task = self._loop.create_task(self._take(connection))
-            self._asking.add(task)
-            task.add_done_callback(self._asking.discard)
+            self._asking[task] = address[0]
+            task.add_done_callback(lambda task: self._asking.pop(task, None))
             task.add_done_callback(self._looking.discard)
 
     async def _take(self, connection: socket.socket) -> None:
@@ -111,7 +117,7 @@ class Gate:
         task = asyncio.current_task()
         assert task is not None
         self._looking.add(task)
-        self._asking.discard(task)
+        self._asking.pop(task, None)
         return head
 
     async def _lead_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:

@@ -1,7 +1,9 @@
 """The figures of a day: what was heard, for how long, how often, when."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,9 @@ from hearthlog.schemas.arrays import Int64
 
 _RISING = 4  # of the clock: what is heard before is of the night
 HOUR = 60 * MINUTE
-MOST = 0.75  # of a day and of its night, for its figures to be compared
+MOST = 0.75  # of a time: what has to be heard for a 0 to be said, and for days to be compared
+_Figure = TypeVar("_Figure", Count, Minutes)
+_HALF = 0.5
 _BIN, _BUSY = 10 * MINUTE, MINUTE
 
 
@@ -63,19 +67,18 @@ class Day:
         name : str
             Of the class; 0 for one that the home does not know.
         """
-        return common(self.home.listened.get(name, NONE), self.span).length / self.span.length
+        return _share(self.home.listened.get(name, NONE), self.span)
 
     def minutes(self, name: str) -> Minutes | None:
-        """Return how long a class was heard; None if it could not be.
+        """Return how long a class was heard; None if it is not known.
 
         Parameters
         ----------
         name : str
             Of the class.
         """
-        if not self.share_of(name):
-            return None
-        return _length(common(self.home.spans.get(name, NONE), self.span))
+        minutes = _length(common(self.home.spans.get(name, NONE), self.span))
+        return _if_known(minutes, self.share_of(name))
 
     def events(self, name: str) -> Int64:
         """Return when the events of a class began on this day.
@@ -108,25 +111,25 @@ class Day:
         return self.home.events_in(name, self.night)
 
     def count(self, name: str) -> Count | None:
-        """Return how often a class was heard on this day; None if it could not be.
+        """Return how often a class was heard on this day; None if it is not known.
 
         Parameters
         ----------
         name : str
             Of the class.
         """
-        return self._count(name, self.span) if self.share_of(name) else None
+        return _if_known(self._count(name, self.span), self.share_of(name))
 
     def night_count(self, name: str) -> Count | None:
-        """Return how often a class was heard in the night; None if it could not be.
+        """Return how often a class was heard in the night; None if it is not known.
 
         Parameters
         ----------
         name : str
             Of the class.
         """
-        listened = common(self.home.listened.get(name, NONE), self.night).length > 0
-        return self._count(name, self.night) if listened else None
+        share = _share(self.home.listened.get(name, NONE), self.night)
+        return _if_known(self._count(name, self.night), share)
 
     def beside_television(self, name: str) -> int:
         """Return how many events of a class were not counted, because of a television.
@@ -142,22 +145,23 @@ class Day:
         return self.home.minutes.between(span).count(name, self.home.rates.get(name))
 
     @property
-    def sound(self) -> Minutes:
-        """How long there was any sound on this day."""
-        return _length(common(self.home.sound, self.span))
+    def sound(self) -> Minutes | None:
+        """How long there was any sound on this day; None if it is not known."""
+        return _if_known(_length(common(self.home.sound, self.span)), self.share)
 
     @property
-    def night_sound(self) -> Minutes:
-        """How long there was any sound in the night."""
-        return _length(common(self.home.sound, self.night))
+    def night_sound(self) -> Minutes | None:
+        """How long there was any sound in the night; None if it is not known."""
+        return _if_known(_length(common(self.home.sound, self.night)), self._share_of(self.night))
 
     @property
-    def night_stretches(self) -> Count:
+    def night_stretches(self) -> Count | None:
         """Number of stretches of sound in the night, with ten quiet minutes between them.
 
-        A stretch has at least half a minute of sound.
+        A stretch has at least half a minute of sound. None if it is not known.
         """
-        return exactly(stretches(self.home.sound, self.night))
+        count = exactly(stretches(self.home.sound, self.night))
+        return _if_known(count, self._share_of(self.night))
 
     @property
     def hours(self) -> Int64:
@@ -177,8 +181,9 @@ class Day:
 
     @property
     def quiet(self) -> Minutes | None:
-        """Length of `longest_quiet`; None if nothing of the day was heard."""
-        return _length(self.longest_quiet) if self.coverage.length else None
+        """Length of `longest_quiet`; None if less than half of the time it lies in was heard."""
+        waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
+        return _length(self.longest_quiet) if self._share_of(waking) >= _HALF else None
 
     @property
     def active(self) -> Int64:
@@ -191,16 +196,25 @@ class Day:
 
     @property
     def first(self) -> Clock | None:
-        """Start of the first of the `active` blocks; None if there are none."""
-        return self._clock(self.active[:1])
+        """Start of the first of the `active` blocks; None if it is not known, or there is none."""
+        before = at_hour(self.day, _RISING, self.zone)
+        return self._clock(self.active[:1], lambda time: (before, time))
 
     @property
     def last(self) -> Clock | None:
-        """Last minute of the last of the `active` blocks; None if there are none."""
-        return self._clock(self.active[-1:] + _BIN - MINUTE)
+        """Last minute of the last of the `active` blocks; None as for `first`."""
+        after = int(self.span.ends[0])
+        return self._clock(self.active[-1:] + _BIN - MINUTE, lambda time: (time + MINUTE, after))
 
-    def _clock(self, times: Int64) -> Clock | None:
+    def _share_of(self, span: Spans) -> float:
+        return _share(self.home.coverage, span)
+
+    def _clock(self, times: Int64, quiet: Callable[[int], tuple[int, int]]) -> Clock | None:
+        """Return a time, if most of the span was heard in which there was nothing."""
         if not len(times):
+            return None
+        start, end = quiet(int(times[0]))
+        if start < end and self._share_of(one(start, end)) < MOST:
             return None
         local = local_time(int(times[0]), self.zone)
         return Clock(60 * local.hour + local.minute)
@@ -222,6 +236,15 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> Day:
     span = one(start, end)
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
     return Day(day, near, zone, span, night, common(near.coverage, span))
+
+
+def _share(heard: Spans, span: Spans) -> float:
+    return common(heard, span).length / span.length
+
+
+def _if_known(value: _Figure, share: float) -> _Figure | None:
+    """Return a figure, but for a 0 where too little was heard to know that there was nothing."""
+    return value if share >= MOST or (share and value.middle) else None
 
 
 def _length(spans: Spans) -> Minutes:

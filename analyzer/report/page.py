@@ -12,7 +12,7 @@ from hearthlog.analyzer.report.class_words import (
     several_in_words,
     times_in_words,
 )
-from hearthlog.analyzer.report.daily_metrics import Day
+from hearthlog.analyzer.report.daily_metrics import MOST, Day
 from hearthlog.analyzer.report.html import Cell, PageTable, TableRow, fill_page
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.sections import (
@@ -145,13 +145,21 @@ def _scenario(account: Account, name: str) -> PageTable:
         TableRow(
             [
                 Cell(in_words(label), colour=colour_on_paper(label)),
-                *(Cell(Minutes(day.get(label, 0.0)).text, whole=True) for day in days),
+                *(
+                    Cell(_scenario_text(found.get(label, 0.0), day), whole=True)
+                    for found, day in zip(days, account.days, strict=True)
+                ),
             ]
         )
         for label in classes
     ]
     dates = [class_words.short_day(day.day) for day in account.days]
     return PageTable(["Sound", *(dates if len(days) > 1 else ["How long, as labelled"])], rows)
+
+
+def _scenario_text(minutes: float, day: Day) -> str:
+    """Say how long a class of a scenario was heard on a day."""
+    return Minutes(minutes).text if minutes or day.share >= MOST else _NOTHING
 
 
 def _sounds(account: Account, day: Day) -> PageTable:
@@ -264,15 +272,18 @@ def _dense(text: str) -> str:
 
 def _total(days: Sequence[Day], figure: Figure) -> str:
     values = [figure.value(day) for day in days if day.coverage.length]
-    return _short(_sum([v for v in values if v is not None])) if figure.sums else ""
+    return _short(_sum(values)) if figure.sums else ""
 
 
-def _sum(values: Sequence[Value]) -> Count | Minutes | None:
+def _sum(values: Sequence[Value | None]) -> Count | Minutes | None:
+    """Add figures of days, of which some may not be known; None if a 0 cannot be known."""
     counts = [value for value in values if isinstance(value, Count)]
     minutes = [value for value in values if isinstance(value, Minutes)]
-    if not values:
+    known = counts or minutes
+    if not known:
         return None
-    return sum(counts, Count()) if counts else sum(minutes, Minutes())
+    total = sum(counts, Count()) if counts else sum(minutes, Minutes())
+    return total if total.middle or len(known) >= MOST * len(values) else None
 
 
 def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
@@ -280,8 +291,7 @@ def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
     rows = []
     for item in interrai.ITEMS:
         audible = not item.needs or item.needs in account.classes
-        values = [value for day in days if (value := item.value(day)) is not None]
-        number = _sum(values)
+        number = _sum([item.value(day) for day in days])
         text = _text(number) if audible else "this model does not know the sound"
         if account.checked and number is not None and not _is_checked(number):
             text += ", as labelled"

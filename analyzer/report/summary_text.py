@@ -12,7 +12,7 @@ from hearthlog.analyzer.report.class_words import (
     several_in_words,
     short_day,
 )
-from hearthlog.analyzer.report.daily_metrics import HOUR, Day
+from hearthlog.analyzer.report.daily_metrics import HOUR, MOST, Day
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.routine_text import WEEK, judgement_text, too_few_text
 from hearthlog.analyzer.report.values import Minutes
@@ -39,7 +39,7 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
         A paragraph of the page.
     """
     minutes = Minutes(day.coverage.length / _MINUTE).text
-    yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}"
+    yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
     yield _changes(account, day)
     if day.night_hours:
         yield _night(day)
@@ -179,7 +179,8 @@ def _loudest(day: Day) -> str:
         in_words(name).lower() for minutes, name in sorted(lasting, reverse=True) if minutes >= 1
     ]
     sounds = listed(most[:3], "and")
-    return f"Most of the sound: {sounds}." if most else "It was quiet."
+    quiet = "It was quiet." if day.share >= MOST else ""
+    return f"Most of the sound: {sounds}." if most else quiet
 
 
 def _changes(account: Account, day: Day) -> str:
@@ -199,7 +200,9 @@ def _night(day: Day) -> str:
         count = day.night_count(name)
         if count is not None:
             parts.append(f"{several_in_words(name).lower()} {count.text}")
-    parts.append(f"{day.night_sound.text} of sound in all")
+    if day.night_sound is not None:
+        parts.append(f"{day.night_sound.text} of sound in all")
+    parts = parts or ["nothing can be told of it"]
     partly = "" if day.night_hours > 8.5 else f" Only {day.night_hours:.1f} hours of it were heard."
     return f"Night before, 22:00 to 07:00: {'; '.join(parts)}.{partly}"
 

@@ -28,6 +28,13 @@ def doctor(
             help="With --live: ask for this address if all is well, for /fail below if not.",
         ),
     ] = None,
+    ping_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--ping-file",
+            help="The same, with the address in a file of one line: no other account sees it.",
+        ),
+    ] = None,
     bundle: Annotated[
         Path | None,
         typer.Option(
@@ -41,13 +48,15 @@ def doctor(
     Exit status 1: a log is damaged, or not as hearthlog writes them, or nothing is recorded now; 3:
     a log has gaps, or is unfinished, or something is not as it should be now.
     """
-    if ping_url is not None and not live:
-        wrong_use("--ping goes with --live")
+    if (ping_url is not None or ping_file is not None) and not live:
+        wrong_use("--ping and --ping-file go with --live")
+    if ping_url is not None and ping_file is not None:
+        wrong_use("give either --ping or --ping-file")
     if bundle is not None:
         _write_bundle(bundle, path)
         return
     if live:
-        _examine_live(path, ping_url, as_json=as_json)
+        _examine_live(path, ping_url, ping_file, as_json=as_json)
         return
     from hearthlog.analyzer.doctor import examine
     from hearthlog.tools.cli.progress import share_done
@@ -76,12 +85,16 @@ def _write_bundle(bundle: Path, folder: Path) -> None:
             print(f"{bundle}: {name}, {number(len(content), 'byte')}")
 
 
-def _examine_live(folder: Path, ping_url: str | None, *, as_json: bool) -> None:
+def _examine_live(
+    folder: Path, ping_url: str | None, ping_file: Path | None, *, as_json: bool
+) -> None:
     from hearthlog.analyzer.live import examine_live
-    from hearthlog.analyzer.ping import is_ping_address, ping
+    from hearthlog.analyzer.ping import is_ping_address, ping, read_ping_address
 
     if ping_url is not None and not is_ping_address(ping_url):
         wrong_use("--ping wants an address such as https://hc-ping.com/your-uuid")
+    if ping_file is not None:
+        ping_url = read_ping_address(ping_file)
     states = examine_live(folder)
     if as_json:
         print(json.dumps([state._asdict() for state in states], indent=2))

@@ -50,37 +50,52 @@ class Delivery:
         self._zone = zone
         self._say = say
         self._pauses = first_pause, longest_pause
-        self._stop = Flag()
-        self._threads = [
-            Thread(target=self._run, args=(target,), daemon=True, name=f"alerts {target.place}")
-            for target in targets
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._threads: dict[str, tuple[Thread, Flag]] = {}  # by name of the target
+        self.set_targets(targets)
+
+    def set_targets(self, targets: Sequence[Target]) -> None:
+        """Tell these from now on; who was told before goes on as he was.
+
+        Parameters
+        ----------
+        targets : sequence of Target
+        """
+        names = {target.name for target in targets}
+        for name in self._threads.keys() - names:
+            self._threads.pop(name)[1].set()
+        for target in targets:
+            if target.name not in self._threads:
+                stop = Flag()
+                thread = Thread(
+                    target=self._run, args=(target, stop), daemon=True, name="alerts, to a target"
+                )
+                self._threads[target.name] = thread, stop
+                thread.start()
 
     def close(self) -> None:
         """End within seconds, whatever a target does; the rest waits for the next start."""
-        self._stop.set()
         until = time.monotonic() + _CLOSE_SECONDS
-        for thread in self._threads:
+        for _, stop in self._threads.values():
+            stop.set()
+        for thread, _ in self._threads.values():
             thread.join(max(until - time.monotonic(), 0.0))
 
-    def _run(self, target: Target) -> None:
+    def _run(self, target: Target, stop: Flag) -> None:
         first, longest = self._pauses
         pause = first
-        while not self._stop.wait(_LOOK_SECONDS):
-            told, failed = self._tell(target)
+        while not stop.wait(_LOOK_SECONDS):
+            told, failed = self._tell(target, stop)
             if told:
                 pause = first
             if failed:
-                self._stop.wait(pause)
+                stop.wait(pause)
                 pause = min(2 * pause, longest)
 
-    def _tell(self, target: Target) -> tuple[int, bool]:
+    def _tell(self, target: Target, stop: Flag) -> tuple[int, bool]:
         """Tell a target of all that waits for it; return of how much, and whether it failed."""
         told = 0
         for ring in self._outbox.waiting_for(target.name, time.time_ns()):
-            if self._stop.is_set():
+            if stop.is_set():
                 break
             try:
                 reason = target.deliver(f"{self._node}: {ring.rule}", message(ring, self._zone))

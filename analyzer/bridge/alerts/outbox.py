@@ -1,6 +1,7 @@
 """Rings that are to be told, on the disk until everybody was."""
 
 import json
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +12,11 @@ from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.times import NANOSECONDS
 
 MOST = 1000
+UNREAD = "?"  # who is meant by a line that cannot be read, in the place of the name of a target
+_UNREAD_LONGEST = 24 * 3600 * NANOSECONDS  # that a ring waits for such a line to be mended
 _SUFFIX = ".json"
 _LONGEST = 1 << 16  # bytes of a ring
 _DAMAGED = (ValueError, TypeError, KeyError, RecursionError, HearthlogError)
@@ -70,6 +74,29 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._waiting)
 
+    def set_targets(self, targets: Iterable[str], now: int) -> None:
+        """Name those who are to be told from now on; what waits for nobody else is removed.
+
+        Parameters
+        ----------
+        targets : iterable of str
+            With `UNREAD` rings wait for a day, and are there for a target that comes.
+        now : int
+            In nanoseconds of UTC.
+        """
+        with self._lock:
+            self._targets = frozenset(targets)
+            self._remove_done(now)
+
+    def _remove_done(self, now: int) -> None:
+        for name in [n for n, each in self._waiting.items() if self._is_done(each, now)]:
+            self._remove(name)
+
+    def _is_done(self, waiting: Waiting, now: int) -> bool:
+        missing = self._targets - waiting.told
+        is_old = now - waiting.ring.time > _UNREAD_LONGEST
+        return not missing or (is_old and missing == {UNREAD})
+
     def put(self, rings: Iterable[Ring]) -> None:
         """Keep rings, unless they are known; they are on the disk on return.
 
@@ -78,6 +105,7 @@ class Outbox:
         rings : iterable of Ring
         """
         with self._lock:
+            self._remove_done(time.time_ns())
             for ring in rings:
                 if ring.id not in self._waiting and ring.id not in self._early:
                     self._waiting[ring.id] = waiting = Waiting(ring)

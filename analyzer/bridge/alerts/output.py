@@ -1,8 +1,10 @@
 """The output of the bridge that evaluates rules, and tells of what rings."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
@@ -13,16 +15,17 @@ from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
 from hearthlog.analyzer.bridge.alerts.memory import Memory
 from hearthlog.analyzer.bridge.alerts.open_run import Label
-from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.outbox import UNREAD, Outbox
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule, unknown_class
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
-from hearthlog.analyzer.bridge.alerts.targets import read_targets
+from hearthlog.analyzer.bridge.alerts.targets import find_targets
 from hearthlog.analyzer.bridge.alerts.watch import AHEAD, RuleWatch
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -40,6 +43,7 @@ _LOOK_SECONDS = 1.0
 _FORGET_SECONDS = 300.0
 _CLOSE_SECONDS = 2.0
 _LABELS = 10_000
+_LOOK_AT_FILE_SECONDS = 5.0
 _WAIT_SECONDS = 60.0  # for news, where there is no recorder
 
 
@@ -63,8 +67,7 @@ class AlertsOutput:
     Raises
     ------
     BridgeError
-        If nobody would be told, the file of addresses cannot be used, or the folder of the state
-        cannot be written.
+        If nobody would be told, or the folder of the state cannot be written.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -76,9 +79,8 @@ class AlertsOutput:
         say: Callable[[str], None],
         on_ring: OnRing | None = None,
     ) -> None:
-        file = delivery.urls_file
-        targets = [] if file is None else read_targets(file, say)
-        if not targets and on_ring is None:
+        self._file = delivery.urls_file
+        if self._file is None and on_ring is None:
             raise BridgeError(
                 "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a "
                 "broker in [bridge.mqtt]"
@@ -87,10 +89,11 @@ class AlertsOutput:
         self._followed = home
         self._say = say
         self._on_ring = on_ring
-        names = [*(target.name for target in targets), *([BROKER] if on_ring else [])]
         folder = state_folder / "alerts"
+        self._has_problems = False
+        self._read_file, self._looked_at_file = object(), -math.inf  # and when, CLOCK_MONOTONIC
         try:
-            self._outbox = Outbox(folder / "outbox", names, say)
+            self._outbox = Outbox(folder / "outbox", [BROKER, UNREAD], say)
         except OSError as error:
             raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
         memory = Memory(folder / "rules.json", say)
@@ -102,7 +105,8 @@ class AlertsOutput:
         self._labels: deque[tuple[str, Label, Sequence[str]]] = deque(maxlen=_LABELS)
         self._told_now: tuple[Ring, str] | None = None  # of which the broker is told
         self._stop = Flag()
-        self._delivery = Delivery(self._outbox, targets, home.node, home.zone, say)
+        self._delivery = Delivery(self._outbox, [], home.node, home.zone, say)
+        self._find_targets()
         self._thread = Thread(target=self._run, daemon=True, name="alerts")
         self._thread.start()
 
@@ -147,6 +151,30 @@ class AlertsOutput:
                 self._stop.wait(_LOOK_SECONDS)
         self._watch.save(time.time_ns())
 
+    def _find_targets(self) -> None:
+        """Find out who is to be told, if the file of addresses is another one than before.
+
+        Who cannot be read in it does not keep the others from being told; what rings waits for
+        the line to be mended.
+        """
+        if time.monotonic() - self._looked_at_file < _LOOK_AT_FILE_SECONDS:
+            return
+        self._looked_at_file = time.monotonic()
+        state = None if self._file is None else _state_of(self._file)
+        if state == self._read_file:
+            return
+        targets, problems = ([], []) if self._file is None else find_targets(self._file, self._say)
+        self._read_file = state
+        for problem in problems:
+            self._say(f"alerts: {problem}; the others are told, and who is meant when it is mended")
+        if self._has_problems and not problems:
+            self._say(f"alerts: {self._file}: every line of it can be read now")
+        self._has_problems = bool(problems)
+        names = [target.name for target in targets] + [UNREAD] * bool(problems)
+        names += [BROKER] * (self._on_ring is not None)
+        self._outbox.set_targets(names, time.time_ns())
+        self._delivery.set_targets(targets)
+
     def _follow(self) -> None:
         """Read what is written, and evaluate the rules whenever all of it has been read.
 
@@ -158,6 +186,7 @@ class AlertsOutput:
         start = self._watch.needed_from(now)
         self._heard = LiveHome(start, _PATIENCE)
         while not logs.is_dir():
+            self._find_targets()
             self._look()
             if self._stop.wait(_LOOK_SECONDS):
                 return
@@ -166,6 +195,7 @@ class AlertsOutput:
         for path, batch in batches:
             if self._now() < self._latest - AHEAD:
                 return
+            self._find_targets()
             if path == logs:
                 caught_up = True
             elif log_name(path).node == self._followed.node:
@@ -226,6 +256,14 @@ class AlertsOutput:
 
     def _damaged(self, error: LogError) -> None:
         self._say(f"alerts: {error}")
+
+
+def _state_of(file: Path) -> tuple[int, ...] | None:
+    """Return what changes whenever a file does; None if it cannot be looked at."""
+    with suppress(OSError):
+        state = secret_path(file).stat()
+        return state.st_mtime_ns, state.st_size, state.st_ino, state.st_mode, state.st_ctime_ns
+    return None
 
 
 def _decoded(batch: Sequence[RawMessages]) -> list[Columns]:

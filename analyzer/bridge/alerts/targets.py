@@ -1,5 +1,6 @@
 """Those who are told of alerts by Apprise: a phone, a chat, an address."""
 
+import codecs
 import hashlib
 import logging
 import re
@@ -10,6 +11,7 @@ from typing import Any, Protocol
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
+from hearthlog.analyzer.extras import remedy
 from hearthlog.schemas.storage.small_file import read_whole
 
 _LIMIT = 1 << 16  # bytes of the file
@@ -109,10 +111,37 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
     BridgeError
         If the file cannot be read, a line is no address that Apprise knows, or none is there.
     """
-    import apprise  # noqa: PLC0415
+    targets, problems = find_targets(file, say)
+    if problems:
+        raise BridgeError("; ".join(problems))
+    return targets
 
+
+def find_targets(file: Path, say: Callable[[str], None]) -> tuple[list[AppriseTarget], list[str]]:
+    """Read a file of addresses as `read_targets` does, as far as it can be read.
+
+    Parameters
+    ----------
+    file : Path
+        As `secret_path` finds it.
+    say : callable
+        Told in a line that others may read the file.
+
+    Returns
+    -------
+    targets : list of AppriseTarget
+    problems : list of str
+        Why somebody who was meant cannot be told, a line each, without any address.
+    """
     file = secret_path(file)
-    data = read_whole(file, "file of addresses", _LIMIT, BridgeError)
+    try:
+        import apprise  # noqa: PLC0415
+
+        text = _text(read_whole(file, "file of addresses", _LIMIT, BridgeError))
+    except BridgeError as error:
+        return [], [str(error)]
+    except ModuleNotFoundError as error:
+        return [], [f"{error.name} is not installed; {remedy(error.name or '')}"]
     if file.stat().st_mode & _OTHERS:
         say(f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}")
     # Nothing is loaded from the disk, and nothing written there.
@@ -120,17 +149,37 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
         plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False
     )
     asset.app_id = asset.app_desc = "hearthlog"
-    targets = []
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        address = line.strip()
+    targets: dict[str, AppriseTarget] = {}
+    problems = []
+    lines = [line.strip() for line in text.splitlines()]
+    for number, address in enumerate(lines, 1):
         if not address or address.startswith("#"):
             continue
-        plugin = apprise.Apprise.instantiate(address, asset=asset, suppress_exceptions=True)
+        plugin = _plugin(address, asset)
         if plugin is None:
-            raise BridgeError(
+            problems.append(
                 f"{file}, line {number}: no address that Apprise knows; docs/alerts.md has examples"
             )
-        targets.append(AppriseTarget(plugin, address, number))
-    if not targets:
-        raise BridgeError(f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic")
-    return targets
+        else:
+            target = AppriseTarget(plugin, address, number)
+            targets.setdefault(target.name, target)
+    if not targets and not problems:
+        problems = [f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic"]
+    return [*targets.values()], problems
+
+
+def _plugin(address: str, asset: Any) -> Any:
+    """Return an address as Apprise reads it; None if it cannot."""
+    import apprise  # noqa: PLC0415
+
+    try:
+        return apprise.Apprise.instantiate(address, asset=asset, suppress_exceptions=True)
+    except Exception:  # noqa: BLE001  hundreds of services, each with its own
+        return None
+
+
+def _text(data: bytes) -> str:
+    """Decode a file as editors write it: UTF-8, or what begins with a mark."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
+    return data.decode("utf-8-sig", "replace")

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.bridge.day import Today, iso_time
+from hearthlog.analyzer.bridge.day import iso_time
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
 from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
+from hearthlog.analyzer.bridge.home_state import HomeState, Known, MicrophoneState
 from hearthlog.analyzer.bridge.mqtt.announced import Announced, Place
 from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
 from hearthlog.analyzer.bridge.mqtt.discovery import (
@@ -305,11 +305,12 @@ class MqttPublisher:
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             say("level", f"{microphone.level_dbfs:.1f}")
+        known = microphone.known_of(news.today)
         for label in (each for each in microphone.classes if each != SILENCE):
             is_told = self._announced.is_told(label)
             if self._settings.commands:
                 self._keep(Place(_TOLD, label=label), _ON[is_told])
-            for kind, value in class_values(microphone, label, news):
+            for kind, value in class_values(microphone, label, news, known):
                 shown = value if is_told or kind != "on" else _ON[False]
                 self._keep(Place(kind, microphone.name, label), shown)
 
@@ -324,7 +325,9 @@ class MqttPublisher:
         self._keep(Place("problem", microphone.name), json.dumps(value))
 
 
-def class_values(microphone: MicrophoneState, label: str, news: News) -> Iterator[tuple[str, str]]:
+def class_values(
+    microphone: MicrophoneState, label: str, news: News, known: Known
+) -> Iterator[tuple[str, str]]:
     """Yield what the broker keeps of a class: the kind of topic, and its value.
 
     Parameters
@@ -334,21 +337,16 @@ def class_values(microphone: MicrophoneState, label: str, news: News) -> Iterato
         The class.
     news : News
         Of whose day and night events are counted.
+    known : Known
+        Of these.
     """
     yield "on", _ON[microphone.heard.is_heard(label)]
-    for kind, count in zip(
-        ("count_today", "count_night"), counts(microphone, label, news.today), strict=True
-    ):
-        yield kind, str(count)
+    counts = microphone.counts(label, news.today, known)
+    for kind, count in zip(("count_today", "count_night"), counts, strict=True):
+        yield kind, str(count)  # `None`, which Home Assistant takes for unknown, where it is that
     last = microphone.last_event(label)
     if last is not None:  # else what the broker has from an earlier bridge is right
         yield "last_heard", iso_time(last.end, news.zone)
-
-
-def counts(microphone: MicrophoneState, label: str, today: Today) -> tuple[int, int]:
-    """Count the events of a class that began since midnight, and those of the last night."""
-    night = [e for e in microphone.events(label, today.night) if e.start < today.morning]
-    return len(microphone.events(label, today.midnight)), len(night)
 
 
 def event_fields(event: Event, news: News) -> dict[str, str | float]:

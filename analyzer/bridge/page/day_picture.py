@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.bridge.day import Today
 from hearthlog.analyzer.bridge.event_record import Event
-from hearthlog.analyzer.bridge.home_state import MicrophoneState
+from hearthlog.analyzer.bridge.home_state import Known, MicrophoneState
 from hearthlog.analyzer.bridge.page.words import class_words, long_date, room, times, when
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
@@ -60,23 +60,25 @@ def day_picture(microphones: Iterable[MicrophoneState], today: Today, zone: tzin
 
 
 def _room(microphone: MicrophoneState, day: Day, today: Today) -> Any:
+    known = microphone.known_of(today)
     return {
         "room": room(microphone.name),
         "gaps": [(day.place(a), day.place(b)) for a, b in _unheard(microphone, day, today)],
         "lanes": [
-            _lane(microphone, label, day, today)
+            _lane(microphone, label, day, today, known)
             for label in dict.fromkeys([*microphone.classes, *microphone.labels()])
             if label != SILENCE
         ],
     }
 
 
-def _lane(microphone: MicrophoneState, label: str, day: Day, today: Today) -> Any:
-    count, night = counts(microphone, label, today)
+def _lane(microphone: MicrophoneState, label: str, day: Day, today: Today, known: Known) -> Any:
+    count, night = microphone.counts(label, today, known)
     last = microphone.last_event(label)
     last_heard = "" if last is None else when(last.end, today.now, day.zone)
     words = class_words(label)
-    told = f"{words}: {times(count)} today" + (f", last at {last_heard}" if count else "")
+    how_often = "not known" if count is None else times(count)
+    told = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
     events = microphone.events(label, day.start - 24 * _HOUR)
     return {
         "words": words,
@@ -87,12 +89,6 @@ def _lane(microphone: MicrophoneState, label: str, day: Day, today: Today) -> An
         "night": night,
         "last": last_heard,
     }
-
-
-def counts(microphone: MicrophoneState, label: str, today: Today) -> tuple[int, int]:
-    """Count the events of a class that began since midnight, and those of the last night."""
-    night = [e for e in microphone.events(label, today.night) if e.start < today.morning]
-    return len(microphone.events(label, today.midnight)), len(night)
 
 
 def bars(events: Iterable[Event], day: Day) -> str:

@@ -40,7 +40,7 @@ def health_list(news: News, node: str, started: int, recurring: str = "") -> lis
 
 def _lines(news: News, node: str, started: int) -> Iterator[HealthLine]:
     state = news.state
-    for microphone in state.microphones.values():
+    for microphone in state.present():
         yield _of_microphone(microphone, state)
     is_recording = state.is_recording()
     yield HealthLine(
@@ -59,7 +59,7 @@ def _lines(news: News, node: str, started: int) -> Iterator[HealthLine]:
 def _of_microphone(microphone: MicrophoneState, state: HomeState) -> HealthLine:
     health = state.health.get(microphone.name)
     text, level = ("", _WELL) if health is None else (told(health.text), health.level)
-    is_alone = len(state.microphones) == 1
+    is_alone = len(state.present()) == 1
     what = "Microphone" if is_alone else f"Microphone, {room(microphone.name)}"
     if not microphone.is_listening():
         why = reason(text)

@@ -1,6 +1,7 @@
 """The page of the home, made of what the bridge knows, once a second where something changed."""
 
 import json
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,12 +12,13 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.page.admission import PageAdmission
 from hearthlog.analyzer.bridge.page.board import Board
 from hearthlog.analyzer.bridge.page.day_picture import BIN, day_picture
 from hearthlog.analyzer.bridge.page.event_list import last_events
 from hearthlog.analyzer.bridge.page.health_list import health_list
 from hearthlog.analyzer.bridge.page.now_heard import NowHeard
-from hearthlog.analyzer.bridge.page.page_token import page_token
+from hearthlog.analyzer.bridge.page.page_token import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.page.recurring import Recurring
 from hearthlog.analyzer.bridge.page.recurring_list import Moment
 from hearthlog.analyzer.bridge.page.said import Said
@@ -67,11 +69,23 @@ class HomePage:
         self._recurring = Recurring(home.folder)
         self._is_read_back = False
         token = page_token(settings.token_file, state)
+        names = frozenset(settings.names)
+        admission = PageAdmission(settings.bind, settings.port, token, cookie_key(state), names)
         self._board = Board()
         actions = {"/mark": self._mark, "/group": self._recurring.name}
-        self._server = PageServer(settings.bind, settings.port, token, self._board, actions)
+        self._server = PageServer(admission, self._board, actions, settings.frames)
         host = f"[{settings.bind}]" if bind.version == 6 else settings.bind
-        say(f"the page of the home: http://{host}:{settings.port}/?token={token}")
+        address = f"http://{host}:{settings.port}/"
+        whole = f"{address}?token={token}"
+        try:
+            file = keep_address(whole, state)
+        except BridgeError:
+            self._server.end()
+            raise
+        # A service says it to its journal, which others may read.
+        is_shown = sys.stderr is not None and sys.stderr.isatty()
+        place = whole if is_shown else f"{address}; its whole address, which opens it, is in {file}"
+        say(f"the page of the home: {place}")
         if not bind.is_loopback:
             say(
                 f"the page listens on {settings.bind}: it crosses the network in the clear, and "

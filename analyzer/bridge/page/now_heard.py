@@ -32,7 +32,7 @@ class NowHeard:
 
     def describe(self, news: News) -> Any:
         """Describe what is heard for JSON."""
-        microphones = list(news.state.microphones.values())
+        microphones = news.state.present()
         return {
             "is_recording": news.state.is_recording(),
             "rooms": [

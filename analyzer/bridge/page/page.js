@@ -123,7 +123,7 @@ function showLane({ svg, cells }, it, gaps, day, width) {
   set(moment, "d", `M${day.now * width} 0V${LANE}`);
   [it.today, it.night, it.last].forEach((value, index) => {
     cells[index].className = value ? "" : "none";
-    write(cells[index], String(value || (index < 2 ? 0 : "not lately")));
+    write(cells[index], String(value ?? "not known") || "not lately");
   });
 }
 
@@ -260,7 +260,7 @@ function beginEvent({ id, words, colour, time }) {
   const item = begin(() => ({
     legend: `${words} at ${time}: that was …`,
     choices: [...classes, ["silence", "Nothing"]],
-    save: (label) => send("/mark", { event: id, label }),
+    save: (label) => send("mark", { event: id, label }),
   }));
   item.what.append(swatch(colour), words);
   return item;
@@ -280,7 +280,7 @@ function beginGroup({ id }) {
   const item = begin(({ words }) => ({
     legend: `${words}: that was …`,
     choices: classes,
-    save: (label) => send("/group", { group: id, label }),
+    save: (label) => send("group", { group: id, label }),
   }));
   [item.heard, item.listen] = [make("p", { class: "about" }), make("p", { class: "about" })];
   item.about.after(item.heard, item.listen);
@@ -289,7 +289,7 @@ function beginGroup({ id }) {
   item.details.after(item.back);
   item.back.addEventListener("click", async () => {
     item.back.disabled = true;
-    const answer = await send("/group", { group: id, label: "" });
+    const answer = await send("group", { group: id, label: "" });
     item.back.disabled = false;
     write(item.said, answer.error ?? answer.said);
   });
@@ -350,7 +350,7 @@ function beat() {
 }
 
 function connect() {
-  const source = new EventSource("/events");
+  const source = new EventSource("events");
   const shows = { home: showHome, now: showNow, scenarios: showScenarios, day: showDay, events: showEvents,
     recurring: showRecurring, health: showHealth };
   for (const [name, show] of Object.entries(shows)) {

@@ -1,4 +1,4 @@
-"""The token in the address of the page: given in a file, or made once."""
+"""Secrets of a server: a token in a file, given or made once, and what is made of it."""
 
 import os
 import re
@@ -9,7 +9,7 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.schemas.storage.small_file import read_whole
 
-_NAME = "page-token"
+_TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
 _FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # what an address can have as it is
 
 
@@ -29,36 +29,73 @@ def page_token(file: Path | None, state: Path) -> str:
     BridgeError
         If the file cannot be used, or none can be made.
     """
-    if file is not None:
-        return _read(secret_path(file))
-    path = state / _NAME
-    if not path.exists():
-        _make(path)
-    return _read(path)
+    return read_token(file) if file is not None else _kept(state / _TOKEN)
 
 
-def _read(file: Path) -> str:
+def cookie_key(state: Path) -> bytes:
+    """Return what the cookies of the page are made with; without its file there will be another.
+
+    Parameters
+    ----------
+    state : Path
+        Folder in which it is made once, and kept.
+
+    Raises
+    ------
+    BridgeError
+        If it cannot be read or made.
+    """
+    return _kept(state / _COOKIES).encode()
+
+
+def keep_address(address: str, state: Path) -> Path:
+    """Write the whole address of the page into a file that only its owner may read.
+
+    Raises
+    ------
+    BridgeError
+        If it cannot be written.
+    """
+    path = state / _ADDRESS
+    _write(path, address)
+    return path
+
+
+def read_token(file: Path) -> str:
+    """Read a file of a token, as `secret_path` finds it.
+
+    Raises
+    ------
+    BridgeError
+        If it cannot be used.
+    """
+    file = secret_path(file)
     data = read_whole(file, "file of a token", 1 << 12, BridgeError)
     token = data.decode("utf-8", errors="replace").strip()
     if not _FORM.fullmatch(token):
         raise BridgeError(
-            f"{file}: is no token of the page: one line of 16 to 200 letters, digits, '.', '_', "
-            "'~' and '-'"
+            f"{file}: has no token: one line of 16 to 200 letters, digits, '.', '_', '~' and '-'"
         )
     return token
 
 
-def _make(path: Path) -> None:
+def _kept(path: Path) -> str:
+    if not path.exists():
+        _write(path, secrets.token_urlsafe(16))
+    return read_token(path.absolute())
+
+
+def _write(path: Path, line: str) -> None:
     temporary = path.with_name(f".{path.name}-{os.getpid()}")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         temporary.unlink(missing_ok=True)
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w") as stream:
-            stream.write(f"{secrets.token_urlsafe(16)}\n")
+            stream.write(f"{line}\n")
         temporary.replace(path)
     except OSError as error:
         raise BridgeError(
-            f"{path}: the token of the page cannot be kept ({error.strerror}); name a folder with "
-            "`state` in [bridge], or a file with `token_file` in [bridge.page]"
+            f"{path}: cannot be written ({error.strerror}); name another folder with `state` in "
+            "[bridge]"
         ) from error
