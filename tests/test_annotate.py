@@ -134,7 +134,8 @@ def test_a_label_file_that_does_not_say_who_labelled_is_yours(log, hearthlog, tm
     before = time.time_ns()
     done = hearthlog("annotate", "import", log, labels)
     assert done.returncode == 0
-    assert f"next: a model of this home, from these: hearthlog train --home {log}" in done.stderr
+    assert "next: a model of this home, from these (leave it recording, for ten" in done.stderr
+    assert f"hearthlog train --home {log}\n" in done.stderr
     mine, hers = read_marks(log)
     assert mine.reviewer == getpass.getuser()
     assert before <= mine.made <= time.time_ns()

@@ -83,7 +83,8 @@ def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(
     hearthlog("export", logs, "-o", labels, "--topics", "/mic/segment")
     hearthlog("annotate", "import", logs, labels)
     assert hearthlog("info", logs).stdout.splitlines()[-1] == (
-        f"next: a model of this home, from what is marked: hearthlog train --home {logs}"
+        f"next: a model of this home, from what is marked (leave it recording, for ten minutes "
+        f"that it has not learned from judge it): hearthlog train --home {logs}"
     )
     soundfile.write(tmp_path / "quiet.wav", np.zeros(16_000 * 20), 16_000)
     hearthlog("record", tmp_path / "quiet.wav", "--model", "general", "-o", tmp_path / "quiet")

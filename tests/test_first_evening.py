@@ -89,11 +89,17 @@ def test_an_evening_with_nothing_but_a_microphone(
         assert info.stdout.splitlines()[-1].endswith("hearthlog review logs --queue")
         refused = hearthlog("models", "promote", "home-1")
         assert refused.returncode == 1
-        assert "record for some hours" in refused.stderr  # it has learned from all there is
+        assert "it takes 10 min to judge it: record " in refused.stderr  # it learned from the rest
         promoted = hearthlog("models", "promote", "home-1", "--anyway")
         assert promoted.returncode == 0, promoted.stderr
         wait_for(lambda: [m.model for m in latest("info")] == ["home-1"])
         wait_for(lambda: len(latest("label")) > 40)
+        back = hearthlog("models", "rollback")
+        assert "is the champion again, after home-1" in back.stdout, back.stderr
+        wait_for(lambda: [m.model for m in latest("info")] == ["general"])
+        again = hearthlog("models", "promote", "home-1")
+        assert again.returncode == 0, again.stderr  # who insisted once is not asked again
+        wait_for(lambda: [m.model for m in latest("info")] == ["home-1"])
     assert process.returncode == 0, process.errors
     assert "the labels are by the starter model general" in process.errors
     home = load_model(Path("models/home-1.safetensors"))

@@ -15,7 +15,7 @@ from hearthlog.schemas.text import listed, shortened
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.options import LocalLog, Microphone, reviewer_name
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
-from hearthlog.tools.cli.text import end_with_warnings, number, tell, wrong_use
+from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, number, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.coverage import Coverage
@@ -138,9 +138,11 @@ def import_labels(
             tell(f"{number(len(others), 'mark')} in no span of {asked}: of your own choice")
     if taken:
         what, of = (
-            (f"scenario {scenario}", f" --scenario {scenario}") if scenario else ("this home", "")
+            (f"scenario {scenario}, from these", f" --scenario {scenario}")
+            if scenario
+            else (f"this home, from these ({JUDGED_BY})", "")
         )
-        tell(f"next: a model of {what}, from these: hearthlog train --home {quote(str(log))}{of}")
+        tell(f"next: a model of {what}: hearthlog train --home {quote(str(log))}{of}")
     end_with_warnings(losses)
 
 

@@ -12,7 +12,7 @@ from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.tools.cli.options import models_folder
-from hearthlog.tools.cli.text import number
+from hearthlog.tools.cli.text import JUDGED_BY, number
 
 
 def gist(summary: Summary) -> Iterator[str]:
@@ -55,7 +55,10 @@ def next_step(summary: Summary, path: Path) -> str | None:
         return "nothing but quiet was heard yet: leave it recording, or try the microphone"
     marked = any(name.partition("/")[2] == REVIEW for name in summary.segments)
     if marked and latest["starter"] and not _has_learned(summary.layers):
-        return f"a model of this home, from what is marked: hearthlog train --home {place}"
+        return (
+            f"a model of this home, from what is marked ({JUDGED_BY}): "
+            f"hearthlog train --home {place}"
+        )
     kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())
     what = "listen to" if kept else "judge"
     return f"ten spans to {what}: hearthlog review {place} --queue"

@@ -29,7 +29,7 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.recurring_lanes import add_groups, add_voices
 from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import end_with_warnings, tell, wrong_use
+from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, tell, wrong_use
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -275,7 +275,8 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
             words += ["--scenario", marking.scenario] if marking.scenario else []
             what = f"scenario {marking.scenario}" if marking.scenario else "this home"
             train = f"hearthlog train {shlex.join(words)}"
-            tell(f"next: a model of {what}, from what is marked: {train}")
+            judged = "" if marking.scenario else f" ({JUDGED_BY})"
+            tell(f"next: a model of {what}, from what is marked{judged}: {train}")
     if not marking.scenario:
         _say_how_right(logs)
 

@@ -12,6 +12,7 @@ import typer
 from hearthlog.schemas.text import printable
 from hearthlog.schemas.times import millisecond_text
 
+JUDGED_BY = "leave it recording, for ten minutes that it has not learned from judge it"
 _SHOWN = 10  # of a list
 _MOST_TOLD = 100  # that are remembered
 

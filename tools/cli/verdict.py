@@ -60,11 +60,11 @@ def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
     from hearthlog.analyzer.gate.changes import time_words
 
     changes = evidence.changes
-    little = "" if changes.pairs() else f" less than half a minute{changes.each}"
-    whole = "" if changes.each else f" of the {time_words(evidence.recorded)} that were recorded"
+    much = ":" if changes.pairs() else f" less than half a minute{changes.each}"
+    whole = "" if changes.each else f", taken for the {time_words(evidence.recorded)} recorded"
     print(
-        f"\non {time_words(evidence.minutes)} of the last two weeks that it has not learned from, "
-        f"{model} instead of {champion} changes{little}{whole}"
+        f"\nby {time_words(evidence.minutes)} of the last two weeks that it has not learned from"
+        f"{whole}, {model} instead of {champion} would change{much}"
     )
     print_changes(changes, champion, model)
 
