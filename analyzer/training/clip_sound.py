@@ -3,6 +3,7 @@
 import numpy as np
 
 from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32
@@ -19,7 +20,8 @@ def clip_frames(clip: LabelledClip) -> Float32:
     Returns
     -------
     np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Whole frames at 16 kHz; none of a part behind the end of the file.
+        Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
+        of the file.
 
     Raises
     ------
@@ -28,4 +30,4 @@ def clip_frames(clip: LabelledClip) -> Float32:
     """
     cutter = FrameCutter()
     blocks = [cutter.push(block) for block in read_audio(clip.path, clip.start, clip.end)]
-    return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
+    return InfrasoundFilter()(np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks]))

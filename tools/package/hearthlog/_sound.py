@@ -10,6 +10,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import FloorTracker
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.installed import feature_set as installed
 from hearthlog.models.labels.labeller import Labeller
@@ -116,7 +117,8 @@ def extract_features(
     count = len(samples) // FRAME_SAMPLES
     if count == 0:
         raise SourceError("the sound is shorter than one frame of 50 ms")
-    values = described.extractor()(samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES))
+    frames = samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+    values = described.extractor()(InfrasoundFilter()(frames))
     times = start + np.arange(count) * FRAME_NANOSECONDS
     return SoundFeatures(described.feature_names, described.units, times, values)
 
