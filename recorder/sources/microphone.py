@@ -72,6 +72,8 @@ class MicrophoneSource:
         When the device is to be closed; by default never.
     channels : int or None
         Of an array; None of a single microphone.
+    channel : int or None
+        The one to hear of the device, from 1 on; by default the first one, as of its fallback.
 
     Attributes
     ----------
@@ -86,7 +88,7 @@ class MicrophoneSource:
         if an address cannot be one of sound.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         device: str,
         *,
@@ -94,8 +96,9 @@ class MicrophoneSource:
         waits: bool = True,
         rest: Rest | None = None,
         channels: int | None = None,
+        channel: int | None = None,
     ) -> None:
-        self._own = _Device(device, channels)
+        self._own = _Device(device, channels, channel)
         self._fallback = _Device(fallback) if fallback else None
         self._return: ReturnWatch | None = None  # as long as the fallback is heard
         self._lost_at = -math.inf  # when the device was lost
@@ -214,8 +217,13 @@ class MicrophoneSource:
 
     def _open(self, device: "_Device", stop: Flag) -> Capture:
         if is_address(device.wanted):
-            return NetworkProcess(device.wanted, stop)
-        return CaptureProcess(device.wanted, exact=device.was_heard, channels=device.channels)
+            return NetworkProcess(device.wanted, stop, device.channel)
+        return CaptureProcess(
+            device.wanted,
+            exact=device.was_heard,
+            channels=device.channels,
+            channel=device.channel,
+        )
 
     def _hear(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
@@ -341,11 +349,14 @@ class _Level:
 class _Device:
     """A device that is to be heard: by its name, and once it was heard, by what it is."""
 
-    def __init__(self, device: str, channels: int | None = None) -> None:
+    def __init__(
+        self, device: str, channels: int | None = None, channel: int | None = None
+    ) -> None:
         check_device(device)
         self.name = public_name(device)
         self.wanted = device
         self.channels = channels
+        self.channel = channel
         self.was_heard = False
 
     def is_heard(self, capture: Capture) -> None:
