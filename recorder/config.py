@@ -82,6 +82,13 @@ class MicrophoneSettings(BaseModel):
         description="Places of the microphones of an array, [x, y] in metres for each channel; "
         "empty: one channel is heard.",
     )
+    channel: int | None = Field(
+        default=None,
+        ge=1,
+        le=64,
+        description="The channel to hear of several, from 1 on; by default the first one, and of "
+        "files their mean.",
+    )
     model: Path | None = Field(
         default=None, description="Instead of the recorder's; none: no labels."
     )
@@ -103,6 +110,8 @@ class MicrophoneSettings(BaseModel):
     def _check_array(self) -> Self:
         if self.array and is_address(self.device):
             raise ValueError("an address in the network gives one channel, and has no array")
+        if self.array and self.channel is not None:
+            raise ValueError("an array is heard with all of its channels; leave `channel` out")
         return self
 
     @field_serializer("device", "fallback", when_used="json")

@@ -103,7 +103,11 @@ def record_microphones(
             each.name: stack.enter_context(
                 closing(
                     MicrophoneSource(
-                        each.device, fallback=each.fallback, rest=rest, channels=each.channels
+                        each.device,
+                        fallback=each.fallback,
+                        rest=rest,
+                        channels=each.channels,
+                        channel=each.channel,
                     )
                 )
             )

@@ -206,12 +206,19 @@ def test_a_microphone_at_another_rate_is_resampled(labmic, tmp_path):
     assert np.median(values[:, 7]) * RATE / 2 == pytest.approx(1000, abs=1)
 
 
-def test_a_dead_microphone_that_gives_only_zeros_is_reported(labmic, tmp_path):
-    labmic.configure(data=np.zeros(RATE, np.int16))
+@pytest.mark.parametrize(
+    ("offset", "what"), [(0, "digital silence"), (-655, "nothing but an offset")]
+)
+def test_a_dead_microphone_is_reported_and_an_offset_is_no_level(labmic, tmp_path, offset, what):
+    noise = np.random.default_rng(1).integers(-1, 2, RATE) if offset else 0
+    labmic.configure(data=(offset + noise * np.ones(RATE)).astype(np.int16))
     with recording(labmic, tmp_path / "logs"):
         wait_for_frames(tmp_path / "logs", 220)
     found = [s for m in read(tmp_path / "logs", "diagnostics") for s in m.status]
-    assert any(s.level == 2 and "digital silence" in s.message for s in found)
+    (*_, dead) = [s for s in found if s.level == 2]
+    assert dead.message == f"the microphone gives {what}: is it muted or dead?"
+    values = {pair.key: pair.value for pair in dead.values}
+    assert float(values["level_dbfs"]) == -70.0
 
 
 def test_sound_of_pulseaudio_is_heard_to_the_last_sample(pulse_microphone, tmp_path):

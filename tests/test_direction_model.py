@@ -219,7 +219,7 @@ def test_states_begin_to_converge_once_a_second_of_directions_is_known(recorded,
     monkeypatch.setattr(labeller.segmenter, "forget", lambda: forgotten.append(frame.first))
     for place in range(60):
         frame = sound.part(slice(place, place + 1))
-        floors = Floors(powers[place : place + 1], converged=True)
+        floors = Floors(powers[place : place + 1], powers[place : place + 1], converged=True)
         labeller.push(frame.values, floors, frame.first, frame.stamps, frame.directions)
     assert forgotten == [sound.first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)]
 

@@ -222,10 +222,13 @@ def test_what_is_no_sound_to_learn_from_is_refused(hearthlog, recorded, cough, h
     soundfile.write(short, np.full(RATE - 1, 0.1), RATE)
     noise = np.random.default_rng(1).normal(0, 10 ** (-70 / 20), 2 * RATE)
     soundfile.write(quiet, noise, RATE)
+    dead = tmp_path / "dead.wav"
+    soundfile.write(dead, 0.02 + np.random.default_rng(1).integers(-1, 2, 2 * RATE) / 32768, RATE)
     at = ("--start", "2026-03-01T06:59:40", "--end", "2026-03-01T06:59:40.9")
     for options, reason in (
         (("cry", "--file", short), "only 0.95 s of sound; enrol at least 1 s"),
         (("cry", "--file", quiet), "all of it is below -60 dBFS: this is silence, not cry"),
+        (("cry", "--file", dead), "all of it is below -60 dBFS: this is silence, not cry"),
         (("Cry!", "--file", cough), "'Cry!' cannot be the name of a class"),
         (("cry", "--file", tmp_path / "no.wav"), f"{tmp_path}/no.wav: no such file"),
         (("cry", "--log", recorded, *at), "only 0.90 s of sound"),

@@ -1,10 +1,13 @@
 """The floor of a room: what is there while nothing happens, and never what happens."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features import floor as module
 from hearthlog.models.features.floor import (
     BLOCK_FRAMES,
@@ -15,7 +18,9 @@ from hearthlog.models.features.floor import (
     low_power,
 )
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.schemas.frames import FRAME_SAMPLES
+from hearthlog.models.labels.labeller import Labeller
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 pytestmark = pytest.mark.fast
 
@@ -41,12 +46,12 @@ def sound(level, count, spread, seed=0):
     return noise(level, count, seed) * 10 ** (changes / 10)
 
 
-def tracked(powers, first=0, sizes=(10**9,)):
-    """Floors of a new tracker, from blocks of some sizes in turn."""
+def tracked(powers, first=0, sizes=(10**9,), of="powers"):
+    """Floors of a new tracker, or its rooms, from blocks of some sizes in turn."""
     tracker, floors, place, turn = FloorTracker(), [], 0, 0
     while place < len(powers):
         block = powers[place : place + sizes[turn % len(sizes)]]
-        floors.append(tracker(block, first + place).powers)
+        floors.append(getattr(tracker(block, first + place), of))
         place, turn = place + len(block), turn + 1
     return np.concatenate([np.empty((0, powers.shape[1])), *floors])
 
@@ -143,6 +148,35 @@ def test_a_fan_is_a_part_of_the_room_after_a_minute_and_not_before():
         assert level_at(floors, powers, 2 * MINUTE + second * SECOND) == pytest.approx(-50, abs=0.5)
 
 
+def test_what_is_steady_is_the_room_at_once_and_as_long_as_it_sounds():
+    quiet, fan = noise(-70, 2 * MINUTE), noise(-50, 40 * SECOND, 1)
+    fan[300:340] *= 100  # a cough
+    powers = np.concatenate([quiet, fan, noise(-70, MINUTE, 2)])
+    rooms = tracked(powers, of="room")
+    for second in range(9, 40, 3):
+        at = level_at(rooms, powers, 2 * MINUTE + second * SECOND)
+        assert at == pytest.approx(-50, abs=0.5)
+    stopped = 2 * MINUTE + 40 * SECOND
+    assert level_at(rooms, powers, stopped + 2 * BLOCK_FRAMES) < -69
+    assert np.array_equal(rooms, tracked(powers, sizes=(7, 1, 30), of="room"))
+
+
+@pytest.mark.parametrize("level", [-60, -50, -40])
+def test_a_fridge_that_starts_is_a_sound_for_some_seconds_and_no_longer(level):
+    classifier = Classifier(load_model(Path("general")))
+    rng = np.random.default_rng(3)
+    samples = rng.standard_normal((100 * SECOND, FRAME_SAMPLES)) * 10 ** (-75 / 20)
+    samples[40 * SECOND :] += rng.standard_normal((60 * SECOND, FRAME_SAMPLES)) * 10 ** (level / 20)
+    values = DEFAULT.extractor()(samples.astype(np.float32))
+    floors = FloorTracker()(DEFAULT.band_powers(values), 0)
+    stamps = np.arange(len(values)) * FRAME_NANOSECONDS
+    labels, _ = Labeller(classifier).push(values, floors, 0, stamps)
+    heard = labels.frames[labels.probabilities[:, classifier.classes.index("silence")] < 1.0]
+    assert 40 * SECOND - 10 < heard.min() < 40 * SECOND + 10
+    assert len(heard) > 3 * SECOND
+    assert (heard > 48.5 * SECOND).sum() < SECOND  # of 50 s
+
+
 @pytest.mark.parametrize("spread", [0.7, 1.5, 3.0, 6.0])
 def test_ten_minutes_of_a_shower_or_of_music_never_raise_it(spread):
     quiet = noise(-60, 2 * MINUTE)
@@ -150,6 +184,8 @@ def test_ten_minutes_of_a_shower_or_of_music_never_raise_it(spread):
     floors = tracked(powers)
     before = floors[len(quiet) - 1 - len(powers)]
     assert np.array_equal(floors[len(quiet) - len(powers) :].max(axis=0), before)
+    rooms = tracked(powers, of="room")
+    assert np.array_equal(rooms[len(quiet) - len(powers) :].max(axis=0), before)
 
 
 def test_neither_does_a_sound_that_is_steady_for_less_than_a_minute():

@@ -222,7 +222,8 @@ class _Listener:
         if not features.bands:
             return None
         floor = np.zeros(features.bands) if recording.floor is None else recording.floor[-1]
-        return Floors(np.tile(floor, (frames, 1)), converged=True)
+        floors = np.tile(floor, (frames, 1))
+        return Floors(floors, floors, converged=True)
 
     def detections(self) -> Detections:
         """Score all of them."""

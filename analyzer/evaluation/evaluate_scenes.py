@@ -292,7 +292,7 @@ def _fault(clip: LabelledClip) -> str:
 def _read(clip: LabelledClip) -> Float32:
     blocks, length = [], 0
     for block in read_audio(clip.path, clip.start, clip.end):
-        blocks.append(block)
+        blocks.append(np.nan_to_num(block))
         length += len(block)
         if length >= _MOST_SECONDS * SAMPLE_RATE:
             break

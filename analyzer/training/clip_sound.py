@@ -3,6 +3,7 @@
 import numpy as np
 
 from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
@@ -22,12 +23,14 @@ def clip_frames(clip: LabelledClip) -> Float32:
     Returns
     -------
     np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Whole frames at 16 kHz; none of a part behind the end of the file.
+        Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
+        of the file.
 
     Raises
     ------
     SourceError
-        If the clip cannot be read completely, or is longer than an hour.
+        If the clip cannot be read completely, is longer than an hour, or if samples of it are not
+        finite.
     """
     cutter = FrameCutter()
     faults: list[str] = []
@@ -42,4 +45,7 @@ def clip_frames(clip: LabelledClip) -> Float32:
             )
     if faults:
         raise SourceError(faults[0])
-    return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
+    frames = np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
+    if not np.isfinite(frames).all():
+        raise SourceError(f"{clip.path}: samples of it are no numbers (NaN or infinity)")
+    return InfrasoundFilter()(frames)

@@ -3,7 +3,8 @@
 The floor falls with the tenth percentile of the last minute, as in minimum statistics (Martin,
 "Noise power spectral density estimation based on optimal smoothing and minimum statistics", 2001),
 and rises only while the sound is as steady as noise. So a fan becomes a part of the room, and ten
-minutes of a shower or of music do not.
+minutes of a shower or of music do not. What is steady belongs to the room at once; the floor, which
+is subtracted from sound, follows it after a minute.
 """
 
 from typing import NamedTuple
@@ -18,6 +19,7 @@ _MINUTE_BLOCKS = 150
 _SECOND_FRAMES = 20  # no window is longer
 _MEMORY_SECTIONS = 10_800  # 12 h; a relabelling looks back no further
 _SHARE = 0.1  # of the blocks of a minute that may be below the floor
+_STANDS_OUT = 10 ** (2 / 10)  # times the power of the floor: what is less is silence anyway
 _STEADY_DB = 0.42  # noise is below 0.4; real showers, taps, music and speech are above
 NOMINAL = 1e-7  # power, -70 dBFS: differences below it are those of codecs
 
@@ -29,12 +31,15 @@ class Floors(NamedTuple):
     ----------
     powers : np.ndarray [shape=(m, b)], float64
         Powers of the bands; the last is that of the whole frame.
+    room : np.ndarray [shape=(m, b)], float64
+        The same with what is steady and sounds on: what is not above it is silence.
     converged : bool
         Whether frames before the first one of the stream would leave no trace in them, nor in those
         of the second before.
     """
 
     powers: Float64
+    room: Float64
     converged: bool
 
 
@@ -54,6 +59,7 @@ class FloorTracker:
         self._partial: Float64 | None = None  # frames of a block that is not complete
         self._blocks: Float64 | None = None  # of the last minute
         self._floor: Float64 | None = None
+        self._steady: Float64 | None = None  # powers of what is steady and sounds on
         self._settled = False  # whether a whole section was heard
         self._unsteady = 0  # number of sections since the last steady one
 
@@ -76,16 +82,18 @@ class FloorTracker:
         converged = self._converged_for is not None and self._converged_for >= _SECOND_FRAMES
         if self._converged_for is not None:
             self._converged_for += len(powers)
-        return Floors(self._track(powers, first), converged)
+        floors, room = np.split(self._track(powers, first), 2, axis=1)
+        return Floors(floors, room, converged)
 
     def _track(self, powers: Float64, first: int) -> Float64:
+        """Return the floor and the room at each frame that has them, beside each other."""
         if self._partial is None:
             skipped = -first % BLOCK_FRAMES
             if skipped >= len(powers):
-                return powers[:0]
+                return np.empty((0, 2 * powers.shape[1]))
             powers, first = powers[skipped:], first + skipped
             self._partial = powers[:0]
-        begun, before = len(self._partial), self._floor
+        begun, before = len(self._partial), self._now()
         frames = np.concatenate([self._partial, powers])
         count = len(frames) // BLOCK_FRAMES
         self._partial = frames[count * BLOCK_FRAMES :].copy()
@@ -96,8 +104,8 @@ class FloorTracker:
         return np.concatenate([before[np.newaxis], floors])[complete]
 
     def _add_blocks(self, blocks: Float64, number: int) -> Float64:
-        """Return the floors after each of some blocks, of which the first has this number."""
-        floors = np.empty_like(blocks)
+        """Return floor and room after each of some blocks, of which the first has this number."""
+        floors = np.empty((len(blocks), 2 * blocks.shape[1]))
         past = 0 if self._blocks is None else len(self._blocks)
         if self._blocks is not None:
             blocks = np.concatenate([self._blocks, blocks])
@@ -107,9 +115,17 @@ class FloorTracker:
                 self._end_section(blocks[max(end - _MINUTE_BLOCKS, 0) : end])
             elif not self._settled:
                 self._floor = _low(blocks[:end])
-            floors[place] = self._floor
+            if self._steady is not None and _STANDS_OUT * blocks[end - 1, -1] < self._steady[-1]:
+                self._steady = None
+            floors[place] = self._now()
         self._blocks = blocks[-_MINUTE_BLOCKS:].copy()
         return floors
+
+    def _now(self) -> Float64 | None:
+        if self._floor is None:
+            return None
+        room = self._floor if self._steady is None else np.maximum(self._floor, self._steady)
+        return np.concatenate([self._floor, room])
 
     def _end_section(self, minute: Float64) -> None:
         """Move the floor at the end of a section, by the blocks of the minute before."""
@@ -118,10 +134,13 @@ class FloorTracker:
         self._unsteady += 1
         if decibels(section[:, :-1]).std(axis=0).mean() < _STEADY_DB:
             self._floor, self._unsteady = section.mean(axis=0), 0
+            self._steady = self._floor
         elif self._floor is None or self._unsteady >= _MEMORY_SECTIONS:
-            self._floor = low
+            self._floor, self._steady = low, None
         if low[-1] < self._floor[-1]:
             self._floor = np.minimum(self._floor, low)
+        if self._steady is not None and not _stands_out(self._steady, self._floor):
+            self._steady = None
         forgotten = self._unsteady in {0, _MEMORY_SECTIONS}
         if self._converged_for is None and forgotten and len(minute) == _MINUTE_BLOCKS:
             self._converged_for = 0
@@ -188,6 +207,10 @@ def low_power(powers: Float64, share: float = 0.2) -> Float64:
         mean: Float64 = powers.mean(axis=0)
         return mean
     return _low(_block_means(powers, count), share)
+
+
+def _stands_out(steady: Float64, floor: Float64) -> bool:
+    return bool((steady + NOMINAL > _STANDS_OUT * (floor + NOMINAL)).any())
 
 
 def _low(blocks: Float64, share: float = _SHARE) -> Float64:

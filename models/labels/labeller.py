@@ -173,13 +173,14 @@ class Labeller:
         segments : list of Segment
             Those whose end these frames decide.
         """
-        powers = floors.powers if floors is not None and self.timing.needs_floor else None
+        needed = floors if floors is not None and self.timing.needs_floor else None
+        powers, room = (None, None) if needed is None else (needed.powers, needed.room)
         self._converge(floors, first)
         inputs, window = self._advance(features, powers, stamps)
         evidence = None
         if self._evidence is not None:
             evidence = self._evidence.push(directions, first, len(features), len(inputs))
-        probabilities, novelty = self._classify(inputs, window, powers, evidence)
+        probabilities, novelty = self._classify(inputs, window, room, evidence)
         count, spoken = len(inputs), self.timing.label_frame
         first = first + len(features) - count - self.timing.delay
         labelled = LabelledFrames(
@@ -256,15 +257,15 @@ class Labeller:
         self,
         inputs: Float32,
         window: "_Frames",
-        floors: Float64 | None,
+        room: Float64 | None,
         evidence: Float64 | None,
     ) -> tuple[Float32, Float32]:
-        """Classify windows; those that are not above the floor by the gate are silence."""
+        """Classify windows; those that are not above the room by the gate are silence."""
         gate, powers = self._classifier.gate, self._classifier.feature_set.band_powers
-        if not gate or floors is None or powers is None or not len(inputs):
+        if not gate or room is None or powers is None or not len(inputs):
             return self._classifier.classify(inputs, evidence)
-        floors = floors[len(floors) - len(inputs) :]
-        quiet = is_quiet(powers(window.features), floors, self.timing.window_frames, gate)
+        room = room[len(room) - len(inputs) :]
+        quiet = is_quiet(powers(window.features), room, self.timing.window_frames, gate)
         probabilities = np.zeros((len(inputs), len(self.classes)), np.float32)
         novelty = np.zeros(len(inputs), np.float32)
         probabilities[quiet, self.classes.index(SILENCE)] = 1.0

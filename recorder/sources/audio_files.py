@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from threading import Event as Flag
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import OK, READING, Event, Gap, SourceHealth
+from hearthlog.recorder.events import OK, READING, WARNING, Event, Gap, SourceHealth
 from hearthlog.recorder.sources.decoding import check_channels, read_audio
 from hearthlog.recorder.sources.file_times import FileTime
 from hearthlog.recorder.sources.framing import frames_of
@@ -24,6 +25,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
 _NAMED = 10  # of the files that are damaged
+_NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
 
 
 class FileSource:
@@ -42,7 +44,9 @@ class FileSource:
     realtime : bool
         Whether to yield each frame only once as much time has passed since the first one.
     channels : int or None
-        Of an array, which the files must have; None: their channels are averaged.
+        Of an array, which the files must have; None: they become one, as of `read_audio`.
+    channel : int or None
+        The one to hear, from 1 on.
     progress : callable
         Told the share of the sound that was read, 0 to 1.
 
@@ -56,7 +60,8 @@ class FileSource:
     ------
     SourceError
         If one of the files is missing, is not audio, holds none, has a sample rate that cannot be
-        recorded, or other channels than the array; if a log cannot have their times.
+        recorded, other channels than the array, or not the one to hear; if a log cannot have their
+        times.
     """
 
     def __init__(  # noqa: PLR0913
@@ -67,10 +72,11 @@ class FileSource:
         times: Sequence[FileTime | None] = (),
         realtime: bool = False,
         channels: int | None = None,
+        channel: int | None = None,
         progress: Progress = ignore_progress,
     ) -> None:
         for path in paths:
-            check_channels(path, channels)
+            check_channels(path, channels, channel)
         lengths = [audio_seconds(path) for path in paths]
         self._seconds = sum(lengths)
         self._times = list(times) or [None] * len(paths)
@@ -80,16 +86,23 @@ class FileSource:
         self.frames = 0
         self._faults: list[str] = []
         self._overlaps: list[tuple[float, Path]] = []  # seconds, and the file that begins too early
+        self._choices: list[str] = []  # of one channel of a file
+        self._hole_seconds = 0.0
         self._paths = paths
         self._start = start
         self.realtime = realtime
         self._channels = channels
+        self._channel = channel
+        self._problem = ""
         self._progress = progress
 
     @property
     def warnings(self) -> list[str]:
         """What of the files was not heard, or not at its time, as far as they were read."""
-        lines = [f"{fault}; what is there was heard" for fault in self._faults[:_NAMED]]
+        lines = list(self._choices)
+        if self._hole_seconds:
+            lines.append(f"{self.device}: {self._hole_seconds:.2f} s are left out: {_NO_NUMBERS}")
+        lines += [f"{fault}; what is there was heard" for fault in self._faults[:_NAMED]]
         if len(self._faults) > _NAMED:
             lines.append(f"{len(self._faults) - _NAMED:,} more files are damaged or cut short")
         if self._overlaps:
@@ -124,11 +137,14 @@ class FileSource:
         """
         began = time.monotonic()
         next_frame, end, report = 0, self._start, 0
-        for item in self._frames():
-            if isinstance(item, _Pause):
-                lost = max(round((item.until - end) / FRAME_NANOSECONDS), 1)
-                yield Gap(end, item.until, item.reason, lost)
-                next_frame, end = next_frame + lost, item.until
+        for item in _finite_runs(self._frames()):
+            if isinstance(item, _Pause | _Hole):
+                until = item.until if isinstance(item, _Pause) else end + item.nanoseconds
+                lost = max(round((until - end) / FRAME_NANOSECONDS), 1)
+                if isinstance(item, _Hole):
+                    self._hole_seconds += item.nanoseconds / NANOSECONDS
+                yield Gap(end, until, item.reason, lost)
+                next_frame, end = next_frame + lost, until
                 continue
             stamps = end + np.arange(len(item)) * FRAME_NANOSECONDS
             frames = frames_of(next_frame, item, stamps)
@@ -138,7 +154,8 @@ class FileSource:
             if stop.is_set():
                 return
             if self.frames >= report:
-                yield SourceHealth(int(stamps[0]), OK, READING, {"device": self.device})
+                health = (WARNING, self._problem) if self._problem else (OK, READING)
+                yield SourceHealth(int(stamps[0]), *health, {"device": self.device})
                 report = self.frames + _HEALTH_FRAMES
             yield frames
             next_frame += len(item)
@@ -147,9 +164,8 @@ class FileSource:
             self._progress(min(self.frames * FRAME_NANOSECONDS / NANOSECONDS / self._seconds, 1.0))
         if not self.frames:
             files = ", ".join(str(path) for path in self._paths)
-            raise SourceError(
-                "; ".join(self._faults) or f"{files}: shorter than one frame of 50 ms"
-            )
+            what = _NO_NUMBERS if self._hole_seconds else "shorter than one frame of 50 ms"
+            raise SourceError("; ".join(self._faults) or f"{files}: {what}")
 
     def _frames(self) -> Iterator["Float32 | _Pause"]:
         """Yield blocks of frames whose number divides the interval of the health reports."""
@@ -166,7 +182,15 @@ class FileSource:
                 yield _Pause(moment.start, f"between the files {before} and {_text(path)}")
                 held, samples, begin = held[:0], 0, moment.start
             before = _text(path)
-            for block in read_audio(path, channels=self._channels, incomplete=self._faults.append):
+            self._problem = ""
+            blocks = read_audio(
+                path,
+                channels=self._channels,
+                channel=self._channel,
+                incomplete=self._faults.append,
+                chosen=partial(self._choose, path),
+            )
+            for block in blocks:
                 samples += len(block)
                 held = np.concatenate([held, block])
                 whole = len(held) - len(held) % size
@@ -176,6 +200,12 @@ class FileSource:
         rest = len(held) - len(held) % FRAME_SAMPLES
         if rest:
             yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
+
+    def _choose(self, path: Path, sentence: str) -> None:
+        """Note that a channel of a file is heard alone."""
+        self._problem = sentence
+        if (choice := f"{path}: {sentence}") not in self._choices:
+            self._choices.append(choice)
 
     def _is_later(self, path: Path, moment: FileTime, end: int) -> bool:
         """Whether a file begins after the end of those before it, as far as it says."""
@@ -191,6 +221,35 @@ class _Pause(NamedTuple):
 
     until: int  # in nanoseconds of UTC
     reason: str
+
+
+class _Hole(NamedTuple):
+    """Frames of a file that hold what is no sound."""
+
+    nanoseconds: int
+    reason: str = _NO_NUMBERS
+
+
+def _finite_runs(blocks: Iterator[Float32 | _Pause]) -> Iterator[Float32 | _Pause | _Hole]:
+    """Replace frames that are not finite by holes."""
+    lost = 0  # frames of a hole that may go on
+    for block in blocks:
+        for run in [block] if isinstance(block, _Pause) else _runs(block):
+            if not isinstance(run, _Pause) and np.isnan(run).any():
+                lost += len(run)
+                continue
+            if lost:
+                yield _Hole(lost * FRAME_NANOSECONDS)
+                lost = 0
+            yield run
+    if lost:
+        yield _Hole(lost * FRAME_NANOSECONDS)
+
+
+def _runs(block: Float32) -> list[Float32]:
+    """Divide frames where finite ones border on others."""
+    is_hole = np.isnan(block).reshape(len(block), -1).any(axis=1)
+    return np.split(block, np.flatnonzero(np.diff(is_hole)) + 1) if is_hole.any() else [block]
 
 
 def find_audio(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:

@@ -48,7 +48,8 @@ def main() -> None:
     """Capture from the device named by the first argument, until killed or without a parent.
 
     Without an argument, list the devices. The second one is the number of channels of an array, or
-    0. A third one: take no other device whose name contains this one.
+    0, the third one the channel to hear, or 0. A fourth one: take no other device whose name
+    contains this one.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
@@ -60,8 +61,9 @@ def main() -> None:
         if len(sys.argv) == 1:
             output.write(json.dumps([asdict(device) for device in devices]).encode())
         else:
-            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 3)
-            _capture(sounddevice, device, int(sys.argv[2]) or None, output)
+            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 4)
+            places, channel = (int(number) or None for number in sys.argv[2:4])
+            _capture(sounddevice, device, places, channel, output)
     except SourceError as error:
         answer = {"error": str(error), "device": isinstance(error, DeviceError)}
         output.write(json.dumps(answer).encode() + b"\n")
@@ -71,7 +73,9 @@ def main() -> None:
     os._exit(0)
 
 
-def _capture(sounddevice: ModuleType, device: Device, places: int | None, output: Any) -> None:
+def _capture(
+    sounddevice: ModuleType, device: Device, places: int | None, channel: int | None, output: Any
+) -> None:
     blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(_QUEUE_BLOCKS)
     index = 0
 
@@ -88,7 +92,9 @@ def _capture(sounddevice: ModuleType, device: Device, places: int | None, output
         if not blocks.full():  # what is dropped here shows in the next index
             blocks.put_nowait((head, bytes(samples)))
 
-    stream, rate, channels = _open(sounddevice, device, places or 1, enqueue)
+    wanted = range(channel - 1, channel) if channel else range(places or 1)
+    _check_channels(device, places, channel)
+    stream, rate, channels = _open(sounddevice, device, wanted.stop, enqueue)
     answer = CaptureFormat(device.name, device.identity, rate, channels=places)
     output.write(json.dumps(asdict(answer)).encode() + b"\n")
     stream.start()
@@ -99,18 +105,13 @@ def _capture(sounddevice: ModuleType, device: Device, places: int | None, output
         except queue.Empty:
             continue
         output.write(head)
-        output.write(_first_channels(samples, channels, places or 1))
+        output.write(_some_channels(samples, channels, wanted))
 
 
 def _open(
     sounddevice: ModuleType, device: Device, wanted: int, callback: Any
 ) -> tuple[Any, int, int]:
     """Open the device at 16 kHz and so many channels, or at its own rate, or all channels."""
-    if device.channels < wanted:
-        raise SourceError(
-            f"microphone {device.name!r} has {device.channels} channels, and `array` names places "
-            f"for {wanted}: name one for each channel that it has"
-        )
     reason = ""
     for rate in (_PREFERRED_RATE, int(device.default_rate)):
         for channels in (wanted, device.channels):
@@ -131,13 +132,27 @@ def _open(
     raise DeviceError(f"microphone {device.name!r} cannot be opened ({reason})")
 
 
-def _first_channels(samples: bytes, channels: int, wanted: int) -> bytes:
-    if channels == wanted:
+def _check_channels(device: Device, places: int | None, channel: int | None) -> None:
+    """Raise SourceError if the device has too few channels."""
+    there = device.channels
+    has = f"microphone {device.name!r} has {there} channel{'s' if there > 1 else ''}"
+    if places is not None and there < places:
+        raise SourceError(
+            f"{has}, and `array` names places for {places}: name one for each channel that it has"
+        )
+    if channel is not None and there < channel:
+        raise SourceError(
+            f"{has}, and `channel` asks for number {channel}: take one from 1 to {there}"
+        )
+
+
+def _some_channels(samples: bytes, channels: int, wanted: range) -> bytes:
+    if wanted == range(channels):
         return samples
     every = array("h", samples)
-    chosen = array("h", bytes(2 * wanted * (len(every) // channels)))
-    for channel in range(wanted):
-        chosen[channel::wanted] = every[channel::channels]
+    chosen = array("h", bytes(2 * len(wanted) * (len(every) // channels)))
+    for place, channel in enumerate(wanted):
+        chosen[place :: len(wanted)] = every[channel::channels]
     return chosen.tobytes()
 
 

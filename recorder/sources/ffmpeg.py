@@ -32,7 +32,9 @@ _FILE_FORMATS = (
 )
 _FILE_SECONDS = 30.0  # after which a file without more sound is given up
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
-_AU = struct.Struct(">4s5I")  # magic, where the samples begin, their bytes, kind, rate, channels
+AU_HEADER = struct.Struct(
+    ">4s5I"
+)  # magic, where the samples begin, their bytes, kind, rate, channels
 _AU_FLOAT = 6
 _KEPT_BYTES = 4000  # of what it writes to standard error
 _SAMPLE_BYTES = 4
@@ -110,10 +112,10 @@ class FileDecoder:
 
     def _read_header(self) -> str:
         """Read up to the first sample; return why there is none."""
-        head = self._read(_AU.size)
-        if len(head) == _AU.size:
-            _, place, _, kind, self.rate, self.channels = _AU.unpack(head)
-            self._read(place - _AU.size)
+        head = self._read(AU_HEADER.size)
+        if len(head) == AU_HEADER.size:
+            _, place, _, kind, self.rate, self.channels = AU_HEADER.unpack(head)
+            self._read(place - AU_HEADER.size)
             if kind == _AU_FLOAT and self.channels:
                 self._held = self._read(_SAMPLE_BYTES * self.channels)
         return "" if self._held else self.fault() or _NO_SOUND
@@ -229,7 +231,7 @@ def _start_decoding(path: Path) -> subprocess.Popen[bytes]:
 
 
 def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
-    """Start to read the first sound of an address, as int16 at 16 kHz, one channel.
+    """Start to read the first sound of an address: an AU file of int16 at 16 kHz, all channels.
 
     ffmpeg ends with the thread that starts it, also if that is killed.
 
@@ -249,7 +251,7 @@ def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
             *("-protocol_whitelist", f"pipe,{_PROTOCOLS[urlsplit(address).scheme]}"),
             *("-format_whitelist", f"concat,{_FORMATS}", "-threads", "1"),
             *("-f", "concat", "-safe", "0", "-i", "pipe:0", "-map", "0:a:0"),
-            *("-ac", "1", "-ar", str(SAMPLE_RATE), "-f", "s16le", "pipe:1"),
+            *("-ar", str(SAMPLE_RATE), "-c:a", "pcm_s16be", "-f", "au", "pipe:1"),
         ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

@@ -8,6 +8,7 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.models.features.floor import decibels
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.addresses import check_address, is_address, is_topic, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, WARNING, Event, Frames, Gap, SourceHealth
@@ -18,6 +19,7 @@ from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkP
 from hearthlog.recorder.sources.return_watch import ReturnWatch
 from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
+from hearthlog.recorder.stream.sound_watch import is_offset_only
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -70,6 +72,8 @@ class MicrophoneSource:
         When the device is to be closed; by default never.
     channels : int or None
         Of an array; None of a single microphone.
+    channel : int or None
+        The one to hear of the device, from 1 on; by default the first one, as of its fallback.
 
     Attributes
     ----------
@@ -84,7 +88,7 @@ class MicrophoneSource:
         if an address cannot be one of sound.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         device: str,
         *,
@@ -92,8 +96,9 @@ class MicrophoneSource:
         waits: bool = True,
         rest: Rest | None = None,
         channels: int | None = None,
+        channel: int | None = None,
     ) -> None:
-        self._own = _Device(device, channels)
+        self._own = _Device(device, channels, channel)
         self._fallback = _Device(fallback) if fallback else None
         self._return: ReturnWatch | None = None  # as long as the fallback is heard
         self._lost_at = -math.inf  # when the device was lost
@@ -106,6 +111,7 @@ class MicrophoneSource:
         self._frames_lost = 0
         self._overruns = 0  # blocks of which the sound card lost a part
         self._last_block = time.monotonic()  # its arrival
+        self._infrasound = InfrasoundFilter()
         self._level = _Level()
         self._health = (OK, "starting")
         waits_later = waits and is_address(device)  # the recorder does not wait for a network
@@ -211,8 +217,13 @@ class MicrophoneSource:
 
     def _open(self, device: "_Device", stop: Flag) -> Capture:
         if is_address(device.wanted):
-            return NetworkProcess(device.wanted, stop)
-        return CaptureProcess(device.wanted, exact=device.was_heard, channels=device.channels)
+            return NetworkProcess(device.wanted, stop, device.channel)
+        return CaptureProcess(
+            device.wanted,
+            exact=device.was_heard,
+            channels=device.channels,
+            channel=device.channel,
+        )
 
     def _hear(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
@@ -266,13 +277,17 @@ class MicrophoneSource:
     def _watch(self, event: Frames | Gap) -> None:
         if isinstance(event, Gap):
             self._frames_lost += event.frames_lost
+            self._infrasound.restart()
             return
-        self._level.add(event.samples)
-        sounding = np.flatnonzero(event.samples.any(axis=1))
+        filtered = self._infrasound(event.samples)
+        self._level.add(filtered)
+        is_dead = ~event.samples.any(axis=1) | is_offset_only(event.samples, filtered)
+        sounding = np.flatnonzero(~is_dead)
         zeros = len(event.samples) - 1 - sounding[-1] if len(sounding) else len(event.samples)
         self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)
         if self._silent_frames >= _SILENT_FRAMES:
-            self._health = (ERROR, "the microphone gives digital silence: is it muted or dead?")
+            what = "nothing but an offset" if event.samples[-1].any() else "digital silence"
+            self._health = (ERROR, f"the microphone gives {what}: is it muted or dead?")
         elif self._clock.trouble:
             self._health = (ERROR, self._clock.trouble)
         elif self._return is not None:
@@ -334,11 +349,14 @@ class _Level:
 class _Device:
     """A device that is to be heard: by its name, and once it was heard, by what it is."""
 
-    def __init__(self, device: str, channels: int | None = None) -> None:
+    def __init__(
+        self, device: str, channels: int | None = None, channel: int | None = None
+    ) -> None:
         check_device(device)
         self.name = public_name(device)
         self.wanted = device
         self.channels = channels
+        self.channel = channel
         self.was_heard = False
 
     def is_heard(self, capture: Capture) -> None:

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from array import array
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
@@ -20,7 +21,7 @@ from typing import Any
 from hearthlog.recorder.addresses import public_name
 from hearthlog.recorder.errors import DeviceError
 from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, CaptureFormat
-from hearthlog.recorder.sources.ffmpeg import explain, start_ffmpeg
+from hearthlog.recorder.sources.ffmpeg import AU_HEADER, explain, start_ffmpeg
 from hearthlog.recorder.sources.pace import Pace
 from hearthlog.schemas.frames import SAMPLE_RATE
 
@@ -30,6 +31,7 @@ _SETTLE_SECONDS = 3.0  # in which a server has sent what it kept for its listene
 _PIPE_BYTES = 1 << 18  # 8 s of sound
 _SAMPLE_BYTES = 2
 _SAID_BYTES = 4000
+_DECIDED_SAMPLES = 10 * SAMPLE_RATE  # after which the channel to hear is chosen again
 
 
 def main() -> None:
@@ -38,7 +40,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
     address = sys.stdin.read()
     try:
-        _capture(_Sound(address), address, os.fdopen(1, "wb", buffering=0))
+        sound = _Sound(address, int(sys.argv[1]) or None)
+        _capture(sound, address, os.fdopen(1, "wb", buffering=0))
     except DeviceError as error:
         sys.exit(str(error))
     except BrokenPipeError:
@@ -48,9 +51,13 @@ def main() -> None:
 class _Sound:
     """What ffmpeg gives, every 0.6 s: each wake-up costs more than the samples it brings."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, channel: int | None) -> None:
         self.began = self.arrival = time.monotonic()
         self._address = address
+        self._channel = channel
+        self._held = b""
+        self._channels = 0  # of the sound; 0 before its header
+        self._mix: Any = None  # of several channels to one
         self._process = start_ffmpeg(address)
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -73,14 +80,32 @@ class _Sound:
                 sys.exit()
             self._listen()
             with suppress(BlockingIOError):
-                samples = os.read(self._pipe, _PIPE_BYTES)
-                if not samples:
+                data = os.read(self._pipe, _PIPE_BYTES)
+                if not data:
                     raise DeviceError(self._reason())
-                self.arrival, self._has_sounded = time.monotonic(), True
-                return samples
+                self._held += data
+                if samples := self._take():
+                    self.arrival, self._has_sounded = time.monotonic(), True
+                    return samples
             if time.monotonic() - self.arrival > _PATIENCE_SECONDS:
                 name = public_name(self._address)
                 raise DeviceError(f"{name} has sent no sound for {_PATIENCE_SECONDS:.0f} s")
+
+    def _take(self) -> bytes:
+        """Return the samples that have come, as int16 of one channel."""
+        if not self._channels:
+            if len(self._held) < AU_HEADER.size:
+                return b""
+            _, place, _, _, _, channels = AU_HEADER.unpack_from(self._held)
+            if len(self._held) < place:
+                return b""
+            self._held, self._channels = self._held[place:], channels
+            self._mix = _mixer(public_name(self._address), channels, self._channel)
+        size = _SAMPLE_BYTES * self._channels
+        end = len(self._held) // size * size
+        samples, self._held = array("h", self._held[:end]), self._held[end:]
+        samples.byteswap()
+        return samples.tobytes() if self._mix is None else self._mix(samples)
 
     def _listen(self) -> None:
         with suppress(BlockingIOError):
@@ -93,6 +118,36 @@ class _Sound:
             self._process.wait(timeout=1.0)
         self._listen()
         return explain(self._address, self._said.decode(errors="replace"))
+
+
+def _mixer(name: str, channels: int, channel: int | None) -> Any:
+    """Return what makes one channel of several; None if there is only one."""
+    if channels == 1 and channel in {None, 1}:
+        return None
+    import numpy as np  # noqa: PLC0415  most sounds have one channel, and need no numpy
+
+    from hearthlog.recorder.sources.channels import ChannelMixer, missing_channel  # noqa: PLC0415
+
+    if channel is not None and channel > channels:
+        raise DeviceError(f"{name} {missing_channel(channels, channel)}")
+    mixer = ChannelMixer(channel)
+    recent = np.empty((0, channels), np.float32)
+    count = 0
+
+    def mix(samples: "array[int]") -> bytes:
+        nonlocal recent, count
+        block = np.frombuffer(samples, np.int16).reshape(-1, channels).astype(np.float32) / 32768
+        if channel is None:
+            count += len(block)
+            recent = np.concatenate([recent, block])
+            if count < _DECIDED_SAMPLES:
+                mixer.decide(block)
+            if len(recent) >= _DECIDED_SAMPLES:
+                mixer.decide(recent[:_DECIDED_SAMPLES])
+                recent = recent[_DECIDED_SAMPLES:]
+        return np.clip(np.rint(mixer.mix(block) * 32768), -32768, 32767).astype("<i2").tobytes()
+
+    return mix
 
 
 def _capture(sound: _Sound, address: str, output: Any) -> None:

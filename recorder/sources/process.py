@@ -176,6 +176,8 @@ class CaptureProcess(_Process):
         Whether no other device will do whose name contains this one.
     channels : int or None
         Of an array; None of a single microphone.
+    channel : int or None
+        The one to hear, from 1 on; by default the first one.
 
     Attributes
     ----------
@@ -192,9 +194,17 @@ class CaptureProcess(_Process):
 
     _hangs, _crashes = _HANGS, _CRASHES
 
-    def __init__(self, device: str, *, exact: bool = False, channels: int | None = None) -> None:
+    def __init__(
+        self,
+        device: str,
+        *,
+        exact: bool = False,
+        channels: int | None = None,
+        channel: int | None = None,
+    ) -> None:
+        asked = [device, str(channels or 0), str(channel or 0), *(["exact"] if exact else [])]
         process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, device, str(channels or 0), *(["exact"] if exact else [])],
+            [*_CAPTURE, *asked],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
             bufsize=0,
@@ -211,6 +221,8 @@ class NetworkProcess(_Process):
         As `check_address` takes it.
     stop : threading.Event
         Ends the wait for its first answer when it is set.
+    channel : int or None
+        The one to hear, from 1 on; by default their mean, of a topic the first one.
 
     Attributes
     ----------
@@ -224,10 +236,10 @@ class NetworkProcess(_Process):
 
     _hangs = _crashes = "the capture process does not answer"
 
-    def __init__(self, address: str, stop: Flag) -> None:
+    def __init__(self, address: str, stop: Flag, channel: int | None = None) -> None:
         pipe = subprocess.PIPE
         process = subprocess.Popen(  # noqa: S603  our own modules
-            _TOPIC_CAPTURE if is_topic(address) else _NETWORK_CAPTURE,
+            [*(_TOPIC_CAPTURE if is_topic(address) else _NETWORK_CAPTURE), str(channel or 0)],
             stdin=pipe,
             stdout=pipe,
             stderr=pipe,

@@ -49,7 +49,7 @@ def main() -> None:
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # ROS prints as it likes
     try:
-        _capture(sys.stdin.read(), output)
+        _capture(sys.stdin.read(), int(sys.argv[1]) or 1, output)
     except SourceError as error:
         print(error, file=sys.stderr, flush=True)  # noqa: T201
     except BrokenPipeError:
@@ -57,11 +57,17 @@ def main() -> None:
     os._exit(0)  # rclpy may wait for others when it is shut down
 
 
-def _capture(address: str, output: Any) -> None:
+def _capture(address: str, channel: int, output: Any) -> None:
     topic = read_topic(address)
     stream = _TopicStream(topic)
     sounds = stream.read()
-    blocks = _Blocks(topic.name, sounds[0], output)
+    there = sounds[0].channels
+    if there < channel:
+        raise DeviceError(
+            f"{topic.name} has {there} channels, and `channel` asks for number {channel}: take one "
+            f"from 1 to {there}"
+        )
+    blocks = _Blocks(topic.name, channel, sounds[0], output)
     output.write(json.dumps(asdict(blocks.format(address))).encode() + b"\n")
     while True:
         arrival = time.monotonic()
@@ -73,8 +79,9 @@ def _capture(address: str, output: Any) -> None:
 class _Blocks:
     """Writes the sound of a topic as blocks, in which all samples follow each other."""
 
-    def __init__(self, name: str, first: _Sound, output: Any) -> None:
+    def __init__(self, name: str, channel: int, first: _Sound, output: Any) -> None:
         self._name = name
+        self._channel = channel - 1
         self._output = output
         self._rate, self._channels = first.rate, first.channels
         self._stale = max(_STALE_SECONDS, 5 * self._seconds(first))
@@ -102,7 +109,7 @@ class _Blocks:
 
     def write(self, run: list[_Sound], arrival: float) -> None:
         """Write messages that follow each other as one block."""
-        samples = b"".join(self._first_channel(sound) for sound in run)
+        samples = b"".join(self._one_channel(sound) for sound in run)
         count = len(samples) // _SAMPLE_BYTES
         taken = _taken(run[0], arrival)
         self._output.write(BLOCK.pack(self._index, count, 0, taken, arrival))
@@ -125,7 +132,7 @@ class _Blocks:
         # A longer loss ends the capture; if this one goes on, a clock was set.
         return round(seconds * self._rate) if _LOSS_SECONDS < seconds < self._stale else 0
 
-    def _first_channel(self, sound: _Sound) -> bytes:
+    def _one_channel(self, sound: _Sound) -> bytes:
         if (sound.rate, sound.channels) != (self._rate, self._channels):
             raise DeviceError(
                 f"{self._name} changed from {self._rate} Hz and {self._channels} channels "
@@ -133,7 +140,7 @@ class _Blocks:
             )
         if self._channels == 1:
             return sound.data
-        return array("h", sound.data)[:: self._channels].tobytes()
+        return array("h", sound.data)[self._channel :: self._channels].tobytes()
 
 
 def _taken(sound: _Sound, arrival: float) -> float:

@@ -12,6 +12,7 @@ from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE, Dire
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.recorder.events import OK, READING, WARNING, Event, Frames, Gap, Notice, SourceHealth
@@ -56,6 +57,8 @@ class Pipeline:
     ----------
     microphone : str
     feature_set : FeatureSet
+    last_frames : Frames or None
+        Those that were pushed last, without what is below hearing and stands out.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -70,12 +73,14 @@ class Pipeline:
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
+        self.last_frames: Frames | None = None
         live = {} if classifier is None else {LIVE: classifier}
         self._streams = {
             labelling: LabelStream(microphone, labelling, one)
             for labelling, one in (live | dict(beside or {})).items()
         }
         window, width = features.window_frames, features.width
+        self._infrasound = InfrasoundFilter()
         self._features = features.extractor()
         statistics = RollingStatistics(window, width)
         self._feature_messages = FeatureMessages(microphone, statistics, statistics_every)
@@ -124,9 +129,11 @@ class Pipeline:
             In the order of their log times.
         """
         if isinstance(event, Frames):
-            self._watch.add_samples(event.samples)
             directions = NOWHERE if self._directions is None else self._directions(event)
-            features = self._features(event.samples)
+            samples = self._infrasound(event.samples)
+            self._watch.add_samples(event.samples, samples)
+            self.last_frames = replace(event, samples=samples)
+            features = self._features(samples)
             return self.push_features(features, event.first, event.stamps, directions)
         if isinstance(event, Gap):
             return self.hold(self._push_gap(event))
@@ -331,6 +338,7 @@ class Pipeline:
 
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
         held = self._unveil()
+        self._infrasound.restart()
         self._features.restart()
         if self._directions is not None:
             self._directions.restart()

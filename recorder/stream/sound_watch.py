@@ -1,4 +1,4 @@
-"""Sound in which little can be recognised: clipped, stuck, humming, faint, or too loud."""
+"""Sound in which little can be recognised: clipped, stuck, below hearing, humming, faint, loud."""
 
 from collections import deque
 
@@ -15,6 +15,10 @@ _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
 _LOUD_FRAMES = 10 * _MINUTE
 _STUCK_FRAMES = round(10.0 / FRAME_SECONDS)
+_INFRASOUND_FRAMES = round(20.0 / FRAME_SECONDS)
+_INFRASOUND_SHARE = 0.8  # of them
+_INFRASOUND_POWER = 1e-5  # -50 dBFS
+_DEAD_POWER = (2 / 32768) ** 2  # of what is left beside an offset
 _DAY_MINUTES = 1440
 _FALL = 1000.0  # 30 dB
 _SECOND = round(1.0 / FRAME_SECONDS)
@@ -27,6 +31,8 @@ _HUM_MINUTES = 30
 CLIPS = "the microphone clips: turn its volume down"
 STUCK = "the microphone gives one value only: connect it again, or replace it"
 HUMS = "the microphone hums at {} Hz: check its cable and power supply, or what hums beside it"
+OFFSET = "the sound has an offset (DC), which is left out: try another socket or sound card"
+RUMBLE = "there is a rumble below hearing, which is left out: keep wind and vibration off"
 FAINT = "a whole day was 30 dB fainter than before: is the microphone covered or turned away?"
 LOUD = "the room is as loud as most sounds: turn the microphone down, or put it elsewhere"
 
@@ -50,21 +56,27 @@ class SoundWatch:
         self._clipped: Bool = np.empty(0, bool)  # frames of the last minute
         self._loud = 0  # frames since the floor of the room was not loud
         self._stuck = 0  # frames since the sound was not one value
+        self._infrasound = _Infrasound()
         self._level = _DailyLevel()
         self._hum = _MainsHum()
 
-    def add_samples(self, samples: Float32) -> None:
+    def add_samples(self, samples: Float32, filtered: Float32 | None = None) -> None:
         """Add successive frames.
 
         Parameters
         ----------
         samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
             In full scale, -1 to 1.
+        filtered : np.ndarray [shape=(n, FRAME_SAMPLES)], float32, optional
+            The same by `InfrasoundFilter`.
         """
+        filtered = samples if filtered is None else filtered
+        self._infrasound.add(samples, filtered)
         clipped = (np.abs(samples) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
         self._clipped = np.concatenate([self._clipped, clipped])[-_MINUTE:]
         # Zeros are another matter: in a file they are silence, and a microphone's are reported.
-        moving = np.flatnonzero((np.ptp(samples, axis=1) > 0) | (samples[:, 0] == 0.0))
+        moving = (np.ptp(samples, axis=1) > 0) | (samples[:, 0] == 0.0)
+        moving = np.flatnonzero(moving & ~is_offset_only(samples, filtered))
         last = int(moving[-1]) if len(moving) else -1
         self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
         self._level.add(np.square(samples).mean(axis=1))
@@ -89,9 +101,49 @@ class SoundWatch:
             return CLIPS
         if self._loud >= _LOUD_FRAMES:
             return LOUD
+        if infrasound := self._infrasound.problem():
+            return infrasound
         if self._hum.frequency:
             return HUMS.format(self._hum.frequency)
         return FAINT if self._level.has_fallen else ""
+
+
+def is_offset_only(samples: Float32, filtered: Float32) -> Bool:
+    """Tell in which frames there is no more than an offset: a dead microphone.
+
+    Parameters
+    ----------
+    samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+    filtered : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        The same by `InfrasoundFilter`.
+    """
+    if filtered is samples:
+        return np.zeros(len(samples), bool)
+    is_faint: Bool = np.square(filtered).mean(axis=1) < _DEAD_POWER
+    return is_faint & (filtered != samples).any(axis=1)
+
+
+class _Infrasound:
+    """Remembers what the filter took out of the last frames."""
+
+    def __init__(self) -> None:
+        self._means = self._powers = np.zeros(_INFRASOUND_FRAMES, np.float32)
+
+    def add(self, samples: Float32, filtered: Float32) -> None:
+        if filtered is samples and not self._powers.any():
+            return
+        removed = samples - filtered
+        means, powers = removed.mean(axis=1), np.square(removed).mean(axis=1)
+        self._means = np.concatenate([self._means, means])[-_INFRASOUND_FRAMES:]
+        self._powers = np.concatenate([self._powers, powers])[-_INFRASOUND_FRAMES:]
+
+    def problem(self) -> str:
+        if (
+            np.count_nonzero(self._powers > _INFRASOUND_POWER)
+            < _INFRASOUND_SHARE * _INFRASOUND_FRAMES
+        ):
+            return ""
+        return OFFSET if self._means.mean() ** 2 > 0.5 * self._powers.mean() else RUMBLE
 
 
 class _DailyLevel:

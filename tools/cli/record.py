@@ -68,6 +68,13 @@ def record(
             "address."
         ),
     ] = None,
+    channel: Annotated[
+        int | None,
+        typer.Option(
+            help="Channel to hear of several, from 1 on.",
+            show_default="the first one, and of files their mean",
+        ),
+    ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of the microphone in the log.", show_default="mic")
     ] = None,
@@ -138,7 +145,7 @@ def record(
         "min_free_space": min_free_space,
         "keep_audio": keep_audio,
     }
-    microphone = _given({"name": name, "device": device})
+    microphone = _given({"name": name, "device": device, "channel": channel})
     load = partial(load_settings, config, _given(given), microphone)
     configured = load()
     settings = with_model(configured)
@@ -279,6 +286,7 @@ def _open_files(
         times=times,
         realtime=realtime,
         channels=settings.microphone[0].channels,
+        channel=settings.microphone[0].channel,
         progress=progress,
     )
     return source, doubts(paths, times) if start is None else [], refused

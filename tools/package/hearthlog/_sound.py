@@ -10,6 +10,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import FloorTracker
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.installed import feature_set as installed
 from hearthlog.models.labels.labeller import Labeller
@@ -83,7 +84,8 @@ def extract_features(
     ----------
     sound : np.ndarray [shape=(n,) or (n, channels)]
         Integers of the full range of their type, or floats in full scale, -1 to 1. Channels are
-        averaged; what fills no frame at the end is left out.
+        averaged, or the best one is taken where they cancel; what fills no frame at the end is left
+        out, and so are frames with samples that are not finite.
     rate : int
         Samples per second; other than 16000 are resampled.
     feature_set : str
@@ -116,9 +118,13 @@ def extract_features(
     count = len(samples) // FRAME_SAMPLES
     if count == 0:
         raise SourceError("the sound is shorter than one frame of 50 ms")
-    values = described.extractor()(samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES))
-    times = start + np.arange(count) * FRAME_NANOSECONDS
-    return SoundFeatures(described.feature_names, described.units, times, values)
+    frames = samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+    heard = np.flatnonzero(np.isfinite(frames).all(axis=1))
+    if not len(heard):
+        raise SourceError("the sound is no numbers (NaN or infinity)")
+    values = [described.extractor()(InfrasoundFilter()(frames[run])) for run in _runs(heard)]
+    times = start + heard * FRAME_NANOSECONDS
+    return SoundFeatures(described.feature_names, described.units, times, np.concatenate(values))
 
 
 def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0) -> SoundLabels:
@@ -156,22 +162,37 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
     features = extract_features(sound, rate, classifier.feature_set.name, start)
     labeller = Labeller(classifier)
     powers = classifier.feature_set.band_powers
-    floors = None if powers is None else FloorTracker()(powers(features.values), 0)
-    labels, segments = labeller.push(features.values, floors, 0, features.times)
-    segments += labeller.close(int(features.times[-1]) + FRAME_NANOSECONDS)
-    names = np.array(labels.classes, object)
+    labelled, segments = [], []
+    frames = (features.times - start) // FRAME_NANOSECONDS
+    for run in _runs(frames):
+        rows = np.searchsorted(frames, run)
+        values, times, first = features.values[rows], features.times[rows], int(run[0])
+        floors = None if powers is None else FloorTracker()(powers(values), first)
+        labels, ended = labeller.push(values, floors, first, times)
+        labelled.append(labels)
+        segments += [*ended, *labeller.close(int(times[-1]) + FRAME_NANOSECONDS)]
+    stamps, probabilities, novelty = (
+        np.concatenate([getattr(labels, name) for labels in labelled])
+        for name in ("stamps", "probabilities", "novelty")
+    )
+    names = np.array(labeller.classes, object)
     starts, ends, states = (
         np.array([getattr(segment, name) for segment in segments], np.int64)
         for name in ("start", "end", "label")
     )
     return SoundLabels(
-        labels.classes,
-        labels.stamps,
-        names[labels.probabilities.argmax(axis=1)],
-        labels.probabilities,
-        labels.novelty,
+        labeller.classes,
+        stamps,
+        names[probabilities.argmax(axis=1)],
+        probabilities,
+        novelty,
         Labelling(starts, ends, names[states]),
     )
+
+
+def _runs(frames: Int64) -> list[Int64]:
+    """Divide numbers of frames where they do not follow each other."""
+    return np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
 
 
 def load_model(path: Path | str) -> Model:

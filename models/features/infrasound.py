@@ -1,0 +1,145 @@
+"""What is below hearing: an offset, a drift or a rumble, taken out of frames where it stands out.
+
+It is no sound, yet it sets the floor of the room and hides what is above it. Polynomials follow it
+through each frame on its own, so that a step leaves no trace behind it. Frames in which it does not
+stand out stay as they are, to the last bit: feature sets and models know them so.
+"""
+
+from functools import cache
+
+import numpy as np
+
+from hearthlog.models.batch_invariant import rowwise_matmul
+from hearthlog.schemas.arrays import Bool, Float32, Float64
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+
+_TERMS = 5  # of the polynomials: 12 Hz falls by 40 dB, 50 Hz by 1 dB
+_PROBES = (8.0, 16.0)  # Hz, beside 0: each hears some 20 Hz around it
+_LEAST_POWER = 10 ** (-65 / 10)
+_STANDS_OUT = 4.0  # times the power of the rest of a frame
+_IS_PLAIN = 16.0  # in the first frame, before which nothing is known
+_WINDOW, _MOST = 20, 10  # frames: of a second, half; a thump is shorter
+_HELD = 200  # frames: ten seconds of speech or music may hide it
+_STEPS = 1 << 15  # to 1: samples of 16 bits remain such
+_TINY = 1e-20
+
+
+class InfrasoundFilter:
+    """Takes what is below some 20 Hz out of one stream of frames, while it stands out.
+
+    The same frames give the same bits in blocks of any size.
+
+    Attributes
+    ----------
+    is_active : bool
+        Whether something was taken out of the last frame.
+    """
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self.is_active = False
+        self._last: Float64 | None = None  # coefficients of the last frame
+        self._offset, self._wave = _Persistence(), _Persistence()
+
+    def __call__(self, frames: Float32) -> Float32:
+        """Filter successive frames.
+
+        Parameters
+        ----------
+        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+            Finite.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+            The array that was given, where nothing stands out.
+        """
+        if not len(frames):
+            return frames
+        samples = frames.astype(np.float64)
+        coefficients = rowwise_matmul(samples, _curves())
+        rest = np.maximum(_power(samples) - _power(coefficients), _TINY)
+        below, waves = self._powers(coefficients)
+        wavy = self._wave(waves, rest)
+        removed = self._offset(below, rest) | wavy
+        self.is_active = bool(removed[-1])
+        if not removed.any():
+            return frames
+        coefficients[~wavy, 1:] = 0.0
+        coefficients[~removed] = 0.0
+        baseline = np.rint(_STEPS * rowwise_matmul(coefficients, _curves().T)) / _STEPS
+        return frames - baseline.astype(np.float32)
+
+    def _powers(self, coefficients: Float64) -> tuple[Float64, Float64]:
+        """Return the power below 20 Hz around the start of each frame, and that without offsets."""
+        last = coefficients[:1] if self._last is None else self._last
+        self._last = coefficients[-1:].copy()
+        pairs = np.concatenate([np.concatenate([last, coefficients[:-1]]), coefficients], axis=1)
+        values = np.square(rowwise_matmul(pairs, _probes()))
+        powers = np.maximum(
+            np.maximum(values[:, 0::5], values[:, 1::5] + values[:, 2::5]),
+            values[:, 3::5] + values[:, 4::5],
+        )
+        return powers[:, 0], powers[:, 1]
+
+
+class _Persistence:
+    """Tells in which frames of a stream something stands out that lasts."""
+
+    def __init__(self) -> None:
+        self._recent: Bool | None = None  # whether it stood out in the last frames
+        self._held = 0  # number of frames for which it still counts
+
+    def __call__(self, powers: Float64, rest: Float64) -> Bool:
+        out = powers > np.maximum(_STANDS_OUT * rest, _LEAST_POWER)
+        known = out if self._recent is None else np.concatenate([self._recent, out])
+        count = np.cumsum(np.concatenate([np.zeros(_WINDOW, np.intp), known]))
+        begins = (count[_WINDOW:] - count[:-_WINDOW] >= _MOST)[len(known) - len(out) :]
+        if self._recent is None:
+            begins[0] |= bool(out[0]) and powers[0] > _IS_PLAIN * rest[0]
+        self._recent = known[-_WINDOW:].copy()
+        if not self._held and not begins.any():
+            return begins
+        lasting = np.zeros(len(out), bool)
+        for place, (begin, again) in enumerate(zip(begins, out, strict=True)):
+            if begin or (again and self._held):
+                self._held = _HELD
+            lasting[place] = self._held > 0
+            self._held = max(self._held - 1, 0)
+        return lasting
+
+
+def _power(rows: Float64) -> Float64:
+    return np.vecdot(rows, rows) / FRAME_SAMPLES
+
+
+@cache
+def _curves() -> Float64:
+    """Return orthonormal polynomials over a frame, one a column."""
+    place = (np.arange(FRAME_SAMPLES) + 0.5) / FRAME_SAMPLES * 2.0 - 1.0
+    powers = np.polynomial.legendre.legvander(place, _TERMS - 1)
+    curves: Float64 = powers / np.linalg.norm(powers, axis=0)
+    return curves
+
+
+@cache
+def _probes() -> Float64:
+    """Return what maps the coefficients of two frames to their spectrum below 20 Hz.
+
+    The first half of the columns is of the whole, the second of all but the means of the frames.
+    """
+    count = 2 * FRAME_SAMPLES
+    taper = np.hanning(count + 2)[1:-1]
+    turns = 2 * np.pi * (np.arange(count) + 0.5) / SAMPLE_RATE
+    waves = [np.ones(count)]
+    for frequency in _PROBES:
+        waves += [np.sqrt(2) * np.cos(frequency * turns), np.sqrt(2) * np.sin(frequency * turns)]
+    weights = np.stack(waves, axis=1) * (taper / taper.sum())[:, np.newaxis]
+    curves = _curves()
+    whole = np.concatenate([curves.T @ weights[:FRAME_SAMPLES], curves.T @ weights[FRAME_SAMPLES:]])
+    waves_only = whole.copy()
+    waves_only[::_TERMS] = 0.0
+    return np.concatenate([whole, waves_only], axis=1)

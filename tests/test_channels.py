@@ -1,0 +1,223 @@
+"""Several channels become one in which everything is heard; what is no number is a gap."""
+
+from array import array
+from threading import Event as Flag
+
+import numpy as np
+import pytest
+import soundfile
+from logs import features, read
+from test_capture import recording, wait_for_frames
+
+from hearthlog import classify, extract_features, load_model
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.errors import DeviceError, SourceError
+from hearthlog.recorder.events import WARNING, Frames, Gap, SourceHealth
+from hearthlog.recorder.recording import record_files
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.network_capture import _mixer
+
+RATE = 16_000
+START = 1_772_348_400_000_000_000
+RNG = np.random.default_rng(5)
+
+
+def noise(level, seconds=25):
+    return RNG.normal(0, level, seconds * RATE)
+
+
+def knocks(level=0.05):
+    """Knocks, one every two seconds, in a quiet room."""
+    sound = noise(3e-4)
+    for at in range(RATE, len(sound) - RATE, 2 * RATE):
+        sound[at : at + RATE // 4] += level * noise(1.0)[: RATE // 4]
+    return sound
+
+
+def written(path, *channels, rate=RATE):
+    soundfile.write(path, np.stack(channels, axis=1), rate, subtype="FLOAT")
+    return path
+
+
+def heard(path, **options):
+    return np.concatenate([*read_audio(path, **options)])
+
+
+SOUND, NOTHING = knocks(), np.zeros(25 * RATE)
+ONE_GOOD = {
+    "a sound and its negative": (SOUND, -SOUND),
+    "its negative, and a bit louder": (SOUND, -0.9 * SOUND),
+    "one of eight": (SOUND, *[NOTHING] * 7),
+    "noise in another one": (SOUND, noise(0.02)),
+    "noise and an offset": (SOUND, noise(0.02), NOTHING + 0.1),
+    "no numbers in another one": (SOUND, NOTHING * np.nan),
+}
+
+
+@pytest.mark.parametrize("case", ONE_GOOD)
+def test_the_best_channel_is_heard_where_the_mean_hides_sound(case, tmp_path):
+    for place in (0, 1):
+        channels = [*ONE_GOOD[case]]
+        channels[0], channels[place] = channels[place], channels[0]
+        told = []
+        path = written(tmp_path / f"{place}.wav", *channels)
+        samples = heard(path, chosen=told.append)
+        best = 0 if case == "a sound and its negative" else place
+        np.testing.assert_array_equal(samples, channels[best].astype(np.float32))
+        (line,) = told
+        number = best + 1
+        assert line.startswith(f"channel {number} of {len(channels)} is heard alone: ")
+
+
+FINE = {
+    "the same twice": (SOUND, SOUND),
+    "one of two": (SOUND, NOTHING),
+    "two microphones of a room": (SOUND + noise(3e-4), np.roll(SOUND, 50) * 0.6 + noise(3e-4)),
+    "unlike sounds": (SOUND, np.roll(knocks(), RATE)),
+    "noise": (noise(0.01), noise(0.01)),
+    "a voice in the middle of five": (SOUND, SOUND * 0.7, SOUND * 0.7, noise(3e-4), noise(3e-4)),
+}
+
+
+@pytest.mark.parametrize("case", FINE)
+def test_other_channels_are_averaged_to_the_last_bit(case, tmp_path):
+    told = []
+    path = written(tmp_path / "stereo.wav", *FINE[case])
+    samples = heard(path, chosen=told.append)
+    mean = np.stack(FINE[case], axis=1).astype(np.float32).mean(axis=1)
+    np.testing.assert_array_equal(samples, mean)
+    assert told == []
+
+
+def test_a_channel_is_kept_while_the_others_are_only_quiet(tmp_path):
+    pause = noise(3e-4)
+    path = written(
+        tmp_path / "pause.wav",
+        np.concatenate([SOUND[: 20 * RATE], pause, SOUND]),
+        np.concatenate([noise(0.02, 20), noise(0.02), noise(0.02)]),
+    )
+    told = []
+    samples = heard(path, chosen=told.append)
+    assert len(told) == 1
+    assert samples[20 * RATE : 45 * RATE].std() < 4e-4
+
+
+def test_the_choice_is_told_in_the_log_and_at_the_end(tmp_path):
+    path = written(tmp_path / "anti.wav", SOUND, -SOUND)
+    source = FileSource([path], START)
+    about = Settings(output=tmp_path / "logs", model="none", timezone="UTC")
+    record_files(about, source, Flag())
+    problem = "channel 1 of 2 is heard alone: their mean is much fainter"
+    assert source.warnings == [f"{path}: {problem}"]
+    states = [status for m in read(tmp_path / "logs", "diagnostics") for status in m.status]
+    assert {(state.level, state.message) for state in states} == {(WARNING, problem)}
+
+
+def test_a_channel_is_chosen_by_its_number(tmp_path):
+    path = written(tmp_path / "two.wav", SOUND, noise(0.02))
+    for number, channel in ((1, SOUND), (2, soundfile.read(path)[0][:, 1])):
+        np.testing.assert_array_equal(heard(path, channel=number), channel.astype(np.float32))
+    with pytest.raises(SourceError) as error:
+        FileSource([path], START, channel=3)
+    assert str(error.value) == (
+        f"{path}: has 2 channels, and `channel` asks for number 3: take one from 1 to 2"
+    )
+
+
+def test_a_channel_of_a_microphone_is_chosen_by_its_number(labmic, tmp_path):
+    left, right = np.zeros(RATE, np.int16), np.round(noise(0.1, 1) * 32767).astype(np.int16)
+    labmic.configure(data=np.stack([left, right], axis=1))
+    with recording(labmic, tmp_path / "logs", "--channel", "2") as process:
+        wait_for_frames(tmp_path / "logs", 40)
+    assert process.returncode == 0, process.errors
+    assert features(tmp_path / "logs")[2][:, 0].min() > 0.005
+    with recording(labmic, tmp_path / "no", "--channel", "3") as process:
+        process.wait(30)
+    assert process.returncode == 1
+    assert process.errors.strip().endswith(
+        "microphone 'labmic' has 2 channels, and `channel` asks for number 3: take one from 1 to 2"
+    )
+
+
+def test_of_a_stream_in_the_network_too_the_best_channel_is_heard():
+    left = np.round(SOUND * 32767).astype(np.int16)
+    for other, channel, expected in (
+        (-left, None, left),
+        (left, None, left),
+        (np.round(noise(0.02) * 32767).astype(np.int16), 1, left),
+        (left // 2, 2, left // 2),
+    ):
+        mix = _mixer("http://camera", 2, channel)
+        interleaved = np.stack([left, other], axis=1).ravel()
+        blocks = np.split(interleaved, range(19_200, len(interleaved), 19_200))
+        mixed = b"".join(mix(array("h", block.tobytes())) for block in blocks)
+        np.testing.assert_array_equal(np.frombuffer(mixed, "<i2"), expected)
+    assert _mixer("http://camera", 1, 1) is None
+    with pytest.raises(DeviceError, match=r"http://camera has one channel, and `channel` asks"):
+        _mixer("http://camera", 1, 2)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("rate", [RATE, 44_100, 8000])
+def test_what_is_no_number_is_a_gap_of_the_frames_that_hold_it(tmp_path, rate, value):
+    sound = RNG.normal(0, 0.1, 25 * rate)
+    hole = np.array([5.02, 17.03]) * rate
+    broken = sound.copy()
+    broken[slice(*hole.astype(int))] = value
+    events = events_of(written(tmp_path / "broken.wav", broken, rate=rate))
+    (gap,) = [event for event in events if isinstance(event, Gap)]
+    assert (gap.start, gap.end) == (START + 5_000_000_000, START + 17_050_000_000)
+    assert (gap.frames_lost, gap.reason) == (
+        241,
+        "the samples are no numbers (NaN or infinity)",
+    )
+    whole = dict(frames_of(events))
+    assert [*whole] == [*range(100), *range(341, 500)]
+    same = dict(frames_of(events_of(written(tmp_path / "whole.wav", sound, rate=rate))))
+    for number in (0, 50, 345, 499):  # the zeros in the hole are heard some samples around it
+        np.testing.assert_array_equal(whole[number], same[number])
+
+
+def events_of(path):
+    return [e for e in FileSource([path], START).events(Flag()) if not isinstance(e, SourceHealth)]
+
+
+def frames_of(events):
+    return [
+        (event.first + place, frame)
+        for event in events
+        if isinstance(event, Frames)
+        for place, frame in enumerate(event.samples)
+    ]
+
+
+def test_holes_at_both_ends_are_gaps_and_a_file_of_nothing_else_is_refused(tmp_path):
+    broken = noise(0.1)
+    broken[:1000] = broken[-1] = np.nan
+    first, sound, *more, last = events_of(written(tmp_path / "ends.wav", broken))
+    assert (first.start, first.frames_lost, sound.first) == (START, 2, 2)
+    assert (last.end, last.frames_lost) == (START + 25_000_000_000, 1)
+    assert not any(isinstance(event, Gap) for event in more)
+    path = written(tmp_path / "none.wav", noise(0.1) * np.nan)
+    with pytest.raises(SourceError, match=r"none.wav: 25.00 s are left out: the samples are no "):
+        events_of(path)
+    with pytest.raises(SourceError, match=r"none.wav: samples of it are no numbers"):
+        clip_frames(LabelledClip(path, "speech", "a", "b", "c"))
+    with pytest.raises(SourceError, match="the sound is no numbers"):
+        extract_features(noise(0.1) * np.nan, RATE)
+
+
+def test_the_api_labels_what_is_there_as_a_recorder_does_around_a_gap(tmp_path):
+    sound = SOUND.copy()
+    sound[10 * RATE : 12 * RATE] = np.nan
+    labels = classify(load_model("general"), sound.astype(np.float32), RATE, START)
+    about = Settings(output=tmp_path / "logs", model="general", timezone="UTC")
+    record_files(about, FileSource([written(tmp_path / "a.wav", sound)], START), Flag())
+    logged = read(tmp_path / "logs", "label")
+    assert [m.label for m in logged] == labels.labels.tolist()
+    recorded = np.array([m.probabilities for m in logged])
+    np.testing.assert_array_equal(recorded, labels.probabilities)
+    assert np.diff(labels.times).max() > 2_000_000_000
