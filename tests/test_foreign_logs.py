@@ -482,6 +482,9 @@ def test_a_message_above_the_limit_is_left_out_and_recovered(tmp_path, hearthlog
     assert hearthlog("cat", path, "--topics", "/s").returncode == 0
     done = hearthlog("recover", path, "--output", copy)
     assert (done.returncode, done.stderr) == (0, f"hearthlog: {path}: 3 of 3 messages saved\n")
+    merged = tmp_path / "merged.mcap"
+    assert hearthlog("merge", path, "--output", merged).returncode == 3
+    assert merged.stat().st_size > LARGE  # the film is in it
     with copy.open("rb") as stream:
         reader = SeekingReader(stream, record_size_limit=1 << 30)
         sizes = [len(message.data) for _, _, message in reader.iter_messages()]
