@@ -139,6 +139,23 @@ def test_a_text_in_another_encoding_has_a_mark_where_it_cannot_be_read(damaged, 
     )
 
 
+def test_a_topic_whose_name_is_in_another_encoding_is_read(tmp_path, hearthlog):
+    bag = Bag(tmp_path / "bag.mcap", CompressionType.NONE, enable_crcs=False)
+    numbers = bag.channel("/K_se", INT32)
+    for i in range(3):
+        bag.add(numbers, int32(i), T0 + i)
+    bag.writer.add_metadata("K_se", {"K_se": "K_se"})
+    path = bag.close()
+    path.write_bytes(path.read_bytes().replace(b"K_se", "Käse".encode("latin-1")))
+    warning = (
+        f"hearthlog: {path}: U+FFFD stands for what is not UTF-8 in names of topics, types or "
+        "records\n"
+    )
+    for verb in ("cat", "info"):
+        done = hearthlog(verb, path)
+        assert (done.returncode, done.stderr, "/K\ufffdse" in done.stdout) == (3, warning, True)
+
+
 def test_python_reads_what_the_command_reads(damaged):
     logs = package.open_logs(damaged)
     with pytest.warns(HearthlogWarning, match="such messages of /i are left out"):
@@ -482,6 +499,9 @@ def test_a_message_above_the_limit_is_left_out_and_recovered(tmp_path, hearthlog
     assert hearthlog("cat", path, "--topics", "/s").returncode == 0
     done = hearthlog("recover", path, "--output", copy)
     assert (done.returncode, done.stderr) == (0, f"hearthlog: {path}: 3 of 3 messages saved\n")
+    merged = tmp_path / "merged.mcap"
+    assert hearthlog("merge", path, "--output", merged).returncode == 3
+    assert merged.stat().st_size > LARGE  # the film is in it
     with copy.open("rb") as stream:
         reader = SeekingReader(stream, record_size_limit=1 << 30)
         sizes = [len(message.data) for _, _, message in reader.iter_messages()]

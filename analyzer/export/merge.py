@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
@@ -24,15 +25,19 @@ from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.salvage.whole_records import index_attachment
 from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import NANOSECONDS
 
+_PIECE = 1 << 20  # bytes
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters
 _FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
@@ -207,6 +212,9 @@ class _Log:
         for path in logs:
             with LogFile(path) as file:
                 for place in sorted(file.record_locations, key=lambda place: place.offset):
+                    if place.opcode == Opcode.ATTACHMENT and place.length > LIMIT:
+                        self._copy_large_attachment(file, place, seen)
+                        continue
                     record = file.record(place)
                     key = _key(record)
                     if key is None or key in seen:
@@ -219,6 +227,19 @@ class _Log:
                         times = record.create_time, record.log_time
                         self._writer.add_attachment(*times, own, record.media_type, record.data)
         return bool(seen)
+
+    def _copy_large_attachment(
+        self, file: LogFile, place: RecordLocation, seen: set[Hashable]
+    ) -> None:
+        """Copy an attachment that is larger than is read at once."""
+        index = index_attachment(file.read(place.offset, _PIECE))
+        digest = hashlib.sha256()
+        for piece in _pieces(file, place):
+            digest.update(piece)
+        key = index.name, digest.digest()
+        if key not in seen:
+            seen.add(key)
+            self._writer.copy_attachment(_pieces(file, place), index)
 
     def _channel(self, described: Described) -> int:
         key = identity(*described)
@@ -274,6 +295,13 @@ def _profile(logs: Sequence[Path]) -> str:
         with LogFile(path) as file:
             profiles.add("" if file.header is None else file.header.profile)
     return profiles.pop() if len(profiles) == 1 else ""
+
+
+def _pieces(file: LogFile, place: RecordLocation) -> Iterator[bytes]:
+    """Read a record of any size, a megabyte at a time."""
+    end = place.offset + place.length
+    for start in range(place.offset, end, _PIECE):
+        yield file.read(start, min(_PIECE, end - start))
 
 
 def _key(record: McapRecord | None) -> Hashable:

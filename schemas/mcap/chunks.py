@@ -25,7 +25,7 @@ from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
 from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
-from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
+from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
 
 _LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
@@ -377,7 +377,7 @@ def _add_definitions(
 ) -> None:
     """Add the schemas and channels to a file that are at some places of a chunk."""
     for start, end in places:
-        record = parse(content[start], bytes(content[start + HEAD.size : end]))
+        record = file.parse(content[start], bytes(content[start + HEAD.size : end]))
         if isinstance(record, records.Schema):
             file.schemas.setdefault(record.id, record)
         elif isinstance(record, records.Channel):

@@ -42,6 +42,7 @@ from hearthlog.schemas.mcap.records import LIMIT, TOO_LARGE, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
+_NO_UTF8 = "U+FFFD stands for what is not UTF-8 in names of topics, types or records"
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
 _CHANNEL_END = HEAD.size + UINT16.size
 _ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
@@ -198,9 +199,28 @@ class LogFile:
             raise LogError(f"{self.path}: {what} at byte {location.offset}: {TOO_LARGE}")
         content = self.read(location.offset, location.length)[HEAD.size :]
         try:
-            return parse(location.opcode, content)
-        except (McapError, UnicodeDecodeError) as error:
+            return self.parse(location.opcode, content)
+        except McapError as error:
             raise self.damaged(location.offset, error) from error
+
+    def parse(self, opcode: int, content: bytes) -> McapRecord | None:
+        """Parse a record of this file; where a text is not UTF-8, warn of it, and read the rest.
+
+        Parameters
+        ----------
+        opcode, content
+            As of `hearthlog.schemas.mcap.records.parse`.
+
+        Raises
+        ------
+        McapError
+            If it is too short for what it claims to hold.
+        """
+        try:
+            return parse(opcode, content)
+        except UnicodeDecodeError:
+            warnings.warn(HearthlogWarning(_NO_UTF8, self.path, each=True), stacklevel=2)
+            return parse(opcode, content, lenient=True)
 
     def with_channels(
         self, chunks: NDArray[np.void], channels: AbstractSet[int]
@@ -306,7 +326,7 @@ class LogFile:
                 if location.opcode == Opcode.CHUNK_INDEX:
                     self._add_row(rows, read_chunk_index(content))
                 else:
-                    self._add(parse(location.opcode, content))
+                    self._add(self.parse(location.opcode, content))
             crc = zlib.crc32(self.read(end, HEAD.size + FOOTER.size), crc)
         except (McapError, UnicodeDecodeError, struct.error):
             return False

@@ -47,7 +47,14 @@ class _Content(ReadDataStream):
         return data
 
 
-def parse(opcode: int, content: bytes) -> McapRecord | None:
+class _LenientContent(_Content):
+    """The content of one record whose texts may not be UTF-8."""
+
+    def read_prefixed_string(self) -> str:
+        return self.read(self.read4()).decode(errors="replace")
+
+
+def parse(opcode: int, content: bytes, *, lenient: bool = False) -> McapRecord | None:
     """Parse a record of a kind that holds no messages.
 
     Parameters
@@ -55,6 +62,8 @@ def parse(opcode: int, content: bytes) -> McapRecord | None:
     opcode : int
     content : bytes
         The record, without opcode and length.
+    lenient : bool
+        Put U+FFFD where a text is not UTF-8, and raise no error.
 
     Returns
     -------
@@ -69,7 +78,8 @@ def parse(opcode: int, content: bytes) -> McapRecord | None:
         If a text in it is not UTF-8.
     """
     kind = _CLASSES.get(opcode)
-    return None if kind is None else kind.read(_Content(BytesIO(content)))
+    stream = _LenientContent if lenient else _Content
+    return None if kind is None else kind.read(stream(BytesIO(content)))
 
 
 def read_footer(tail: bytes) -> records.Footer | None:
