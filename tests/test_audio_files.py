@@ -19,6 +19,7 @@ from spliced import run
 
 from hearthlog.recorder.errors import ConfigurationError, SourceError
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.sources import ffmpeg
 from hearthlog.recorder.sources.audio_files import FileSource, find_audio
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.file_times import (
@@ -444,6 +445,19 @@ def test_a_file_that_leads_ffmpeg_elsewhere_is_refused(wav, tmp_path):
         path.write_text(text)
         with pytest.raises(SourceError, match="cannot be read as audio"):
             heard(path)
+
+
+@pytest.mark.parametrize("script", ["exec sleep 60", "while :; do echo trouble >&2; done"])
+def test_an_ffmpeg_that_gives_no_sound_is_ended(tmp_path, monkeypatch, script):
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(ffmpeg, "_FILE_SECONDS", 0.3)
+    path = tmp_path / "a.m4a"
+    path.write_text("anything")
+    with pytest.raises(SourceError, match="ffmpeg finds no more sound in it within"):
+        heard(path)
 
 
 def test_without_ffmpeg_the_line_says_what_to_do(tmp_path, monkeypatch):

@@ -36,6 +36,7 @@ AU_HEADER = struct.Struct(
     ">4s5I"
 )  # magic, where the samples begin, their bytes, kind, rate, channels
 _AU_FLOAT = 6
+_PIPE_BYTES = 1 << 16
 _KEPT_BYTES = 4000  # of what it writes to standard error
 _SAMPLE_BYTES = 4
 
@@ -141,7 +142,7 @@ class FileDecoder:
         """Say why the sound ended before the file did; empty if it did not."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
-        self._drain()
+        self._keep_messages()
         text = self._messages.decode(errors="replace")
         if not text.strip() and not self._process.returncode:
             return ""
@@ -172,29 +173,30 @@ class FileDecoder:
         parts = [self._held]
         length, self._held = len(self._held), b""
         until = time.monotonic() + _FILE_SECONDS
+        pipes = [sound, messages]
         while length < size:
-            left = max(until - time.monotonic(), 0.0)
-            ready = select.select([sound, messages], [], [], left)[0]
-            if not ready:
-                raise SourceError(f"ffmpeg finds no more sound in it within {_FILE_SECONDS:.0f} s")
+            left = until - time.monotonic()
+            ready = select.select(pipes, [], [], max(left, 0.0))[0]
             if sound in ready:
                 if not (part := os.read(sound, min(size - length, 1 << 20))):
                     break
                 parts.append(part)
                 length += len(part)
                 until = time.monotonic() + _FILE_SECONDS
-            elif not self._drain():
-                break
+            elif left <= 0:
+                raise SourceError(f"ffmpeg finds no more sound in it within {_FILE_SECONDS:.0f} s")
+            if messages in ready and not self._keep_messages():
+                pipes = [sound]
         return b"".join(parts)
 
-    def _drain(self) -> bool:
-        """Keep the first bytes of standard error; return whether there may be more."""
+    def _keep_messages(self) -> bool:
+        """Keep what ffmpeg writes to standard error, up to a limit; return whether it may go on."""
         assert self._process.stderr is not None
         os.set_blocking(self._process.stderr.fileno(), False)
         with suppress(BlockingIOError):
-            while part := os.read(self._process.stderr.fileno(), 1 << 16):
-                self._messages = (self._messages + part)[:_KEPT_BYTES]
-            return False
+            part = os.read(self._process.stderr.fileno(), _PIPE_BYTES)
+            self._messages = (self._messages + part)[:_KEPT_BYTES]
+            return bool(part)
         return True
 
 
