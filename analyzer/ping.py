@@ -7,7 +7,7 @@ from pathlib import Path
 from threading import Thread
 from urllib.parse import urlsplit
 
-from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.storage.small_file import read_whole
 
 _SECONDS = 15.0
@@ -39,13 +39,13 @@ def read_ping_address(file: Path) -> str:
 
     Raises
     ------
-    DataError
+    HearthlogError
         If it cannot be read, or has no such address.
     """
-    data = read_whole(file, "file of a ping address", _LONGEST, DataError)
+    data = read_whole(file, "file of a ping address", _LONGEST, HearthlogError)
     url = data.decode("utf-8-sig", "replace").strip()
     if not is_ping_address(url):
-        raise DataError(
+        raise HearthlogError(
             f"{file}: has no address that can be asked for; write one such as "
             "https://hc-ping.com/your-uuid on one line"
         )

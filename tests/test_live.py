@@ -191,7 +191,8 @@ def test_a_watchdog_is_told_whether_all_is_well(labmic, tmp_path, watchdog):
     with recording(labmic, logs):
         wait_for_frames(logs, 30)
         doctor(logs, "--ping", url)
-    doctor(logs, "--ping", url)
+    (tmp_path / "url").write_text(f"{url}\n")
+    doctor(logs, "--ping-file", tmp_path / "url")
     assert asked == ["/mine", "/mine/fail"]
 
 
@@ -208,3 +209,8 @@ def test_what_is_no_address_of_a_watchdog_is_refused(tmp_path, url):
     result = doctor(tmp_path, "--ping", url)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith("hearthlog: --ping wants an address")
+    (tmp_path / "url").write_text(url)
+    result = doctor(tmp_path, "--ping-file", tmp_path / "url")
+    assert (result.returncode, result.stdout) == (1, "")
+    assert "has no address that can be asked for" in result.stderr
+    assert url not in result.stderr.replace(str(tmp_path / "url"), "")

@@ -17,8 +17,8 @@ from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.pinging import Pinging
 from hearthlog.analyzer.bridge.settings import PingSettings
-from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.ports import free_port
+from hearthlog.schemas.errors import HearthlogError
 
 pytestmark = pytest.mark.fast
 
@@ -113,7 +113,7 @@ def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
         pings.close()
     for wrong in ("", "a-secret", "https://", "http://x/a secret", "http://x:y/", "http://[x/"):
         file.write_text(wrong)
-        with pytest.raises(DataError, match="has no address that can be asked for") as error:
+        with pytest.raises(HearthlogError, match="has no address that can be asked for") as error:
             Pinging(settings, said.append)
         assert "secret" not in str(error.value)
     assert said == []

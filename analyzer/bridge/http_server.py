@@ -145,6 +145,7 @@ class HttpHandler(BaseHTTPRequestHandler):
     """Answers one request."""
 
     protocol_version = "HTTP/1.1"
+    timeout = SECONDS
     body_limit = 0  # bytes
     fields: Mapping[str, str] = {"Cache-Control": "no-store", "Connection": "close"}
 
@@ -166,7 +167,6 @@ class HttpHandler(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         """Read no more than a head may have, and a body."""
-        self.timeout = SECONDS
         super().setup()
         self.rfile = cast(Any, _Limited(cast(BinaryIO, self.rfile), _HEAD_LIMIT + self.body_limit))
 

@@ -29,7 +29,7 @@ class Pinging:
 
     Raises
     ------
-    DataError
+    HearthlogError
         If the file of the address cannot be used.
     """
 

@@ -80,6 +80,7 @@ class MqttPublisher:
         self._has_said_muted = False
         # Earlier versions left it to the broker to remember what is switched off.
         self._reads_back = settings.commands and self._announced.is_new
+        self._was_ready = False
         if settings.commands:
             subscriptions.append(self._command_topic)
             if self._reads_back:
@@ -117,7 +118,7 @@ class MqttPublisher:
         self._begun += news.begun
         self._ended += news.ended
         if self._connection.is_ready():
-            self._reads_back = False
+            self._was_ready = True
             self._announced.save()  # before anything is published that is to be cleared one day
             self._say_muted()
             self._tell_begun(news)
@@ -127,7 +128,7 @@ class MqttPublisher:
             self._is_born = False
             self._connection.repeat()
         self._connection.flush()
-        if not self._reads_back:
+        if self._was_ready or not self._reads_back:
             self._announced.save()
 
     def _tell_begun(self, news: News) -> None:
@@ -210,6 +211,7 @@ class MqttPublisher:
             label = self._topics.parse_told(message.topic)
             if label is not None:
                 self._announced.switch(label, is_told=False)
+                self._has_said_muted = False
 
     def _say_muted(self) -> None:
         """Say once which classes the broker is not told of, and how to change that."""

@@ -84,7 +84,11 @@ class HomePage:
             raise
         # A service says it to its journal, which others may read.
         is_shown = sys.stderr is not None and sys.stderr.isatty()
-        place = whole if is_shown else f"{address}; its whole address, which opens it, is in {file}"
+        place = (
+            whole
+            if is_shown
+            else f"{address}; its whole address, which opens it, is in {file.absolute()}"
+        )
         say(f"the page of the home: {place}")
         if not bind.is_loopback:
             say(
