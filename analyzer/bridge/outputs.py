@@ -8,11 +8,17 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News, Output
+from hearthlog.analyzer.bridge.page.page_token import read_token
 from hearthlog.analyzer.bridge.saying import Saying
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
 from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.ping import read_ping_address
+from hearthlog.analyzer.ports import listen
+from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.storage.regular_file import exposed_secret
 from hearthlog.schemas.times import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -137,3 +143,69 @@ def open_outputs(
             lambda: AlertsOutput(rules, delivery, home, state_folder, say, on_ring), say
         )
     return outputs, since
+
+
+def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
+    """Look for what the outputs would refuse at their start, and open nothing.
+
+    Parameters
+    ----------
+    settings : BridgeSettings
+
+    Returns
+    -------
+    problems : list of str
+        Why an output could not be opened, a line each.
+    warnings : list of str
+        Files that may be credentials of the service, which are not here.
+    """
+    problems: list[str] = []
+    warnings: list[str] = []
+
+    def check(step: Callable[[], object], path: Path | None = None) -> None:
+        if path is not None and not path.is_absolute() and not secret_path(path).exists():
+            warnings.append(f"{path}: not here; it has to be a credential of the service")
+            return
+        try:
+            step()
+        except (HearthlogError, OSError) as error:
+            problems.append(str(error))
+
+    if (mqtt := settings.mqtt) is not None:
+        from hearthlog.analyzer.bridge.mqtt.connection import (  # noqa: PLC0415
+            read_password,
+            tls_context,
+        )
+
+        check(lambda: read_password(mqtt), mqtt.password_file)
+        check(lambda: tls_context(mqtt))
+    if (page := settings.page) is not None:
+        check(lambda: listen(bind=page.bind).close())
+        if (token := page.token_file) is not None:
+            check(lambda: read_token(token), token)
+    if (file := settings.delivery.urls_file) is not None:
+        from hearthlog.analyzer.bridge.alerts.targets import find_targets  # noqa: PLC0415
+
+        check(lambda: problems.extend(find_targets(file, lambda _: None)[1]), file)
+    if (ping := settings.ping) is not None and (url := ping.url_file) is not None:
+        check(lambda: read_ping_address(secret_path(url)), url)
+    if (figures := settings.prometheus) is not None:
+        if (shown := figures.token_file) is not None:
+            check(lambda: read_token(shown), shown)
+        if (text := figures.text_file) is not None:
+            check(lambda: check_writable(text.absolute().parent))
+    if (state := settings.state) is not None:
+        check(lambda: check_writable(state))
+    return problems, warnings
+
+
+def exposed_files(settings: BridgeSettings) -> list[str]:
+    """Return the lines that say which files of secrets everybody may read."""
+    mqtt, page, figures, ping = settings.mqtt, settings.page, settings.prometheus, settings.ping
+    files = [settings.delivery.urls_file]
+    files += [] if figures is None else [figures.token_file]
+    files += [] if ping is None else [ping.url_file]
+    files += [] if mqtt is None else [mqtt.password_file, mqtt.key_file]
+    files += [] if page is None else [page.token_file]
+    found = [exposed_secret(secret_path(file)) for file in files if file is not None]
+    return [line for line in found if line]

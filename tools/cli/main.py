@@ -78,8 +78,11 @@ def _options(
 
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
+    verbs = _wanted_verbs()
+    if "install_service" not in verbs:  # units are for everybody to read
+        os.umask(0o077)  # what comes from a home is private
     with _ended_by_signals(), checked_output(), _warnings_shown() as warned:
-        app = make_app(_wanted_verbs())
+        app = make_app(verbs)
         status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
@@ -132,7 +135,8 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
-        tell(_message(error))
+        for line in getattr(error, "lines", None) or [_message(error)]:
+            tell(line)
         return error.status if isinstance(error, HearthlogError) else 1
 
 
