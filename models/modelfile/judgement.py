@@ -67,6 +67,11 @@ def judgement_path(folder: Path, sha256: str) -> Path:
     return folder / _FOLDER / f"{sha256}.json"
 
 
+def judgements_of(folder: Path) -> list[Path]:
+    """List the files of the judgements of a folder of models."""
+    return list((folder / _FOLDER).glob("*.json"))
+
+
 def read_judgement(folder: Path, sha256: str) -> Judgement | None:
     """Read the judgement of a model.
 
