@@ -266,7 +266,9 @@ def test_variables_of_other_programs_and_of_the_configuration_are_taken(hearthlo
         (("record", "--what"), "no such option: --what; see `hearthlog record --help`"),
         (("replay",), "missing argument 'path'; see `hearthlog replay --help`"),
         (("models", "promote", "--to", "x"), "invalid value for '--to': "),
-        (("demo", "--minutes", "0"), "invalid value for '--minutes': "),
+        (("demo", "--minutes", "0"), "invalid value for '--minutes': it must be at least 1; see"),
+        (("demo", "--minutes", "2h"), "invalid value for '--minutes': it must be a number; see"),
+        (("discover", "x", "--least", "2.5"), "invalid value for '--least': it must be a whole"),
         (("listen",), "no such command 'listen'; see `hearthlog --help`"),
     ],
 )

@@ -1,6 +1,7 @@
 """The command `hearthlog`: its verbs, and how errors reach the user."""
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -32,6 +33,13 @@ VERBS = (
 )
 _MODULES = {"resume": "pause"}  # of a verb that shares one
 _NAMED = 10  # of many files with the same fault
+_WORDS = (  # for those of the library that reads options
+    (re.compile(r"Input should be greater than or equal to "), "it must be at least "),
+    (re.compile(r"Input should be less than or equal to "), "it must be at most "),
+    (re.compile(r"Input should be a valid integer, .*"), "it must be a whole number"),
+    (re.compile(r"Input should be a valid number, .*"), "it must be a number"),
+    (re.compile(r"Input should be (a valid )?"), "it must be "),
+)
 _debug = {"on": False}
 
 
@@ -144,6 +152,8 @@ def _usage_text(error: typer.TyperException) -> str:
     context = getattr(error, "ctx", None)
     verb = "hearthlog" if context is None else context.command_path
     text = error.format_message().rstrip(".").replace(": Value error,", ":")
+    for form, words in _WORDS:
+        text = form.sub(words, text)
     return f"{text[0].lower()}{text[1:]}; see `{verb} --help`"
 
 
