@@ -1,7 +1,8 @@
 """The outputs that are configured, opened, and opened again where that failed."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -161,42 +162,49 @@ def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
     """
     problems: list[str] = []
     warnings: list[str] = []
-
-    def check(step: Callable[[], object], path: Path | None = None) -> None:
+    for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:
         if path is not None and not path.is_absolute() and not secret_path(path).exists():
             warnings.append(f"{path}: not here; it has to be a credential of the service")
-            return
+            continue
         try:
             step()
         except (HearthlogError, OSError) as error:
             problems.append(str(error))
+    return problems, warnings
 
+
+_Step = tuple[Path | None, Callable[[], object]]  # the file of a secret, and what checks it
+
+
+def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_Step]:
+    """Yield how each file of secrets is read at the start."""
     if (mqtt := settings.mqtt) is not None:
-        from hearthlog.analyzer.bridge.mqtt.connection import (  # noqa: PLC0415
-            read_password,
-            tls_context,
-        )
+        from hearthlog.analyzer.bridge.mqtt.connection import read_password  # noqa: PLC0415
 
-        check(lambda: read_password(mqtt), mqtt.password_file)
-        check(lambda: tls_context(mqtt))
-    if (page := settings.page) is not None:
-        check(lambda: listen(bind=page.bind).close())
-        if (token := page.token_file) is not None:
-            check(lambda: read_token(token), token)
+        yield mqtt.password_file, partial(read_password, mqtt)
+    for table in (settings.page, settings.prometheus):
+        if table is not None and table.token_file is not None:
+            yield table.token_file, partial(read_token, table.token_file)
+    if settings.ping is not None and (url := settings.ping.url_file) is not None:
+        yield url, lambda: read_ping_address(secret_path(url))
     if (file := settings.delivery.urls_file) is not None:
         from hearthlog.analyzer.bridge.alerts.targets import find_targets  # noqa: PLC0415
 
-        check(lambda: problems.extend(find_targets(file, lambda _: None)[1]), file)
-    if (ping := settings.ping) is not None and (url := ping.url_file) is not None:
-        check(lambda: read_ping_address(secret_path(url)), url)
-    if (figures := settings.prometheus) is not None:
-        if (shown := figures.token_file) is not None:
-            check(lambda: read_token(shown), shown)
-        if (text := figures.text_file) is not None:
-            check(lambda: check_writable(text.absolute().parent))
-    if (state := settings.state) is not None:
-        check(lambda: check_writable(state))
-    return problems, warnings
+        yield file, lambda: problems.extend(find_targets(file, lambda _: None)[1])
+
+
+def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
+    """Yield how certificates, addresses and folders are checked."""
+    if (mqtt := settings.mqtt) is not None and mqtt.tls:
+        from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
+
+        yield None, partial(tls_context, mqtt)
+    if (page := settings.page) is not None:
+        yield None, lambda: listen(bind=page.bind).close()
+    if settings.prometheus is not None and (text := settings.prometheus.text_file) is not None:
+        yield None, partial(check_writable, text.absolute().parent)
+    if settings.state is not None:
+        yield None, partial(check_writable, settings.state)
 
 
 def exposed_files(settings: BridgeSettings) -> list[str]:

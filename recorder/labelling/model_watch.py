@@ -21,7 +21,7 @@ from hearthlog.models.modelfile.judgement import (
     read_judgement,
 )
 from hearthlog.models.modelfile.modelfile import load_model, name_and_digest
-from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+from hearthlog.models.modelfile.registry import DEFAULT_MODEL, is_starter
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.memory import give_back
@@ -257,7 +257,8 @@ def _warn_if_simulated(model: Model) -> None:
 def _warn_if_changed(path: Path, champion: Model) -> None:
     """Say that the file of a champion is not the one that was promoted, which left a judgement."""
     is_kept = path.is_symlink() and judgements_of(path.parent)
-    if is_kept and read_judgement(path.parent, champion.sha256) is None:
+    is_known = is_starter(champion.name, champion.sha256)
+    if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
         say(
             f"model {champion.name} is not the file that was promoted: it was replaced, or the "
             "disk has changed a bit of it; it labels all the same. Copy it back from a backup, or "
