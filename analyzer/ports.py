@@ -36,7 +36,8 @@ def listen(port: int | None = None, bind: str = HOST) -> socket.socket:
                 "one with --port"
             ) from error
         reason = error.strerror or error
-        raise DataError(f"cannot listen on {bind}, port {port}: {reason}") from error
+        place = bind if port is None else f"{bind}, port {port}"
+        raise DataError(f"cannot listen on {place}: {reason}") from error
 
 
 def free_port(port: int | None = None, bind: str = HOST) -> int:

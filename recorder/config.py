@@ -17,7 +17,8 @@ from pydantic import (
 )
 
 from hearthlog.recorder.addresses import is_address, public_name
-from hearthlog.recorder.config_origins import DEFAULT, ENVIRONMENT, Key, Origins, key_lines
+from hearthlog.recorder.config_origins import ENVIRONMENT, Origins, key_lines
+from hearthlog.recorder.config_problems import configuration_error
 from hearthlog.recorder.direction.geometry import ArrayGeometry, array_geometry
 from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
 from hearthlog.recorder.disk.sizes import Size
@@ -28,12 +29,17 @@ from hearthlog.recorder.timezone import check_time_zone, machine_zone, time_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name, check_scenario_name
+from hearthlog.schemas.storage.regular_file import exposed_secret
 from hearthlog.schemas.storage.small_file import read_toml
 
 ReadableBy = Literal["owner", "group", "all"]
 Keep = Literal["off", "events", "unsure", "always"]
 NO_MODEL = Path("none")  # in place of a model file: there are no labels
 BRIDGE = "bridge"  # the table of the file that is not the recorder's
+_MOST_DAYS = 36_500
+_MOST_FILES = 10_000_000
+_MOST_FRAMES = 1_728_000  # a day
+_MOST_MEGABYTES = 1_000_000_000
 _LEAST_BAG_SIZE = 1_000_000  # so that no two files begin in one second
 
 
@@ -56,6 +62,8 @@ def _checked_places(places: list[list[float]]) -> list[list[float]]:
     return places
 
 
+_MODELS: list[Any] = ["models/champion.safetensors"]
+_SCENARIOS: list[Any] = [{"speakers": "models/speakers.safetensors"}]
 Scenarios = Annotated[
     dict[Annotated[str, _checked(check_scenario_name)], Path], Field(max_length=8)
 ]
@@ -71,14 +79,18 @@ class MicrophoneSettings(BaseModel):
     )
     device: str = Field(
         default="",
+        examples=["USB PnP Sound Device"],
         description="As `hearthlog devices` lists it, or an rtsp://, http:// or ros2:// address; "
         "empty: the default one.",
     )
     fallback: str = Field(
-        default="", description="A device that is heard while that one is not there; empty: none."
+        default="",
+        examples=["USB PnP Sound Device"],
+        description="A device that is heard while that one is not there; empty: none.",
     )
     array: Annotated[list[list[float]], AfterValidator(_checked_places)] = Field(
         default=[],
+        examples=[[[0.0, 0.0], [0.1, 0.0]]],
         description="Places of the microphones of an array, [x, y] in metres for each channel; "
         "empty: one channel is heard.",
     )
@@ -90,10 +102,10 @@ class MicrophoneSettings(BaseModel):
         "files their mean.",
     )
     model: Path | None = Field(
-        default=None, description="Instead of the recorder's; none: no labels."
+        default=None, examples=_MODELS, description="Instead of the recorder's; none: no labels."
     )
     scenarios: Scenarios | None = Field(
-        default=None, description="Instead of the recorder's; {}: none."
+        default=None, examples=_SCENARIOS, description="Instead of the recorder's; {}: none."
     )
 
     @property
@@ -130,16 +142,18 @@ class Settings(BaseModel):
     output: Path = Field(default=Path("logs"), description="Folder of the logs.")
     model: Path | None = Field(
         default=None,
+        examples=_MODELS,
         description="Model file, or a link to one; general or bathroom, which come with hearthlog; "
         "none: no labels. By default models/champion.safetensors if there is one, else general.",
     )
     scenarios: Scenarios = Field(
         default={},
+        examples=_SCENARIOS,
         description="Models that label beside it, by the name of what for: as "
         '{speakers = "models/speakers.safetensors"}.',
     )
     feature_set: str = Field(
-        default="", description="Empty: that of the model, or the default one."
+        default="", examples=["home33"], description="Empty: that of the model, or the default one."
     )
     microphone: list[MicrophoneSettings] = Field(
         default=[MicrophoneSettings()],
@@ -148,7 +162,9 @@ class Settings(BaseModel):
         description="One table for each.",
     )
     max_bag_duration: int = Field(default=3600, ge=1, le=86_400, description="Seconds a file.")
-    max_bag_size: Size = Field(default=0, description="Bytes a file, such as 50M; 0: any.")
+    max_bag_size: Size = Field(
+        default=0, examples=["50M"], description="Bytes a file, such as 50M; 0: any."
+    )
     flush_seconds: float = Field(
         default=1.0,
         ge=1.0,
@@ -159,20 +175,26 @@ class Settings(BaseModel):
         default=5.0, ge=1.0, le=3600, description="So much is lost at most if the power is cut."
     )
     statistics_every: int = Field(
-        default=LOGGED_EVERY, ge=1, description="Frames from one message of statistics to the next."
+        default=LOGGED_EVERY,
+        ge=1,
+        le=_MOST_FRAMES,
+        description="Frames from one message of statistics to the next.",
     )
     timezone: Annotated[str, _checked(check_time_zone)] = Field(
         default_factory=machine_zone,
         description="Of the home, as Europe/Berlin; by default that of the machine.",
     )
     quiet_hours: list[Annotated[str, _checked(check_quiet_hours)]] = Field(
-        default=[], description='Hours of every day without listening, as ["22:00-06:30"].'
+        default=[],
+        examples=[["22:00-06:30"]],
+        description='Hours of every day without listening, as ["22:00-06:30"].',
     )
     readable_by: ReadableBy = Field(
         default="owner", description="Who of this machine may read new logs, with their folders."
     )
     privacy: list[str] = Field(
         default=[],
+        examples=[["speech"]],
         description='Classes whose features are logged coarsely, as ["speech"]: over a second.',
     )
     keep_audio: Keep = Field(default="off", description="Which sound is kept as clips.")
@@ -189,30 +211,37 @@ class Settings(BaseModel):
     clip_min_free_space: int = Field(
         default=500,
         ge=0,
+        le=_MOST_MEGABYTES,
         description="MB on the disk; with less there are no clips, and the log goes on.",
     )
     retention_days: int = Field(
-        default=0, ge=0, description="Days with logs that are kept; 0: any number."
+        default=0, ge=0, le=_MOST_DAYS, description="Days with logs that are kept; 0: any number."
     )
     max_bag_files: int = Field(
-        default=0, ge=0, description="Finished logs that are kept; 0: any number."
+        default=0, ge=0, le=_MOST_FILES, description="Finished logs that are kept; 0: any number."
     )
     max_record_size: Size = Field(
-        default=0, ge=0, description="Bytes of all logs, such as 20G; 0: any size."
+        default=0, examples=["20G"], description="Bytes of all logs, such as 20G; 0: any size."
     )
     min_free_space: Size = Field(
-        default=500_000_000, ge=0, description="Bytes on the disk that logs leave free; 0: none."
+        default=500_000_000,
+        examples=["500M"],
+        description="Bytes on the disk that logs leave free; 0: none.",
     )
     drop_statistics_days: int = Field(
         default=0,
         ge=0,
+        le=_MOST_DAYS,
         description="Days with logs after which they lose the statistics; 0: never.",
     )
     drop_features_days: int = Field(
-        default=0, ge=0, description="The same with features and statistics."
+        default=0, ge=0, le=_MOST_DAYS, description="The same with features and statistics."
     )
     labels_only_days: int = Field(
-        default=0, ge=0, description="The same with all but labels, segments and gaps."
+        default=0,
+        ge=0,
+        le=_MOST_DAYS,
+        description="The same with all but labels, segments and gaps.",
     )
 
     def keeping_rules(self) -> KeepingRules:
@@ -250,6 +279,12 @@ class Settings(BaseModel):
         if 0 < size < _LEAST_BAG_SIZE:
             raise ValueError("at least 1M, which is some minutes; or 0, for any size")
         return size
+
+
+_OTHERS: dict[str, type[BaseModel]] = {  # tables whose keys may have been meant
+    "above the first table": Settings,
+    "below [[microphone]]": MicrophoneSettings,
+}
 
 
 def load_settings(
@@ -309,7 +344,7 @@ def load_with_origins(
     """
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     content.pop(BRIDGE, None)
-    lines = {} if file is None else key_lines(file.read_text("utf-8"))
+    lines = {} if file is None else key_lines(file.read_text("utf-8-sig"))
     origins = Origins(command_line, content, file, lines)
     given = _environment() | command_line
     if "scenarios" in given:
@@ -328,7 +363,7 @@ def load_with_origins(
         update = {"microphone": [MicrophoneSettings(**merged)]}
         return settings.model_copy(update=update), origins
     except ValidationError as error:
-        raise refusal(error, origins) from error
+        raise configuration_error(error, origins, Settings, (), _OTHERS) from error
 
 
 def _environment() -> dict[str, Any]:
@@ -352,32 +387,13 @@ def _from_json(variable: str) -> Any:
         raise ConfigurationError(f"environment: {variable} is not JSON ({error})") from error
 
 
-def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> ConfigurationError:
-    """Say in one line what is wrong, and where.
-
-    Parameters
-    ----------
-    error : ValidationError
-        Of which one error is said: an unknown key, for it may be why another one is missing.
-    origins : Origins
-        Of what was checked.
-    table : Key, optional
-        Where in the file that was.
-    """
-    errors = error.errors()
-    first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
-    whole = (*table, *(part for part in first["loc"] if part != "[key]"))
-    where = _place(whole, origins)
-    key = ".".join(str(part) for part in whole)
-    if first["type"] == "extra_forbidden":
-        return ConfigurationError(f"{where}: unknown key {key!r}")
-    return ConfigurationError(f"{where}: {key}: {first['msg'].removeprefix('Value error, ')}")
-
-
-def _place(key: Key, origins: Origins) -> str:
-    """Say where something is wrong: a line of the file, or what else the value comes from."""
-    every = (origins.origin(key[:end]) for end in range(len(key), 0, -1))  # of what it is in
-    return next((origin for origin in every if origin != DEFAULT), "configuration")
+def exposed_passwords(settings: Settings, file: Path | None) -> list[str]:
+    """Return the line that says that everybody may read a file with a password; or none."""
+    devices = [name for each in settings.microphone for name in (each.device, each.fallback)]
+    if file is None or all(public_name(device) == device for device in devices):
+        return []
+    line = exposed_secret(file)
+    return [line] if line else []
 
 
 def _check_microphones(microphones: list[MicrophoneSettings], origins: Origins) -> None:
@@ -387,5 +403,5 @@ def _check_microphones(microphones: list[MicrophoneSettings], origins: Origins) 
         twice = next((value for value in values if values.count(value) > 1), None)
         if twice is not None:
             what = f"{key} {public_name(twice)!r}" if twice else "the default device"
-            where = _place(("microphone", len(microphones) - 1), origins)
+            where = origins.place(("microphone", len(microphones) - 1))
             raise ConfigurationError(f"{where}: two microphones have {what}; say which is which")

@@ -8,8 +8,11 @@ from typing import Any, NamedTuple
 
 ENVIRONMENT = "HEARTHLOG_"
 DEFAULT = "default"
-_TABLE = re.compile(r"\s*(\[\[?)\s*([\w-]+(?:\.[\w-]+)*)\s*\]\]?")
-_KEY = re.compile(r"\s*([\w-]+)\s*=")
+_PART = r"""(?:[\w-]+|"[^"\\]*"|'[^']*')"""
+_NAME = rf"{_PART}(?:\s*\.\s*{_PART})*"
+_TABLE = re.compile(rf"\s*(\[\[?)\s*({_NAME})\s*\]\]?")
+_KEY = re.compile(rf"\s*({_NAME})\s*=")
+_PARTS = re.compile(_PART)
 
 Key = tuple[str | int, ...]  # such as ("microphone", 1, "device")
 
@@ -49,6 +52,16 @@ class Origins(NamedTuple):
         line = next((self.lines[up] for up in _upwards(key) if up in self.lines), None)
         return f"{self.path}" if line is None else f"{self.path}, line {line}"
 
+    def place(self, key: Key) -> str:
+        """Say where something is wrong: a line of the file, or what else the value comes from.
+
+        Parameters
+        ----------
+        key : Key
+        """
+        every = (self.origin(key[:end]) for end in range(len(key), 0, -1))  # of what it is in
+        return next((origin for origin in every if origin != DEFAULT), "configuration")
+
     def _is_given(self, key: Key) -> bool:
         value: Any = self.file
         for part in key:
@@ -65,7 +78,7 @@ def key_lines(text: str) -> dict[Key, int]:
     Parameters
     ----------
     text : str
-        Its content. Keys with dots or quotes are not looked for.
+        Its content. Keys in tables within a line are not looked for.
 
     Returns
     -------
@@ -74,16 +87,22 @@ def key_lines(text: str) -> dict[Key, int]:
     """
     lines: dict[Key, int] = {}
     table: Key = ()
-    counts: dict[str, int] = {}
+    counts: dict[Key, int] = {}
     for number, line in enumerate(text.split("\n"), 1):
         if head := _TABLE.match(line):
-            name, is_one_of_many = head[2], head[1] == "[["
-            counts[name] = counts.get(name, -1) + 1
-            table = (*name.split("."), counts[name]) if is_one_of_many else (*name.split("."),)
+            table = _parts(head[2])
             lines.setdefault(table, number)
+            if head[1] == "[[":
+                counts[table] = counts.get(table, -1) + 1
+                table = (*table, counts[table])
+                lines.setdefault(table, number)
         elif key := _KEY.match(line):
-            lines.setdefault((*table, key[1]), number)
+            lines.setdefault((*table, *_parts(key[1])), number)
     return lines
+
+
+def _parts(name: str) -> Key:
+    return tuple(part.strip("\"'") for part in _PARTS.findall(name))
 
 
 def _variable(name: str) -> str | None:

@@ -8,9 +8,19 @@ class SourceError(HearthlogError):
 
 
 class ConfigurationError(HearthlogError):
-    """The configuration is unknown, wrong or contradicts itself."""
+    """The configuration is unknown, wrong or contradicts itself.
+
+    Parameters
+    ----------
+    *lines : str
+        One for each thing that is wrong.
+    """
 
     status = 2
+
+    def __init__(self, *lines: str) -> None:
+        super().__init__("; ".join(lines))
+        self.lines = lines
 
 
 class DeviceError(SourceError):

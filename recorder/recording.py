@@ -1,17 +1,17 @@
 """The recorder: sources of sound, a pipeline for each, and the log that they write."""
 
-import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from threading import Event as Flag
 
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.labelling.open_models import open_models
-from hearthlog.recorder.log.folder_lock import FolderLock
+from hearthlog.recorder.log.folder_lock import FolderLock, check_writable
 from hearthlog.recorder.log.recovery import end_of_sound, recover_active
 from hearthlog.recorder.memory import keep_one_heap
 from hearthlog.recorder.recording_session import (
@@ -25,7 +25,7 @@ from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.merged import merged_events
 from hearthlog.recorder.sources.microphone import MicrophoneSource, check_device
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 
@@ -140,16 +140,44 @@ def check_recording(settings: Settings) -> None:
     ModelError, ConfigurationError
         As `record_files`.
     """
-    sources = {each.name: _Unheard(each.device) for each in settings.microphone}
+    if problems := recording_problems(settings):
+        raise problems[0]
+
+
+def recording_problems(settings: Settings) -> list[HearthlogError]:
+    """Return the errors with which microphones could not be recorded so, and leave no trace.
+
+    Parameters
+    ----------
+    settings : Settings
+
+    Returns
+    -------
+    list of HearthlogError
+        As `check_recording` raises the first one.
+    """
+    problems: dict[str, HearthlogError] = {}  # by its words: microphones may have the same model
+
+    def check(step: Callable[[], object]) -> None:
+        try:
+            step()
+        except HearthlogError as error:
+            problems.setdefault(str(error), error)
+
     for device in (name for each in settings.microphone for name in (each.device, each.fallback)):
-        check_device(device)
+        check(partial(check_device, device))
+    sources = {each.name: _Unheard(each.device) for each in settings.microphone}
     with ExitStack() as stack:
-        models = open_models(settings, list(sources), None, stack)
-        RecordingSession(settings, sources, models)
-    folder = settings.output.absolute()
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise LogError(f"{settings.output}: cannot be written ({there} does not allow it)")
+        for name in sources:
+            check(partial(open_models, settings, [name], None, stack))
+        if not problems:
+            check(
+                lambda: RecordingSession(
+                    settings, sources, open_models(settings, list(sources), None, stack)
+                )
+            )
+    check(partial(check_writable, settings.output))
+    return list(problems.values())
 
 
 @dataclass

@@ -1,12 +1,15 @@
 """When nobody is to be listened to: quiet hours, and a pause that somebody asked for."""
 
+import os
 import re
 import time
+from contextlib import suppress
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.messages.gaps import PAUSED, QUIET_HOURS
 from hearthlog.schemas.text import shortened
 
@@ -134,7 +137,12 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
     """
     end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
     temporary = folder / f"{_PAUSE_FILE}.new"
+    temporary.touch(mode=0o600)
     temporary.write_text(f"{end}\n{who}" if who else end, encoding="utf-8")
+    # A recorder of another account has to read until when.
+    is_own = folder.stat().st_uid == os.geteuid()
+    with suppress(OSError):  # a disk without rights
+        temporary.chmod(0o600 | log_readers(folder) if is_own else 0o644)
     temporary.replace(folder / _PAUSE_FILE)
 
 

@@ -185,7 +185,10 @@ def test_an_alsa_configuration_that_is_missing(refused, tmp_path):
         ('node = "a/b"', "node: node name 'a/b'"),
         ('[[microphone]]\nname = "Bad Room"', "microphone.0.name: microphone name 'Bad Room'"),
         ("[[microphone]]\nnoise = 1", "unknown key 'microphone.0.noise'"),
-        ("flush_seconds = -1", "flush_seconds: Input should be greater"),
+        (
+            "flush_seconds = -1",
+            "flush_seconds: -1 is not a number from 1.0 to 3600; write flush_seconds = 1.0",
+        ),
         ("node = " + "[" * 100_000, "cannot be read as TOML (it is nested too deeply)"),
         ("a." * 400_000 + "a = 1", "cannot be read as TOML (it is nested too deeply)"),
         ("flush_seconds = " + "1" * 5000, "cannot be read as TOML"),
@@ -233,7 +236,10 @@ OF_MICROPHONE = "environment, HEARTHLOG_MICROPHONE: "
         ("HEARTHLOG_MICROPHONE=mic", "environment: HEARTHLOG_MICROPHONE is not JSON (Expecting"),
         ("HEARTHLOG_NEVER_KEEP=" + "[" * 100_000, "environment: HEARTHLOG_NEVER_KEEP is not JSON"),
         ('HEARTHLOG_MICROPHONE=[{"noise": 1}]', f"{OF_MICROPHONE}unknown key"),
-        ("HEARTHLOG_FLUSH_SECONDS=never", "environment, HEARTHLOG_FLUSH_SECONDS: flush_seconds: I"),
+        (
+            "HEARTHLOG_FLUSH_SECONDS=never",
+            "environment, HEARTHLOG_FLUSH_SECONDS: flush_seconds: 'n",
+        ),
     ],
 )
 def test_a_variable_of_the_environment_that_makes_no_sense(
@@ -260,7 +266,9 @@ def test_variables_of_other_programs_and_of_the_configuration_are_taken(hearthlo
         (("record", "--what"), "no such option: --what; see `hearthlog record --help`"),
         (("replay",), "missing argument 'path'; see `hearthlog replay --help`"),
         (("models", "promote", "--to", "x"), "invalid value for '--to': "),
-        (("demo", "--minutes", "0"), "invalid value for '--minutes': "),
+        (("demo", "--minutes", "0"), "invalid value for '--minutes': it must be at least 1; see"),
+        (("demo", "--minutes", "2h"), "invalid value for '--minutes': it must be a number; see"),
+        (("discover", "x", "--least", "2.5"), "invalid value for '--least': it must be a whole"),
         (("listen",), "no such command 'listen'; see `hearthlog --help`"),
     ],
 )

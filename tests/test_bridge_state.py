@@ -219,10 +219,16 @@ def test_who_cannot_be_told_of_a_trouble_ends_nothing():
         ),
         ('[bridge.mqtt]\nhost = ""', "line 2: bridge.mqtt.host: '' cannot be"),
         ('[bridge.mqtt]\nhots = "x"', "line 2: unknown key 'bridge.mqtt.hots'"),
-        ("[bridge.mqtt]\nport = 1883", "line 1: bridge.mqtt.host: Field required"),
-        ('[bridge.mqtt]\nhost = "x"\nport = 70000', "line 3: bridge.mqtt.port: Input should"),
-        ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: String should match"),
-        ("bridge = 3", "line 1: bridge: Input should be"),
+        (
+            "[bridge.mqtt]\nport = 1883",
+            'line 1: bridge.mqtt.host: is missing; write host = "broker.lan"',
+        ),
+        (
+            '[bridge.mqtt]\nhost = "x"\nport = 70000',
+            "line 3: bridge.mqtt.port: 70000 is not a whole number from 1 to 65535",
+        ),
+        ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: is no address that can be"),
+        ("bridge = 3", "line 1: bridge: is a table; write [bridge]"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_named_with_its_line(tmp_path, text, problem):

@@ -1,17 +1,29 @@
 """`hearthlog config`: what is in force, from where, whether it can be used, and what could be."""
 
 import json
+import re
 import tomllib
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from spliced import run
 
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
+from hearthlog.analyzer.bridge.settings import (
+    MqttSettings,
+    PageSettings,
+    PingSettings,
+    PrometheusSettings,
+    load_bridge_settings,
+)
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.config_origins import key_lines
+from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.tools.reference import configuration_page
 
 
@@ -44,6 +56,7 @@ model = "none"
 def file(tmp_path):
     path = tmp_path / "home.toml"
     path.write_text(FILE)
+    path.chmod(0o600)
     return path
 
 
@@ -82,7 +95,7 @@ def test_a_configuration_is_checked_before_a_restart(hearthlog, file, tmp_path):
     ("change", "status", "words"),
     [
         (("node", "nodee"), 2, "FILE, line 2: unknown key 'nodee'"),
-        (('"50M"', '"50X"'), 2, "FILE, line 3: max_bag_size: say how many bytes, such as 50"),
+        (('"50M"', '"50X"'), 2, "FILE, line 3: max_bag_size: '50X' is no size; say how many bytes"),
         (("06:30", "6:30"), 2, "FILE, line 5: quiet_hours.0: '22:00-6:30' are no hours"),
         (('"bath"', '"kitchen"'), 2, "FILE, line 12: two microphones have name 'kitchen'"),
         (('"bath"', '"ba/th"'), 2, "FILE, line 13: microphone.1.name: "),
@@ -101,6 +114,198 @@ def test_what_is_wrong_in_a_configuration_is_said_with_its_line(
     file.write_text(FILE.replace(old, new))
     message = refused("config", "check", file, status=status)
     assert message.startswith(words.replace("FILE", str(file)))
+
+
+TABLES = {  # every table, by its head, with the keys that it cannot be without
+    "": (Settings, ""),
+    "[[microphone]]": (MicrophoneSettings, ""),
+    "[bridge.mqtt]": (MqttSettings, 'host = "x"'),
+    "[bridge.prometheus]": (PrometheusSettings, ""),
+    "[bridge.page]": (PageSettings, ""),
+    "[bridge.ping]": (PingSettings, 'url = "https://x"'),
+    "[bridge.delivery]": (DeliverySettings, ""),
+} | {
+    f"[[bridge.alert]]\nrule = {kind.model_fields['rule'].annotation.__args__[0]!r}": (kind, "")
+    for kind in get_args(get_args(AlertRule)[0])
+}
+OF_A_LIBRARY = re.compile(
+    r"[Ii]nput|valid|pattern|pars|instance|required|tag|discriminat|regex|expect|dictionary|<class"
+)
+
+
+def keys_of(model):
+    names = [field.alias or name for name, field in model.model_fields.items()]
+    return [name for name in names if name not in {"microphone", "rule"} or model not in RULED]
+
+
+RULED = {Settings, *(model for head, (model, _) in TABLES.items() if "rule" in head)}
+
+
+def everywhere(value):
+    """Write a value for every key of every table."""
+    return "\n".join(
+        "\n".join([head, *(f"{key} = {value}" for key in keys_of(model))])
+        for head, (model, _) in TABLES.items()
+    )
+
+
+def slips(path, text):
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as error:
+        load_bridge_settings(path)
+    return error.value.lines
+
+
+@pytest.mark.parametrize(
+    "value", ["5", "'x'", "[1]", "{a = 1}", "true", "1.5", "''", "1e300", "2020-01-01", "['x']"]
+)
+def test_every_slip_is_told_in_words_that_say_what_to_write(tmp_path, monkeypatch, value):
+    monkeypatch.delenv("HEARTHLOG_MODEL", raising=False)
+    lines = slips(tmp_path / "c.toml", everywhere(value))
+    for line in lines:
+        assert not OF_A_LIBRARY.search(line.removeprefix(str(tmp_path))), line
+        assert re.match(rf"{re.escape(str(tmp_path))}/c.toml, line \d+: [\w.]+: .", line), line
+    if value == "{a = 1}":  # which no key takes
+        keys = [key for model, _ in TABLES.values() for key in keys_of(model)]
+        refused = [line.split(": ")[1].removesuffix(".a").rpartition(".")[2] for line in lines]
+        assert sorted(refused) == sorted(keys)
+        assert all(re.search("write|such as", line) for line in lines)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "-1e300", "9" * 40, "-" + "9" * 40])
+def test_every_number_has_bounds(tmp_path, value):
+    lines = slips(tmp_path / "c.toml", everywhere(value))
+    refused = {re.search(r": ([\w.]+): ", line)[1].rpartition(".")[2] for line in lines}
+    for model, _ in TABLES.values():
+        about = model.model_json_schema()["properties"]
+        for name, kind in about.items():
+            kinds = {kind.get("type"), *(each.get("type") for each in kind.get("anyOf", ()))}
+            assert not kinds & {"integer", "number"} or name in refused, name
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[microphone]\nname = 'x'", "microphone: write [[microphone]], with two brackets"),
+        ("[bridge.alert]\nname = 'x'", "bridge.alert: write [[bridge.alert]], with two"),
+        ("[[bridge.mqtt]]\nhost = 'x'", "bridge.mqtt: is a table; write [bridge.mqtt] with one"),
+        ("quiet_hours = '22:00-06:30'", 'not a list of texts; write quiet_hours = ["22:00-06:30"]'),
+        ("max_bag_duration = '1h'", "write max_bag_duration = 3600, without a unit"),
+        ("flush_seconds = '2 min'", "write flush_seconds = 120, without a unit"),
+        ("node = 7", 'node: 7 is not a text in quotes; write node = "7"'),
+        ("quiet_hour = ['22:00-06:30']", "unknown key 'quiet_hour'; is quiet_hours meant?"),
+        (
+            "[[microphone]]\nnode = 'x'",
+            "unknown key 'microphone.0.node'; it belongs above the first",
+        ),
+        ("[bridge.page]\nquiet_hours = []", "; it belongs above the first table"),
+        ("[bridge.mqtt]\nhost='x'\npassword='geheim'", 'write password_file = "/etc/hearthlog/'),
+        ("[bridge.mqtt]\nhost='x'\ntopic='a/#'", "'a/#' cannot begin topics; write 1 to 200"),
+        ("[[bridge.alert]]\nname='x'\nrule='more'", 'rule is one of "longer_than", "more_than"'),
+        ("[bridge.page]\nbind = 'evil.example'", "'evil.example' is no address: write one"),
+        ("node = flat", 'a text stands in quotes, as node = "home"'),
+        ('output = "C:\\Users\\me"', "a text with a backslash stands in single quotes"),
+        ("node = 'a'\nnode = 'b'", "(at line 2, the last one); a key or table is given twice"),
+    ],
+)
+def test_a_slip_is_told_with_what_to_write(tmp_path, text, words):
+    (line,) = slips(tmp_path / "c.toml", text)
+    assert words in line
+    assert "geheim" not in line
+
+
+def test_a_file_of_an_editor_of_windows_is_read_or_named(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_bytes('node = "flat"\r\n'.encode("utf-8-sig"))
+    assert load_bridge_settings(path)[0].node == "flat"
+    path.write_bytes('node = "flat"\n'.encode("utf-16"))
+    with pytest.raises(ConfigurationError, match="it is UTF-16\\); save it as UTF-8"):
+        load_bridge_settings(path)
+    path.write_bytes('\nnode = "M\xfcller"\n'.encode("latin-1"))
+    with pytest.raises(ConfigurationError, match="at line 2\\); save it as UTF-8"):
+        load_bridge_settings(path)
+
+
+of_apprise = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
+BRIDGE = """\
+model = "none"
+output = "FOLDER/logs"
+[[microphone]]
+device = "rtsp://me:secret@camera/1"
+[bridge.mqtt]
+host = "x"
+user = "me"
+password_file = "FOLDER/password"
+[bridge.page]
+token_file = "FOLDER/token"
+[bridge.delivery]
+urls_file = "FOLDER/urls"
+"""
+SECRETS = {"password": "geheim", "token": "abcdefghijklmnop", "urls": "json://127.0.0.1:9"}
+
+
+@of_apprise
+def test_secrets_that_everybody_may_read_are_named_each(hearthlog, tmp_path):
+    for name, secret in SECRETS.items():
+        (tmp_path / name).write_text(secret)
+        (tmp_path / name).chmod(0o640)  # for a group is well
+    file = tmp_path / "home.toml"
+    file.write_text(BRIDGE.replace("FOLDER", str(tmp_path)))
+    file.chmod(0o600)
+    result = hearthlog("config", "check", file)
+    assert (result.returncode, result.stderr) == (0, "")
+    exposed = [file, *(tmp_path / name for name in SECRETS)]
+    for path in exposed:
+        path.chmod(0o666)
+    result = hearthlog("config", "check", file)
+    assert (result.returncode, result.stdout) == (3, f"{file}: can be used\n")
+    assert sorted(result.stderr.splitlines()) == sorted(
+        f"hearthlog: {path}: holds secrets, and everybody on this machine may read it: "
+        f"chmod 600 {path}"
+        for path in exposed
+    )
+
+
+@of_apprise
+def test_what_the_bridge_refuses_at_its_start_is_refused_all_at_once(hearthlog, tmp_path):
+    (tmp_path / "logs").touch()
+    (tmp_path / "password").mkdir()
+    file = tmp_path / "home.toml"
+    text = BRIDGE.replace("FOLDER/urls", "/dev/zero").replace("FOLDER", str(tmp_path))
+    tables = {
+        "page": 'bind = "192.0.2.1"\n',
+        "mqtt": 'tls = true\nca_file = "none.pem"\n',
+    }
+    for name, more in tables.items():
+        text = text.replace(f"[bridge.{name}]\n", f"[bridge.{name}]\n{more}")
+    file.write_text(f'{text}[bridge.prometheus]\ntext_file = "/dev/null/home.prom"\n')
+    file.chmod(0o600)
+    result = hearthlog("config", "check", file)
+    assert (result.returncode, result.stdout) == (1, "")
+    expected = [
+        f"{tmp_path}/logs: cannot be written",
+        f"{tmp_path}/password: cannot be read (Is a directory)",
+        f"{tmp_path}/token: no such file of a token",
+        "/dev/zero: cannot be read (Not a regular file)",
+        "none.pem: no such certificate",
+        "cannot listen on 192.0.2.1",
+        "/dev/null: cannot be written",
+    ]
+    lines = result.stderr.splitlines()
+    assert len(lines) == len(expected)
+    assert len(lines) == len(expected)
+    for words in expected:
+        assert any(line.startswith(f"hearthlog: {words}") for line in lines), words
+
+
+def test_a_credential_of_the_service_is_not_missed(hearthlog, tmp_path):
+    file = tmp_path / "home.toml"
+    file.write_text(
+        'model = "none"\n[bridge.mqtt]\nhost = "x"\nuser = "x"\npassword_file = "mqtt"\n'
+    )
+    result = hearthlog("config", "check", file)
+    assert result.returncode == 3
+    assert "mqtt: not here; it has to be a credential of the service" in result.stderr
 
 
 def test_a_variable_that_is_wrong_is_named(refused):

@@ -1,6 +1,7 @@
 """Quiet hours and pauses: the microphone is closed, and the log says why nobody was listened to."""
 
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -13,6 +14,7 @@ from conftest import HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import features, read
+from spliced import run
 from test_capture import wait_for_frames
 from test_swap import wait_for
 
@@ -174,8 +176,8 @@ def test_a_new_configuration_is_taken_at_sighup_and_a_wrong_one_is_not(labmic, t
         process.send_signal(signal.SIGHUP)
         said = process.stderr.readline()
         assert said == (
-            f"hearthlog: {file}, line 2: unknown key 'modell'; the recorder goes on as it was "
-            "configured\n"
+            f"hearthlog: {file}, line 2: unknown key 'modell'; is model meant?; the recorder goes "
+            "on as it was configured\n"
         )
         file.write_text("node = 'flat'\n" + good)
         process.send_signal(signal.SIGHUP)
@@ -196,3 +198,20 @@ def test_nobody_else_may_read_the_logs(labmic, tmp_path, who, file, folder):
     paths = [path for path in logs.rglob("*") if path.name != ".home.lock"]
     for path in [logs, *paths]:
         assert path.stat().st_mode & 0o777 == (folder if path.is_dir() else file), path
+
+
+@pytest.mark.parametrize(("file", "folder"), [(0o600, 0o700), (0o640, 0o750)])
+def test_what_is_added_to_logs_is_for_those_who_may_read_the_logs(
+    recorded, tmp_path, capfd, file, folder
+):
+    logs = tmp_path / "logs"
+    shutil.copytree(recorded, logs)
+    for path in (logs, *logs.rglob("*")):
+        path.chmod(folder if path.is_dir() else file)
+    logs.chmod(0o755)  # made by hand
+    (tmp_path / "marks.txt").write_text("1.0\t3.0\tcoughing\n")
+    assert run(capfd, "annotate", "import", logs, tmp_path / "marks.txt").returncode == 0
+    assert run(capfd, "pause", logs).returncode == 0
+    made = [logs / ".pause", *logs.rglob("*.review.mcap")]
+    assert len(made) > 1
+    assert {path.stat().st_mode & 0o777 for path in made} == {file}

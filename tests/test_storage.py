@@ -32,7 +32,13 @@ from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.statistics import time_span, topic_counts
-from hearthlog.schemas.storage.new_files import check_new, new_file, replaced_file
+from hearthlog.schemas.storage.new_files import (
+    check_new,
+    new_file,
+    new_folder,
+    private_folder,
+    replaced_file,
+)
 from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_352_000 * NANOSECONDS
@@ -396,3 +402,31 @@ def test_a_server_that_reads_no_ranges_is_one_line(logs):
                 LogFile(location(url))
         finally:
             server.shutdown()
+
+
+def test_a_new_file_is_private_under_any_umask_and_one_that_is_replaced_keeps_its_rights(tmp_path):
+    os.umask(0)
+    for name in ("new", "old"):
+        with new_file(tmp_path / name) as temporary:
+            temporary.write_text("1")
+        assert (tmp_path / name).stat().st_mode & 0o777 == 0o600
+    (tmp_path / "old").chmod(0o644)
+    with replaced_file(tmp_path / "old") as temporary:
+        temporary.write_text("2")
+    assert (tmp_path / "old").stat().st_mode & 0o777 == 0o644
+    private_folder(tmp_path / "a/b")
+    with new_folder(tmp_path / "c") as temporary:
+        (temporary / "d").write_text("3")
+    for name, mode in {"a": 0o700, "a/b": 0o700, "c": 0o700, "c/d": 0o600}.items():
+        assert (tmp_path / name).stat().st_mode & 0o777 == mode
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone gives files away")
+def test_what_root_writes_belongs_to_whom_the_folder_belongs_to(tmp_path):
+    os.chown(tmp_path, 12345, 12345)
+    with new_file(tmp_path / "judgement") as temporary:
+        temporary.write_text("1")
+    private_folder(tmp_path / "folder")
+    owners = {path.stat().st_uid for path in tmp_path.iterdir()}
+    assert owners == {12345}
+    os.chown(tmp_path, 0, 0)

@@ -22,6 +22,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
 from hearthlog.recorder.config import Settings
@@ -322,3 +323,21 @@ def test_a_recorder_whose_terminal_is_closed_completes_its_log(folder, tmp_path)
     process.wait(timeout=20)
     (log,) = logs.rglob("*.mcap*")
     assert LogReader(log).complete
+
+
+def test_a_champion_of_which_a_bit_has_changed_is_named_at_the_start(folder, capfd):
+    def said_at_start():
+        ModelWatch(folder / "champion.safetensors", SimpleQueue()).close()
+        return [line for line in capfd.readouterr().err.splitlines() if "was promoted" in line]
+
+    insist(folder, load_model(folder / "champion.safetensors").sha256)
+    assert said_at_start() == []
+    file = (folder / "champion.safetensors").resolve()
+    data = bytearray(file.read_bytes())
+    data[-8] ^= 1
+    file.write_bytes(data)
+    (line,) = said_at_start()
+    assert line.startswith(f"hearthlog: model {file.stem} is not the file that was promoted")
+    for judgement in (folder / "judgements").iterdir():
+        judgement.unlink()
+    assert said_at_start() == [], "nothing is known of it"

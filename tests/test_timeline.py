@@ -321,6 +321,13 @@ def test_layers_are_labellings_of_their_own(tmp_path, folder, hearthlog, model_f
     assert done.returncode == 0, done.stderr
     found = read_timeline([logs]).microphones["mic"].labellings
     assert [one.name for one in found] == ["live", "relabel/simulated", "review"]
+    assert read_timeline([logs]).losses == []
+    layer = next(logs.rglob("*.relabel-*"))
+    for size, words in ((0.99, "read up to the last whole chunk"), (0.1, "nothing of it is whole")):
+        os.truncate(layer, int(layer.stat().st_size * size))
+        (loss,) = read_timeline([logs]).losses
+        assert loss.startswith(f"{layer}: unfinished, ")
+        assert words in loss
 
 
 def labels_log(path, names, count, width=2, **about):

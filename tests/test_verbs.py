@@ -97,6 +97,7 @@ def folder(tmp_path_factory):
         (folder / path).write_text(TRAP)
     write_training_set(folder / "clips", clips_per_class=3, seed=1)
     write_day(folder / "day.flac", 2, seed=2, manifest=None)
+    make_private(folder)
     for command in MAKING:
         result = run(folder, command)
         assert (result.returncode, sprung(folder)) == (0, []), f"{command}: {result.stderr}"
@@ -104,13 +105,27 @@ def folder(tmp_path_factory):
     (folder / "rules.toml").write_text(RULES)
     whole = min(folder.glob("logs/**/*Z.mcap")).read_bytes()
     (folder / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    assert {path.name for path in exposed(folder)} == {"home.toml", "rules.toml", "cut.mcap"}
+    make_private(folder)
     return folder
+
+
+def exposed(folder):
+    """List what others of this machine may look into."""
+    made = (path for path in folder.rglob("*") if not path.is_symlink())
+    return [path for path in made if path.stat().st_mode & 0o077]
+
+
+def make_private(folder):
+    for path in exposed(folder):
+        path.chmod(0o700 if path.is_dir() else 0o600)
 
 
 def run(folder, command, env=None):
     return subprocess.run(
         [HEARTHLOG, *shlex.split(command)],
         cwd=folder, env=env, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+        umask=0o022,
     )  # fmt: skip
 
 
@@ -120,6 +135,7 @@ def running(folder, command, env=None):
     with subprocess.Popen(
         [HEARTHLOG, *shlex.split(command)],
         cwd=folder, env=env, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        umask=0o022,
     ) as process:  # fmt: skip
         try:
             yield process
@@ -164,19 +180,19 @@ def test_the_traps_work(folder):
 
 
 @pytest.mark.parametrize("command", READING)
-def test_a_verb_imports_nothing_of_the_folder(folder, command):
+def test_a_verb_imports_nothing_of_the_folder_and_writes_for_nobody_else(folder, command):
     result = run(folder, command)
     lost = command.startswith(("recover", "evaluate"))  # the model has learned from these clips
     assert result.returncode == (LOST if lost else 0), result.stderr
-    assert sprung(folder) == []
+    assert (sprung(folder), exposed(folder)) == ([], [])
 
 
 @needs_viewer
 @pytest.mark.parametrize("command", DRAWING)
-def test_a_verb_that_draws_imports_nothing_of_the_folder(folder, command):
+def test_a_verb_that_draws_imports_nothing_and_writes_for_nobody_else(folder, command):
     result = run(folder, command)
     assert result.returncode == 0, result.stderr
-    assert sprung(folder) == []
+    assert (sprung(folder), exposed(folder)) == ([], [])
 
 
 @needs_viewer
@@ -191,13 +207,13 @@ def test_bridging_imports_nothing_of_the_folder(folder):
     with running(folder, BRIDGING) as process:
         assert "waiting for a recorder" in process.stderr.readline()
     assert process.returncode == 0
-    assert sprung(folder) == []
+    assert (sprung(folder), exposed(folder)) == ([], [])
 
 
 @pytest.mark.parametrize("command", LISTENING)
 def test_a_verb_that_listens_imports_nothing_of_the_folder(folder, labmic, command):
     result = run(folder, command, labmic.env)
-    assert sprung(folder) == []
+    assert (sprung(folder), exposed(folder)) == ([], [])
     assert result.returncode == 0, result.stderr
 
 
@@ -205,7 +221,7 @@ def test_recording_imports_nothing_of_the_folder(folder, labmic):
     with running(folder, RECORDING, labmic.env) as process:
         while process.poll() is None and not list(folder.glob("heard/**/*.active")):
             time.sleep(0.1)
-    assert sprung(folder) == []
+    assert (sprung(folder), exposed(folder)) == ([], [])
     assert process.returncode == 0
 
 

@@ -20,8 +20,10 @@ the command line goes before the environment, that before the file, and that bef
 
 `hearthlog config` prints all values in force, and where each comes from: the line of the file, a
 variable, or the default. Passwords of addresses are left out. `hearthlog config check` starts
-nothing: exit status 2 says that a value makes no sense and on which line it is, 1 that the model
-or the folder cannot be used. `hearthlog config schema > home.schema.json` writes a JSON schema,
+nothing, and says all that is wrong, each in a line with what to write: exit status 2 if a value
+makes no sense, 1 if a model, the folder or a file that is named cannot be used, 3 if everybody on
+this machine may read a file with secrets, or a file is not here that may be a credential of the
+service. `hearthlog config schema > home.schema.json` writes a JSON schema,
 by which editors check and complete the file if its first line is `#:schema ./home.schema.json`.
 
 At SIGHUP the recorder reads the file again. If the configuration has changed it completes its log
@@ -104,7 +106,7 @@ def _numbers(about: dict[str, Any]) -> str:
     least, most = about.get("minimum"), about.get("maximum")
     kind = "number" if about["type"] == "number" else "whole number"
     if most is not None:
-        return f"{kind}, {least:g} to {most:g}"
+        return f"{kind}, {least:.10g} to {most:.10g}"
     return kind if least is None else f"{kind}, {least:g} or more"
 
 

@@ -138,6 +138,7 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path) -> Model:
     model = train_model(data, chosen, ignore_progress, _METHOD)
     path.unlink(missing_ok=True)
     save_model(model, path)
+    path.chmod(0o644)  # it learned from published recordings, and is passed on
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     return load_model(path)
 

@@ -1,18 +1,25 @@
 """The outputs that are configured, opened, and opened again where that failed."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News, Output
+from hearthlog.analyzer.bridge.page.page_token import read_token
 from hearthlog.analyzer.bridge.saying import Saying
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
 from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.ping import read_ping_address
+from hearthlog.analyzer.ports import listen
+from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.storage.regular_file import exposed_secret
 from hearthlog.schemas.times import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -137,3 +144,76 @@ def open_outputs(
             lambda: AlertsOutput(rules, delivery, home, state_folder, say, on_ring), say
         )
     return outputs, since
+
+
+def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
+    """Look for what the outputs would refuse at their start, and open nothing.
+
+    Parameters
+    ----------
+    settings : BridgeSettings
+
+    Returns
+    -------
+    problems : list of str
+        Why an output could not be opened, a line each.
+    warnings : list of str
+        Files that may be credentials of the service, which are not here.
+    """
+    problems: list[str] = []
+    warnings: list[str] = []
+    for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:
+        if path is not None and not path.is_absolute() and not secret_path(path).exists():
+            warnings.append(f"{path}: not here; it has to be a credential of the service")
+            continue
+        try:
+            step()
+        except (HearthlogError, OSError) as error:
+            problems.append(str(error))
+    return problems, warnings
+
+
+_Step = tuple[Path | None, Callable[[], object]]  # the file of a secret, and what checks it
+
+
+def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_Step]:
+    """Yield how each file of secrets is read at the start."""
+    if (mqtt := settings.mqtt) is not None:
+        from hearthlog.analyzer.bridge.mqtt.connection import read_password  # noqa: PLC0415
+
+        yield mqtt.password_file, partial(read_password, mqtt)
+    for table in (settings.page, settings.prometheus):
+        if table is not None and table.token_file is not None:
+            yield table.token_file, partial(read_token, table.token_file)
+    if settings.ping is not None and (url := settings.ping.url_file) is not None:
+        yield url, lambda: read_ping_address(secret_path(url))
+    if (file := settings.delivery.urls_file) is not None:
+        from hearthlog.analyzer.bridge.alerts.targets import find_targets  # noqa: PLC0415
+
+        yield file, lambda: problems.extend(find_targets(file, lambda _: None)[1])
+
+
+def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
+    """Yield how certificates, addresses and folders are checked."""
+    if (mqtt := settings.mqtt) is not None and mqtt.tls:
+        from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
+
+        yield None, partial(tls_context, mqtt)
+    if (page := settings.page) is not None:
+        yield None, lambda: listen(bind=page.bind).close()
+    if settings.prometheus is not None and (text := settings.prometheus.text_file) is not None:
+        yield None, partial(check_writable, text.absolute().parent)
+    if settings.state is not None:
+        yield None, partial(check_writable, settings.state)
+
+
+def exposed_files(settings: BridgeSettings) -> list[str]:
+    """Return the lines that say which files of secrets everybody may read."""
+    mqtt, page, figures, ping = settings.mqtt, settings.page, settings.prometheus, settings.ping
+    files = [settings.delivery.urls_file]
+    files += [] if figures is None else [figures.token_file]
+    files += [] if ping is None else [ping.url_file]
+    files += [] if mqtt is None else [mqtt.password_file, mqtt.key_file]
+    files += [] if page is None else [page.token_file]
+    found = [exposed_secret(secret_path(file)) for file in files if file is not None]
+    return [line for line in found if line]

@@ -35,7 +35,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
 _LATER = 12 * 3600 * NANOSECONDS  # than its beginning an event may be known
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
-_MODES = {"owner": 0o600, "group": 0o640, "all": 0o644}
+_READERS = {"owner": 0, "group": 0o040, "all": 0o044}
 _LABELS = ("node", "microphone", "label")
 _LABELS_OF_SCENARIOS = ("node", "microphone", "scenario", "label")
 
@@ -99,10 +99,10 @@ class PrometheusOutput:
         with self._lock:
             self._text, self._made = text, time.monotonic()
         if self._settings.text_file is not None:
-            with replaced_file(self._settings.text_file) as temporary:
+            rights = _READERS[self._settings.readable_by or "all"]
+            with replaced_file(self._settings.text_file, readers=rights) as temporary:
                 temporary.touch(0o600)
                 temporary.write_bytes(text)
-                temporary.chmod(_MODES[self._settings.readable_by or "all"])
 
     def close(self) -> None:
         """Answer no more; the text file goes, so that nobody takes it for today's."""

@@ -15,13 +15,36 @@ from pydantic import (
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
-from hearthlog.recorder.config import BRIDGE, Settings, load_settings, refusal
+from hearthlog.analyzer.ping import is_ping_address
+from hearthlog.analyzer.ports import ip_of
+from hearthlog.recorder.config import BRIDGE, MicrophoneSettings, Settings, load_settings
 from hearthlog.recorder.config_origins import Origins, key_lines
+from hearthlog.recorder.config_problems import configuration_error
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.storage.small_file import read_toml
 
-_Topic = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^+#\x00]+$")]
-_Port = Annotated[int, Field(ge=1, le=65535)]
+_MOST_OF_TOPIC = 200  # characters
+
+
+def _check_topic(topic: str) -> str:
+    if not 0 < len(topic) <= _MOST_OF_TOPIC or set(topic) & set("+#\0") or not topic.isprintable():
+        raise ValueError(
+            f"{topic[:64]!r} cannot begin topics; write 1 to {_MOST_OF_TOPIC} characters without "
+            "+ and #, such as hearthlog"
+        )
+    return topic
+
+
+_Topic = Annotated[str, AfterValidator(_check_topic)]
+_Port = Annotated[int, Field(ge=1, le=65535, examples=[8883])]
+
+
+def _check_ping_address(url: str) -> str:
+    if url and not (is_ping_address(url) and url.isprintable() and " " not in url):
+        raise ValueError(
+            "is no address that can be asked for; write one such as https://hc-ping.com/your-uuid"
+        )
+    return url
 
 
 def _check_host(name: str) -> str:
@@ -54,6 +77,15 @@ def _check_origin(origin: str) -> str:
     return origin.lower()
 
 
+def _check_bind(address: str) -> str:
+    if ip_of(address) is None:
+        raise ValueError(
+            f"{address[:64]!r} is no address: write one of this machine in digits, such as "
+            "127.0.0.1"
+        )
+    return address
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -62,11 +94,15 @@ class MqttSettings(_Table):
     """A broker, and how one speaks to it."""
 
     host: Annotated[str, AfterValidator(_check_host)] = Field(
-        description="Name or address of the broker."
+        examples=["broker.lan"], description="Name or address of the broker."
     )
     port: _Port | None = Field(default=None, description="1883, with TLS 8883, by default.")
-    user: str = Field(default="", description="Empty: nobody in particular.")
-    password_file: Path | None = Field(default=None, description="Of one line.")
+    user: str = Field(
+        default="", examples=["hearthlog"], description="Empty: nobody in particular."
+    )
+    password_file: Path | None = Field(
+        default=None, examples=["/etc/hearthlog/mqtt-password"], description="Of one line."
+    )
     tls: bool = Field(default=False, description="Whether the connection is encrypted.")
     ca_file: Path | None = Field(
         default=None, description="Of who signs the broker's certificate; none: the machine's own."
@@ -88,7 +124,9 @@ class PrometheusSettings(_Table):
     """Where a Prometheus finds its figures."""
 
     text_file: Path | None = Field(
-        default=None, description="For the textfile collector of node_exporter; ends in .prom."
+        default=None,
+        examples=["/var/lib/node_exporter/hearthlog.prom"],
+        description="For the textfile collector of node_exporter; ends in .prom.",
     )
     port: _Port | None = Field(default=None, description="On loopback; none: no port.")
     token_file: Path | None = Field(
@@ -105,7 +143,7 @@ class PageSettings(_Table):
     """A page of the home, for a browser."""
 
     port: _Port = Field(default=8380, description="Where it is.")
-    bind: str = Field(
+    bind: Annotated[str, AfterValidator(_check_bind)] = Field(
         default="127.0.0.1", description="Address of this machine; others than loopback, too."
     )
     token_file: Path | None = Field(
@@ -127,8 +165,10 @@ class PageSettings(_Table):
 class PingSettings(_Table):
     """A watchdog on the network that raises the alarm when it hears nothing."""
 
-    url: str = Field(
-        default="", pattern=r"^$|^https?://[^/\s]+", description="As of healthchecks.io."
+    url: Annotated[str, AfterValidator(_check_ping_address)] = Field(
+        default="",
+        examples=["https://hc-ping.com/your-uuid"],
+        description="As of healthchecks.io.",
     )
     url_file: Path | None = Field(
         default=None, description="Of one line, with that address: who knows it can ping, too."
@@ -163,6 +203,16 @@ class BridgeSettings(_Table):
         return any(output is not None for output in outputs) or bool(self.alert)
 
 
+_OTHERS: dict[str, type[BaseModel]] = {  # tables whose keys may have been meant
+    "above the first table": Settings,
+    "below [[microphone]]": MicrophoneSettings,
+    "below [bridge.mqtt]": MqttSettings,
+    "below [bridge.page]": PageSettings,
+    "below [bridge.ping]": PingSettings,
+    "below [bridge.delivery]": DeliverySettings,
+}
+
+
 def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
     """Load the configuration of a recorder, and of the bridge that follows its log.
 
@@ -176,14 +226,25 @@ def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
     ConfigurationError
         As `load_settings`, also for what is in the table `bridge`.
     """
-    settings = load_settings(file, {}, {})
+    problems: list[str] = []
+    settings = Settings.model_construct()
+    try:
+        settings = load_settings(file, {}, {})
+    except ConfigurationError as error:
+        problems += error.lines
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     table = content.get(BRIDGE, {})
-    lines = {} if file is None else key_lines(file.read_text("utf-8"))
+    lines = {} if file is None else key_lines(file.read_text("utf-8-sig"))
+    bridge = BridgeSettings()
     try:
-        return settings, BridgeSettings.model_validate(table)
+        bridge = BridgeSettings.model_validate(table)
     except ValidationError as error:
-        raise refusal(error, Origins({}, content, file, lines), (BRIDGE,)) from error
+        origins = Origins({}, content, file, lines)
+        refused = configuration_error(error, origins, BridgeSettings, (BRIDGE,), _OTHERS)
+        problems += refused.lines
+    if problems:
+        raise ConfigurationError(*problems)
+    return settings, bridge
 
 
 def file_schema() -> dict[str, Any]:

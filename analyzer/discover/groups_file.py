@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,7 @@ from hearthlog.analyzer.discover.groups import (
 )
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
@@ -58,7 +60,8 @@ def locked_groups(path: Path) -> Iterator[None]:
         If its folder cannot be written.
     """
     try:
-        lock = path.with_name(f".{path.name}.lock").open("ab")
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
+        lock = os.fdopen(os.open(path.with_name(f".{path.name}.lock"), flags, 0o600), "ab")
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror})") from error
     with lock:
@@ -77,7 +80,7 @@ def save_groups(groups: Groups, path: Path) -> None:
     head = _Head(format=_FORMAT, id=groups.id, features=list(groups.features), names=groups.names)
     arrays = {name: np.ascontiguousarray(getattr(groups, name)) for name in _ARRAYS}
     data = save(arrays, {_KEY: head.model_dump_json()})
-    with replaced_file(path) as temporary:
+    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
         temporary.write_bytes(data)
 
 

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 from hearthlog.schemas.times import NANOSECONDS, read_time
@@ -132,7 +133,7 @@ def save_summary(summary: HomeSummary, path: Path) -> None:
     LogError
         If it cannot be written.
     """
-    with replaced_file(path) as temporary:
+    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
         temporary.write_text(f"{json.dumps(summary.model_dump(), allow_nan=False)}\n", "utf-8")
 
 

@@ -15,6 +15,7 @@ from hearthlog.analyzer.discover.voice_space import voice_space
 from hearthlog.analyzer.discover.voices import Evidence
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
@@ -57,7 +58,7 @@ def save_voices(voices: Voices, path: Path) -> None:
             "that hearthlog did not record"
         )
     data = save(arrays, {_KEY: head.model_dump_json()})
-    with replaced_file(path) as temporary:
+    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
         temporary.write_bytes(data)
 
 

@@ -9,10 +9,19 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import SUFFIX, find_logs, is_layer, is_log, log_name, stem
+from hearthlog.schemas.logs.files import (
+    REVIEW_LAYER,
+    SUFFIX,
+    find_logs,
+    is_active,
+    is_layer,
+    is_log,
+    log_name,
+    stem,
+)
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.mcap.statistics import stated_span, time_span
 
 _DAY = re.compile(r"\d{4}/\d\d/\d\d")
 _DAYS = "[0-9]*/[0-9]*/[0-9]*/*"
@@ -105,7 +114,10 @@ def find_timed_files(
     files = []
     for path in find_with_layers(paths):
         try:
-            span = time_span(path)
+            stated = stated_span(path)
+            span = stated[0] if stated is not None else time_span(path)
+            if span is None and stated is None:
+                losses += _cut_off(path, "and nothing of it is whole")
             if span is None or (start is not None and span[1] < start):
                 continue
             # What ends in the span may be logged later, so only the start of a log excludes it.
@@ -115,8 +127,18 @@ def find_timed_files(
         except (LogError, OSError) as error:
             losses.append(str(error))
             continue
+        if stated is None:
+            losses += _cut_off(path, "read up to the last whole chunk")
         files.append(TimedFile(path, *span, size, log_name(path).layer))
     return sorted(files, key=lambda file: (file.first, file.path.name))
+
+
+def _cut_off(path: Path, what: str) -> list[str]:
+    """Say that a file was cut off; nothing of one that is being written, or is read elsewhere."""
+    if is_active(path) or log_name(path).layer == REVIEW_LAYER:
+        return []
+    with LogFile(path) as log:
+        return [] if log.complete else [f"{path}: unfinished, {what}"]
 
 
 def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:

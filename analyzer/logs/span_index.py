@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.listing import UNSURE, KnownFolder, ListedLog, Listing
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import CATALOG_INDEX
+from hearthlog.schemas.logs.files import CATALOG_INDEX, log_readers
 from hearthlog.schemas.storage.byte_ranges import is_local, open_file, store_errors
 from hearthlog.schemas.storage.new_files import replaced_file
 
@@ -120,7 +120,8 @@ def write_index(folder: Path, listing: Listing, spans: NDArray[np.void]) -> None
     texts = _joined(logs_of), _joined(names[log] for log in order)
     head = _HEAD.pack(_MAGIC, len(rows), len(order), *map(len, texts))
     data = b"".join([head, np.array(rows, _FOLDER).tobytes(), spans[order].tobytes(), *texts])
-    with replaced_file(folder / CATALOG_INDEX) as temporary, temporary.open("wb") as stream:
+    put = replaced_file(folder / CATALOG_INDEX, readers=log_readers(folder))
+    with put as temporary, temporary.open("wb") as stream:
         stream.writelines([data, hashlib.sha256(data).digest()])
 
 

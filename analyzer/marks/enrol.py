@@ -36,7 +36,7 @@ from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import CUT, ENROLLED, SUFFIX, find_logs, is_log, log_path
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.schemas.storage.new_files import new_file
+from hearthlog.schemas.storage.new_files import new_file, private_folder
 from hearthlog.schemas.times import NANOSECONDS
 
 SECONDS = 5.0  # of a microphone, by default
@@ -181,7 +181,7 @@ def enrol_log(  # noqa: PLR0913, PLR0917
     stamps, energies = _frames(selection.logs, microphone, start, end)
     _check_sound(label, energies)
     path = cut_path(home, label, int(stamps[0]))
-    path.parent.mkdir(parents=True, exist_ok=True)
+    private_folder(path.parent)
     topics = {topic(microphone, "features"), topic(microphone, "info")}
     merge_logs(selection.only(topics), path, latched=True)
     return _marked(path, microphone, label, stamps)
@@ -247,7 +247,7 @@ def _enrol(
             if not len(stamps):
                 continue
             path = home / ENROLLED / log.relative_to(folder)
-            path.parent.mkdir(parents=True, exist_ok=True)
+            private_folder(path.parent)
             with new_file(path) as temporary:
                 shutil.copyfile(log, temporary)
             enrolled.append(_marked(path, microphone.name, label, stamps))

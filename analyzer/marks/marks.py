@@ -24,7 +24,7 @@ from hearthlog.schemas.messages.topics import (
     review_labelling,
     scenario_name,
 )
-from hearthlog.schemas.storage.new_files import locked_folder, replaced_file
+from hearthlog.schemas.storage.new_files import locked_folder, readers_of, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
@@ -279,7 +279,7 @@ def write_marks(  # noqa: PLR0913
             return path
         node = next((record.get("node", "") for record in select([log]).metadata), "")
         metadata = provenance(node, log=stem(log) + SUFFIX)
-        with replaced_file(path) as temporary:
+        with replaced_file(path, readers=readers_of(log)) as temporary:
             temporary.write_bytes(layer_bytes(path.name, spans, metadata))
     return path
 

@@ -45,7 +45,7 @@ from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.storage.new_files import new_file, replaced_file
+from hearthlog.schemas.storage.new_files import new_file, readers_of, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 _CHUNK_SPAN = 60 * NANOSECONDS  # who wants segments alone reads the minutes in which some end
@@ -226,7 +226,7 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     segments = [segments.name for _, segments in topics]
     put = replaced_file if job.replaces else new_file
     try:
-        with put(job.layer) as temporary, temporary.open("xb") as out:
+        with put(job.layer, readers=readers_of(job.log)) as temporary, temporary.open("xb") as out:
             writer = LogStreamWriter(out, [topic for pair in topics for topic in pair])
             current = 0
             for minute, labels, decided in _by_minutes(labelled):

@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.labelling import (
     overlaid,
     unified,
 )
-from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import Spans, common, joined, one
 from hearthlog.analyzer.marks.formats.class_names import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
@@ -158,10 +158,7 @@ def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, 
         except LogError as error:
             home.lose(str(error))
             continue
-        if selection.unfinished and not selection.logs:
-            home.lose(f"{entry.path}: unfinished, and nothing of it is whole")
-        elif selection.unfinished:
-            home.lose(f"unfinished, read up to the last whole chunk: {entry.path}")
+        _lose_unfinished(home, entry, selection)
         for topic in (*gaps, *selection.topics_of(message_types.STREAM_INFO, ())):
             microphones |= {microphone_of(topic)} - {""}
         nodes |= dict.fromkeys(record["node"] for record in selection.metadata if "node" in record)
@@ -188,11 +185,20 @@ def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
             continue  # it is not of these days
 
 
+def _lose_unfinished(home: HomeData, entry: HomeLog, selection: Selection) -> None:
+    if selection.unfinished and not selection.logs:
+        home.lose(f"{entry.path}: unfinished, and nothing of it is whole")
+    elif selection.unfinished:
+        home.lose(f"unfinished, read up to the last whole chunk: {entry.path}")
+
+
 def _segments(
     home: HomeData, entry: HomeLog, topics: set[str], limits: tuple[int, int]
 ) -> Iterator[Columns]:
     try:
         selection = select([entry.path])
+        if entry.layer:
+            _lose_unfinished(home, entry, selection)
         segments = topics.intersection(selection.topics_of(message_types.SEGMENT, _FIELDS))
         for topic in topics & selection.channels.keys() - segments:
             kinds = {

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import private_folder, replaced_file
 
 _FOLDER = "judgements"
 _LARGEST = 1 << 16  # bytes
@@ -67,6 +67,11 @@ def judgement_path(folder: Path, sha256: str) -> Path:
     return folder / _FOLDER / f"{sha256}.json"
 
 
+def judgements_of(folder: Path) -> list[Path]:
+    """List the files of the judgements of a folder of models."""
+    return list((folder / _FOLDER).glob("*.json"))
+
+
 def read_judgement(folder: Path, sha256: str) -> Judgement | None:
     """Read the judgement of a model.
 
@@ -109,7 +114,7 @@ def write_judgement(folder: Path, judgement: Judgement) -> None:
     """
     path = judgement_path(folder, judgement.model)
     try:
-        path.parent.mkdir(exist_ok=True)
+        private_folder(path.parent)
         with replaced_file(path) as temporary:
             temporary.write_text(judgement.model_dump_json(indent=2))
     except (LogError, OSError) as error:

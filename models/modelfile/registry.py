@@ -373,6 +373,7 @@ def _earlier(folder: Path) -> list[str]:
 
 def _write_history(folder: Path, names: list[str]) -> None:
     temporary = folder / f".{_HISTORY}.tmp"
+    temporary.touch(mode=0o600)
     with temporary.open("w") as stream:
         stream.writelines(f"{name}\n" for name in names[-_KEPT:])
         stream.flush()

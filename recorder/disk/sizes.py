@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+_LARGEST = 10**18
 
 
 def parse_size(value: object) -> int:
@@ -23,8 +24,11 @@ def parse_size(value: object) -> int:
     """
     match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,15})?) ?([kmgt]?)b?", str(value).lower())
     if match is None:
-        raise ValueError("say how many bytes, such as 500M or 20G")
-    return int(float(match[1]) * _UNITS[match[2]])
+        raise ValueError(f"{str(value)[:40]!r} is no size; say how many bytes, such as 500M or 20G")
+    size = int(float(match[1]) * _UNITS[match[2]])
+    if size > _LARGEST:
+        raise ValueError("more than any disk has; say how many bytes, such as 500M or 20G")
+    return size
 
 
 def size_text(size: int) -> str:

@@ -1,7 +1,9 @@
 """Thinning: what old logs hold frame by frame is dropped before they are deleted as a whole."""
 
 import fcntl
+import stat
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -80,6 +82,8 @@ def thin(log: Path, step: int) -> bool:
             return False
         try:
             thin_log(log, copy, step)
+            with suppress(OSError):  # a disk without rights
+                copy.chmod(stat.S_IMODE(log.stat().st_mode))
             sync_file(copy)
             with locked_folder(log.parent):  # a reviewer that writes a layer holds it
                 if step > _STATISTICS and is_reviewed(log):

@@ -15,9 +15,13 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.judgement import judgement_path, read_judgement
+from hearthlog.models.modelfile.judgement import (
+    judgement_path,
+    judgements_of,
+    read_judgement,
+)
 from hearthlog.models.modelfile.modelfile import load_model, name_and_digest
-from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+from hearthlog.models.modelfile.registry import DEFAULT_MODEL, is_starter
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.memory import give_back
@@ -101,6 +105,8 @@ class ModelWatch:
         self._judged: FileIdentity = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
+        if not scenario:
+            _warn_if_changed(path, self._last)
         self._results: SimpleQueue[Loaded | str | None] = SimpleQueue()  # None: that in use
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
@@ -245,6 +251,18 @@ def _warn_if_simulated(model: Model) -> None:
         say(
             f"model {model.name} has learned from simulated sounds alone and is mostly wrong about "
             "real ones, however sure it is; train one from recordings"
+        )
+
+
+def _warn_if_changed(path: Path, champion: Model) -> None:
+    """Say that the file of a champion is not the one that was promoted, which left a judgement."""
+    is_kept = path.is_symlink() and judgements_of(path.parent)
+    is_known = is_starter(champion.name, champion.sha256)
+    if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
+        say(
+            f"model {champion.name} is not the file that was promoted: it was replaced, or the "
+            "disk has changed a bit of it; it labels all the same. Copy it back from a backup, or "
+            f"`hearthlog models promote {champion.name}` judges what is there"
         )
 
 

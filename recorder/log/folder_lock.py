@@ -127,6 +127,20 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
             raise LogError(f"{folder}: cannot be written ({error.strerror})") from error
 
 
+def check_writable(folder: Path) -> None:
+    """Check whether a folder can be written to, or made, and leave no trace.
+
+    Raises
+    ------
+    LogError
+        If it cannot be.
+    """
+    folder = folder.absolute()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise LogError(f"{folder}: cannot be written ({there} does not allow it)")
+
+
 class NodeLock(NamedTuple):
     """The lock of a node, as it was found in a folder.
 

@@ -13,6 +13,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.formats import OTHER_SUFFIXES, not_mcap
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
+from hearthlog.schemas.storage.new_files import readers_of
 from hearthlog.schemas.storage.regular_file import may_be_regular, open_regular
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -99,6 +100,20 @@ def free_log_path(root: Path, node: str, start: int) -> Path:
             break
         path = first.with_name(f"{stem(first)}_{number}{SUFFIX}")  # '_' is behind '.'
     return path
+
+
+def log_readers(folder: Path) -> int:
+    """Return the rights of others to read new logs in a folder, as `readers_of` does.
+
+    Parameters
+    ----------
+    folder : Path
+        Of logs of a recorder: those of the folder of the latest year say it.
+    """
+    if not (is_local(folder) and folder.is_dir()):
+        return 0
+    years = [each for each in folder.iterdir() if re.fullmatch(r"\d{4}", each.name, re.ASCII)]
+    return readers_of(max(years)) if years else 0
 
 
 def active_path(path: Path) -> Path:

@@ -1,12 +1,17 @@
-"""New files: whole or not there at all, on this machine and in a store."""
+"""New files: whole or not there at all, on this machine and in a store.
+
+They are the account's alone, whatever its umask is: what comes from a home is private. Those that
+belong to a log may be read by whoever may read that log.
+"""
 
 import fcntl
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +19,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 
 _AT_ONCE = 8  # files that are synced: one after the other takes a disk milliseconds for each
+_READERS = stat.S_IRGRP | stat.S_IROTH
 
 
 def sync_file(path: Path) -> None:
@@ -27,6 +33,53 @@ def sync_folder(folder: Path) -> None:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def readers_of(path: Path) -> int:
+    """Return the rights of others to read a file or a folder; none where it is not known."""
+    try:
+        return path.stat().st_mode & _READERS if is_local(path) else 0
+    except OSError:
+        return 0
+
+
+def private_folder(path: Path, *, readers: int = 0) -> None:
+    """Make a folder, and those around it, for this account alone; those that are there stay.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine.
+    readers : int, optional
+        Rights of others to read what is in it, as of `readers_of`.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
+    """
+    if path.is_dir():
+        return
+    if not path.parent.is_dir():
+        private_folder(path.parent, readers=readers)
+    path.mkdir(mode=0o700, exist_ok=True)
+    _give(path, 0o700 | readers | readers >> 2)
+
+
+def _give(path: Path, mode: int) -> None:
+    """Set the rights of what was made, which root gives to whom the folder around it belongs to."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):  # a disk without rights
+            os.fchmod(descriptor, mode)
+        around, made = path.parent.stat(), os.fstat(descriptor)
+        # A file with another name could be one that somebody linked here to be given it.
+        is_ours = stat.S_ISDIR(made.st_mode) or made.st_nlink == 1
+        if os.geteuid() == 0 and around.st_uid != 0 and made.st_uid == 0 and is_ours:
+            with suppress(OSError):
+                os.fchown(descriptor, around.st_uid, around.st_gid)
     finally:
         os.close(descriptor)
 
@@ -89,7 +142,7 @@ def _exists(path: Path) -> LogError:
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[Path]:
+def new_file(path: Path, *, readers: int = 0) -> Iterator[Path]:
     """Make a file under a temporary name, and give it its own if the block raises no error.
 
     For a path in a store the temporary file is one of this machine, and is put there at the end.
@@ -101,6 +154,8 @@ def new_file(path: Path) -> Iterator[Path]:
     ----------
     path : Path
         On this machine, or a `upath.UPath` of a store.
+    readers : int, optional
+        Rights of others to read it, as of `readers_of`.
 
     Yields
     ------
@@ -113,19 +168,23 @@ def new_file(path: Path) -> Iterator[Path]:
         If there is such a file already, or if it cannot be written.
     """
     check_new(path)
-    put = _put_in_place if is_local(path) else _put_in_store
-    with put(path, new=True) as temporary:
+    put = (
+        _put_in_place(path, readers, new=True) if is_local(path) else _put_in_store(path, new=True)
+    )
+    with put as temporary:
         yield temporary
 
 
 @contextmanager
-def replaced_file(path: Path) -> Iterator[Path]:
+def replaced_file(path: Path, *, readers: int | None = None) -> Iterator[Path]:
     """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
 
     Parameters
     ----------
     path : Path
         On this machine, or a `upath.UPath` of a store.
+    readers : int, optional
+        Rights of others to read it, as of `readers_of`; by default those of the one that is there.
 
     Yields
     ------
@@ -137,8 +196,11 @@ def replaced_file(path: Path) -> Iterator[Path]:
     LogError
         If it cannot be written.
     """
-    put = _put_in_place if is_local(path) else _put_in_store
-    with put(path, new=False) as temporary:
+    rights = readers_of(path) if readers is None else readers
+    put = (
+        _put_in_place(path, rights, new=False) if is_local(path) else _put_in_store(path, new=False)
+    )
+    with put as temporary:
         yield temporary
 
 
@@ -163,10 +225,13 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     check_new(path)
     with _temporary(path) as temporary:
-        temporary.mkdir()
+        temporary.mkdir(mode=0o700)
         yield temporary
+        for file in temporary.iterdir():
+            _give(file, 0o600)
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             list(pool.map(sync_file, temporary.iterdir()))
+        _give(temporary, 0o700)
         sync_folder(temporary)
         path.mkdir()  # the name is ours now; only an empty folder is replaced
         temporary.replace(path)
@@ -174,9 +239,10 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
+def _put_in_place(path: Path, readers: int, *, new: bool) -> Iterator[Path]:
     with _temporary(path) as temporary:
         yield temporary
+        _give(temporary, 0o600 | readers)
         sync_file(temporary)
         if new:
             _name(temporary, path)

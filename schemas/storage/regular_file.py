@@ -31,6 +31,24 @@ def open_regular(path: Path) -> int:
     return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
 
 
+def exposed_secret(path: Path) -> str:
+    """Return the line that says that everybody may read a file of secrets; empty if that is not so.
+
+    Parameters
+    ----------
+    path : Path
+        If it cannot be looked at, nothing is said.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return ""
+    if not (stat.S_ISREG(mode) and mode & (stat.S_IROTH | stat.S_IWOTH)):
+        return ""
+    what = "read" if mode & stat.S_IROTH else "change"
+    return f"{path}: holds secrets, and everybody on this machine may {what} it: chmod 600 {path}"
+
+
 def may_be_regular(path: Path) -> bool:
     """Tell whether a path is that of a regular file, or of one whose kind cannot be found out.
 

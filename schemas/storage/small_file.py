@@ -1,6 +1,7 @@
 """Files that people write or pass on: read whole within limits, or refused with one line."""
 
 import os
+import re
 import tomllib
 from pathlib import Path
 from typing import IO, Any
@@ -10,6 +11,32 @@ from hearthlog.schemas.storage.byte_ranges import is_local
 from hearthlog.schemas.storage.regular_file import open_regular
 
 _TOML_LIMIT = 1 << 20
+_LINE = re.compile(r"at line (\d+)")
+_HINTS = (  # by what the parser says, and the line it stopped at
+    (
+        re.compile(r"overwrite|twice|redefine|mutate|duplicate", re.IGNORECASE),
+        "; a key or table is given twice",
+    ),
+    (
+        re.compile(r"\n.*\"[^\"]*\\"),
+        "; a text with a backslash stands in single quotes: 'C:\\logs'",
+    ),
+    (
+        re.compile(r"Invalid value"),
+        '; a text stands in quotes, as node = "home"; else true, false, a number',
+    ),
+    (
+        re.compile(
+            r"Expected '='|Invalid (initial )?(character|statement)|after (a )?(key|statement)"
+        ),
+        "; each line is KEY = VALUE, [TABLE] or # COMMENT",
+    ),
+    (
+        re.compile(r"Unclosed|Unterminated|newline|Illegal character '\\n'", re.IGNORECASE),
+        "; a quote or a bracket is not closed",
+    ),
+)
+_UTF_16 = {b"\xff\xfe", b"\xfe\xff"}
 _DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of their number
 
 
@@ -76,15 +103,33 @@ def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, A
     data = read_whole(path, what, _TOML_LIMIT, error)
     content: dict[str, Any] = {}
     try:
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")  # editors of Windows begin a file with a mark
         keys = (line for line in text.split("\n") if not line.lstrip().startswith("#"))
         deep = any(line.count(".") > _DEEPEST for line in keys)
         if not deep:
             content = tomllib.loads(text)
+    except UnicodeDecodeError as reason:
+        line = data.count(b"\n", 0, reason.start) + 1
+        place = "it is UTF-16" if data[:2] in _UTF_16 else f"at line {line}"
+        raise error(
+            f"{path}: cannot be read as TOML (no UTF-8: {place}); save it as UTF-8"
+        ) from reason
     except ValueError as reason:
-        raise error(f"{path}: cannot be read as TOML ({str(reason)[:200]})") from reason
+        raise error(f"{path}: cannot be read as TOML ({_toml_problem(text, reason)})") from reason
     except RecursionError:
         deep = True
     if deep:
         raise error(f"{path}: cannot be read as TOML (it is nested too deeply)")
     return content
+
+
+def _toml_problem(text: str, reason: ValueError) -> str:
+    """Say what the parser refuses, where, and what to write."""
+    last = f"at line {text.rstrip().count(chr(10)) + 1}, the last one"
+    problem = str(reason).replace("at end of document", last)[:200]
+    found = _LINE.search(problem)
+    lines = text.split("\n")
+    line = lines[int(found[1]) - 1] if found and int(found[1]) <= len(lines) else ""
+    return problem + next(
+        (hint for words, hint in _HINTS if words.search(f"{problem}\n{line}")), ""
+    )

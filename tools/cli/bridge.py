@@ -28,11 +28,12 @@ def bridge(
     The recorder takes no notice: only its logs are read. What cannot be told is tried again.
     """
     from hearthlog.analyzer.bridge.home import Home
-    from hearthlog.analyzer.bridge.outputs import open_outputs
+    from hearthlog.analyzer.bridge.outputs import exposed_files, open_outputs
     from hearthlog.analyzer.bridge.run import Bridge
     from hearthlog.analyzer.bridge.saying import Saying
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.bridge.state_folder import state_folder
+    from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.timezone import time_zone
 
     settings, own = load_bridge_settings(config)
@@ -41,6 +42,8 @@ def bridge(
         signal.signal(number, lambda *_: stop.set())
     home = Home(logs or settings.output, settings.node, time_zone(settings.timezone))
     say = Saying(tell)
+    for line in [*exposed_files(own), *exposed_passwords(settings, config)]:
+        say(line)
     outputs, since = open_outputs(own, home, state_folder(own.state, home.folder), say)
     if not outputs:
         wrong_use(

@@ -33,7 +33,8 @@ def catalog(
     ],
     *,
     workers: Annotated[
-        int, typer.Option(min=1, help="Processes; worth it where thousands of files are new.")
+        int,
+        typer.Option(min=1, max=256, help="Processes; worth it where thousands of files are new."),
     ] = 1,
     scheduler: Scheduler = None,
     as_json: Json = False,

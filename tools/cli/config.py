@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.tools.cli.text import print_lines
+from hearthlog.tools.cli.text import print_lines, tell
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -42,17 +42,28 @@ def show(
 def check(
     file: Annotated[Path, typer.Argument(help="Configuration, a TOML file.")],
 ) -> None:
-    """Check a configuration before a recorder is started with it.
+    """Check a configuration before a recorder or a bridge is started with it.
 
-    Exit status 2: it is wrong; 1: its model, or its folder of logs, cannot be used.
+    Exit status 2: it is wrong; 1: a model, a folder or a file that it names cannot be used; 3:
+    others may read its secrets, or a file may be a credential of the service.
     """
+    from hearthlog.analyzer.bridge.outputs import exposed_files, output_problems
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
-    from hearthlog.recorder.recording import check_recording
+    from hearthlog.recorder.config import exposed_passwords
+    from hearthlog.recorder.recording import recording_problems
     from hearthlog.tools.cli.record import with_model
 
-    settings, _ = load_bridge_settings(file)
-    check_recording(with_model(settings))
+    settings, bridge = load_bridge_settings(file)
+    errors = recording_problems(with_model(settings))
+    problems, warnings = output_problems(bridge)
+    warnings += [*exposed_passwords(settings, file), *exposed_files(bridge)]
+    for line in [*map(str, errors), *problems, *warnings]:
+        tell(line)
+    if errors or problems:
+        raise typer.Exit(max([1, *(error.status for error in errors)]))
     print(f"{file}: can be used")
+    if warnings:
+        raise typer.Exit(3)
 
 
 @config.command()

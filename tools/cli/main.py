@@ -1,6 +1,7 @@
 """The command `hearthlog`: its verbs, and how errors reach the user."""
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -32,6 +33,13 @@ VERBS = (
 )
 _MODULES = {"resume": "pause"}  # of a verb that shares one
 _NAMED = 10  # of many files with the same fault
+_WORDS = (  # for those of the library that reads options
+    (re.compile(r"Input should be greater than or equal to "), "it must be at least "),
+    (re.compile(r"Input should be less than or equal to "), "it must be at most "),
+    (re.compile(r"Input should be a valid integer, .*"), "it must be a whole number"),
+    (re.compile(r"Input should be a valid number, .*"), "it must be a number"),
+    (re.compile(r"Input should be (a valid )?"), "it must be "),
+)
 _debug = {"on": False}
 
 
@@ -78,8 +86,11 @@ def _options(
 
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
+    verbs = _wanted_verbs()
+    if "install_service" not in verbs:  # units are for everybody to read
+        os.umask(0o077)  # what comes from a home is private
     with _ended_by_signals(), checked_output(), _warnings_shown() as warned:
-        app = make_app(_wanted_verbs())
+        app = make_app(verbs)
         status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
@@ -132,7 +143,8 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
-        tell(_message(error))
+        for line in getattr(error, "lines", None) or [_message(error)]:
+            tell(line)
         return error.status if isinstance(error, HearthlogError) else 1
 
 
@@ -140,6 +152,8 @@ def _usage_text(error: typer.TyperException) -> str:
     context = getattr(error, "ctx", None)
     verb = "hearthlog" if context is None else context.command_path
     text = error.format_message().rstrip(".").replace(": Value error,", ":")
+    for form, words in _WORDS:
+        text = form.sub(words, text)
     return f"{text[0].lower()}{text[1:]}; see `{verb} --help`"
 
 

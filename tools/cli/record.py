@@ -128,7 +128,7 @@ def record(
     changed. Exit status 3: there were gaps, or a file was damaged, left out, or began before the
     end of another, or a log left by an earlier recorder was damaged, or a new model was refused.
     """
-    from hearthlog.recorder.config import NO_MODEL, load_settings
+    from hearthlog.recorder.config import NO_MODEL, exposed_passwords, load_settings
     from hearthlog.recorder.recording import record_files
     from hearthlog.tools.cli.progress import share_done
 
@@ -149,6 +149,8 @@ def record(
     load = partial(load_settings, config, _given(given), microphone)
     configured = load()
     settings = with_model(configured)
+    for line in exposed_passwords(settings, config):
+        tell(line)
     os.umask(_HIDDEN[settings.readable_by])
     losses: list[str] = []
     stop = Flag()

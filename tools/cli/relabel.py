@@ -28,7 +28,8 @@ def relabel(
         ),
     ],
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; as many as there are cores by default.")
+        int | None,
+        typer.Option(min=1, max=256, help="Processes; as many as there are cores by default."),
     ] = None,
     scheduler: Scheduler = None,
     as_json: Json = False,

@@ -179,10 +179,12 @@ def _print_next(verdict: "Verdict", output: Path) -> None:
 
 def _next_model(name: str) -> Path:
     """Name the next model of the home or of a scenario, in the folder of models, which is made."""
+    from hearthlog.schemas.storage.new_files import private_folder
+
     folder = models_folder()
     numbers = (path.stem.removeprefix(f"{name}-") for path in folder.glob(f"{name}-*.safetensors"))
     number = max((int(text) for text in numbers if text.isdecimal()), default=0) + 1
-    folder.mkdir(exist_ok=True)
+    private_folder(folder)
     return folder / f"{name}-{number}.safetensors"
 
 

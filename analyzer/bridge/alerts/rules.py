@@ -1,6 +1,7 @@
 """The rules of alerts: each a table `[[bridge.alert]]` of the configuration."""
 
 import hashlib
+import re
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,8 @@ LONGEST_PAUSE = 10 * MINUTE  # within an event
 _MARGIN = 5 * MINUTE
 _PAUSE = 10 * SECOND  # between the segments of one event, as in the report
 _NIGHT_ENDS = 7 * 60
+_LONGEST_NAME = 60  # characters
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _TWO_DAYS = 50 * 3600 * SECOND  # with what a change of the clock adds
 
 
@@ -46,17 +49,28 @@ def _check_hours(text: str) -> str:
         raise ValueError(str(error)) from error
 
 
-Window = Annotated[int, _within(MINUTE, _LONGEST_WINDOW, "a minute to seven days")]
-Pause = Annotated[int, _within(0, LONGEST_PAUSE, "ten minutes at most")]
-TimeOfDay = Annotated[int, BeforeValidator(_read_minute)]
+def _check_name(name: str) -> str:
+    if not 0 < len(name) <= _LONGEST_NAME or _CONTROL.search(name):
+        raise ValueError(
+            f"{name[:_LONGEST_NAME]!r} is no name of a rule; write 1 to {_LONGEST_NAME} characters "
+            "in one line, such as Coughing at night"
+        )
+    return name
+
+
+Window = Annotated[
+    int, _within(MINUTE, _LONGEST_WINDOW, "a minute to seven days"), Field(examples=["1h"])
+]
+Pause = Annotated[int, _within(0, LONGEST_PAUSE, "ten minutes at most"), Field(examples=["10s"])]
+TimeOfDay = Annotated[int, BeforeValidator(_read_minute), Field(examples=["07:30"])]
 _Hours = Annotated[str, AfterValidator(_check_hours)]
 
 
 class _Rule(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    name: str = Field(
-        min_length=1, max_length=60, pattern=r"^[^\x00-\x1f\x7f]+$", description="Shown; unique."
+    name: Annotated[str, AfterValidator(_check_name)] = Field(
+        examples=["Coughing at night"], description="Shown; unique."
     )
     cooldown: Window = Field(default="1h", validate_default=True, description="Between two rings.")
     quiet_hours: list[_Hours] = Field(

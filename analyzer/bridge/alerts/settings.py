@@ -11,5 +11,7 @@ class DeliverySettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     urls_file: Path | None = Field(
-        default=None, description="Addresses as Apprise reads them, one a line; they are secrets."
+        default=None,
+        examples=["/etc/hearthlog/alert-urls"],
+        description="Addresses as Apprise reads them, one a line; they are secrets.",
     )

@@ -12,10 +12,10 @@ from typing import Any, Protocol
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.extras import remedy
+from hearthlog.schemas.storage.regular_file import exposed_secret
 from hearthlog.schemas.storage.small_file import read_whole
 
 _LIMIT = 1 << 16  # bytes of the file
-_OTHERS = 0o004
 _HOST = re.compile(r"localhost|\[[0-9a-f:.]+\]|[\w-]+(\.[\w-]+)+", re.ASCII | re.IGNORECASE)
 _FORM = "%(thread)d %(message)s"  # other targets are told at the same time
 _CODE = re.compile(r"\berror=(\d{3})\b")
@@ -142,8 +142,8 @@ def find_targets(file: Path, say: Callable[[str], None]) -> tuple[list[AppriseTa
         return [], [str(error)]
     except ModuleNotFoundError as error:
         return [], [f"{error.name} is not installed; {remedy(error.name or '')}"]
-    if file.stat().st_mode & _OTHERS:
-        say(f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}")
+    if line := exposed_secret(file):
+        say(line)
     # Nothing is loaded from the disk, and nothing written there.
     asset = apprise.AppriseAsset(
         plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False

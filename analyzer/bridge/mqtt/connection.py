@@ -31,6 +31,7 @@ _QOS = 1
 _SHORT_SECONDS = 15.0  # so short a connection is no good one
 _TAKEN_OVER = 0x8E
 _LONGEST_PASSWORD = 4096  # bytes
+_LARGEST_CERTIFICATE = 8 << 20  # bytes; the list of a machine has half a megabyte
 
 Say = Callable[[str], None]
 Received = Callable[[mqtt.MQTTMessage], None]
@@ -179,7 +180,7 @@ class Connection:
         client.max_queued_messages_set(_QUEUED)
         client.reconnect_delay_set(_FIRST_PAUSE, _LONGEST_PAUSE)
         if settings.user:
-            client.username_pw_set(settings.user, _password(settings))
+            client.username_pw_set(settings.user, read_password(settings))
         if settings.tls:
             self._use_tls(client, settings)
         client.on_connect = self._on_connect
@@ -193,22 +194,8 @@ class Connection:
         return client
 
     def _use_tls(self, client: mqtt.Client, settings: MqttSettings) -> None:
-        names = "ca_file", "certificate_file", "key_file"
-        ca, certificate, key = (getattr(settings, name) for name in names)
-        try:
-            context = ssl.create_default_context(cafile=ca)
-            if ca is not None:
-                # Python 3.13 wants extensions that an authority made by hand, as the manual of
-                # Mosquitto does it, leaves out.
-                context.verify_flags &= ~ssl.VERIFY_X509_STRICT
-            if certificate is not None:
-                context.load_cert_chain(certificate, key)
-        except (OSError, ValueError) as error:
-            files = ", ".join(str(path) for path in (ca, certificate, key) if path is not None)
-            what = getattr(error, "strerror", None) or error
-            raise BridgeError(f"bridge.mqtt: {files}: no certificates of use ({what})") from error
-        client.tls_set_context(context)
-        if certificate is None:
+        client.tls_set_context(tls_context(settings))
+        if settings.certificate_file is None:
             self._hint = "; does it want a client certificate? see certificate_file and key_file"
 
     def _publish(self, topic: str, payload: str, *, retain: bool) -> bool:
@@ -297,7 +284,46 @@ def _port(settings: MqttSettings) -> int:
     return settings.port or (8883 if settings.tls else 1883)
 
 
-def _password(settings: MqttSettings) -> str | None:
+def tls_context(settings: MqttSettings) -> ssl.SSLContext:
+    """Load the certificates of a connection.
+
+    Raises
+    ------
+    BridgeError
+        If one of the files cannot be used.
+    """
+    names = "ca_file", "certificate_file", "key_file"
+    ca, certificate, key = paths = [getattr(settings, name) for name in names]
+    for path in paths:
+        if path is not None:
+            read_whole(path, "certificate", _LARGEST_CERTIFICATE, BridgeError)  # a pipe would hang
+    try:
+        context = ssl.create_default_context(cafile=ca)
+        if ca is not None:
+            # Python 3.13 wants extensions that an authority made by hand, as the manual of
+            # Mosquitto does it, leaves out.
+            context.verify_flags &= ~ssl.VERIFY_X509_STRICT
+        if certificate is not None:
+            context.load_cert_chain(certificate, key, password=_no_password)
+    except (OSError, ValueError) as error:
+        files = ", ".join(str(path) for path in paths if path is not None)
+        what = getattr(error, "strerror", None) or error
+        raise BridgeError(f"bridge.mqtt: {files}: no certificates of use ({what})") from error
+    return context
+
+
+def _no_password() -> str:
+    raise ValueError("the key is encrypted; write it anew without a password")
+
+
+def read_password(settings: MqttSettings) -> str | None:
+    """Read the password of the user of a broker; None if none is configured.
+
+    Raises
+    ------
+    BridgeError
+        If its file cannot be used.
+    """
     if settings.password_file is None:
         return None
     path = secret_path(settings.password_file)

@@ -10,9 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hearthlog.analyzer.logs.catalog.file import read_table, write_table
-from hearthlog.schemas.logs.files import CATALOG
+from hearthlog.schemas.logs.files import CATALOG, log_readers
 from hearthlog.schemas.storage.byte_ranges import is_local, map_logs, store_errors
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import private_folder, replaced_file
 
 _SUFFIX = ".parquet"
 _LONGEST = 150  # bytes of a home's name in that of its part
@@ -93,13 +93,14 @@ def write_parts(
         if catalog.is_file():  # an older one
             catalog.unlink()
         if is_local(catalog):
-            catalog.mkdir(exist_ok=True)
+            private_folder(catalog, readers=log_readers(folder))
         there = set(_names(catalog))
         for gone in there - parts.keys():
             (catalog / gone).unlink(missing_ok=True)
     for name, table in parts.items():
         if name not in there or table != before.get(name):
-            with replaced_file(catalog / name) as temporary, temporary.open("wb") as stream:
+            put = replaced_file(catalog / name, readers=log_readers(folder))
+            with put as temporary, temporary.open("wb") as stream:
                 write_table(table, stream)
 
 

@@ -1,0 +1,269 @@
+"""What is wrong in a configuration, each slip in a line that says what to write instead."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ValidationError
+
+from hearthlog.recorder.config_origins import Key, Origins
+from hearthlog.recorder.errors import ConfigurationError
+
+Schema = Mapping[str, Any]
+
+_LONGEST = 40  # characters of a value that are shown
+_MOST = 100  # slips that are said
+_UNITS = {"s": 1, "sec": 1, "m": 60, "min": 60, "h": 3600, "d": 86_400}
+_MEASURED = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ?([a-zA-Z%]{1,8})")
+_SECONDS = re.compile(r"seconds|duration")
+_PLURALS = {"array": "lists", "integer": "whole numbers", "number": "numbers", "string": "texts"}
+
+
+class _Place(NamedTuple):
+    """Where in a configuration something is wrong.
+
+    Attributes
+    ----------
+    key : Key
+        As the file has it.
+    about : Schema
+        Of the value; empty if it is unknown.
+    table : Schema
+        Of the innermost table around it.
+    name : str
+        The innermost key of a table that is described; the value may be one element of its value.
+    named : Schema
+        Of that key.
+    """
+
+    key: Key
+    about: Schema
+    table: Schema
+    name: str
+    named: Schema
+
+
+def configuration_error(
+    error: ValidationError,
+    origins: Origins,
+    model: type[BaseModel],
+    table: Key = (),
+    others: Mapping[str, type[BaseModel]] | None = None,
+) -> ConfigurationError:
+    """Describe everything that is wrong, a line for each slip.
+
+    Parameters
+    ----------
+    error : ValidationError
+    origins : Origins
+        Of what was validated.
+    model : type of BaseModel
+        What it was validated as.
+    table : Key, optional
+        Where in the file that is.
+    others : mapping of str to type of BaseModel, optional
+        Other tables of the file, by what is written to begin them, whose keys may have been meant.
+    """
+    schema = model.model_json_schema()
+    unknown: list[str] = []
+    rest: list[tuple[Key, str]] = []
+    meant: set[Key] = set()
+    for each in error.errors(include_url=False):
+        place = _find(schema, tuple(each["loc"]))
+        key = (*table, *place.key)
+        where = origins.place(key)
+        if each["type"] == "extra_forbidden":
+            near, words = _unknown_key(str(key[-1]), place.table, others or {})
+            meant.add((*key[:-1], near))
+            unknown.append(f"{where}: unknown key {_dotted(key)!r}{words}")
+        else:
+            rest.append((key, f"{where}: {_dotted(key)}: {_words(each, place, key)}"))
+    # A key that is missing because it is misspelt is said once.
+    lines = [*unknown, *(line for key, line in rest if key not in meant)]
+    more = [f"{origins.path}: {len(lines) - _MOST} more"] if len(lines) > _MOST else []
+    return ConfigurationError(*dict.fromkeys(lines[:_MOST]), *more)
+
+
+def _dotted(key: Key) -> str:
+    return ".".join(str(part) for part in key)
+
+
+def _find(root: Schema, location: Key) -> _Place:
+    """Follow the location of an error through a JSON schema; tags of unions are no keys."""
+    node = table = named = _resolved(root, root)
+    key: list[str | int] = []
+    name = ""
+    for part in location:
+        if part == "[key]":
+            continue
+        tags = node.get("discriminator", {}).get("mapping", {})
+        if part in tags:
+            node = _resolved(root, {"$ref": tags[part]})
+            continue
+        key.append(part)
+        if isinstance(part, int):
+            node = _resolved(root, node.get("items", {}))
+            continue
+        table = node
+        inner = node.get("properties", {}).get(part, node.get("additionalProperties", {}))
+        node = _resolved(root, inner if isinstance(inner, dict) else {})
+        if part in table.get("properties", {}):
+            name, named = part, node
+    return _Place(tuple(key), node, table, name, named)
+
+
+def _resolved(root: Schema, node: Schema) -> Schema:
+    """Return a schema without references, and without null as another choice."""
+    while True:
+        kinds = [each for each in node.get("anyOf", ()) if each.get("type") != "null"]
+        rest = {name: value for name, value in node.items() if name not in {"$ref", "anyOf"}}
+        if "$ref" in node:
+            node = {**root.get("$defs", {}).get(str(node["$ref"]).rpartition("/")[2], {}), **rest}
+        elif len(kinds) == 1:
+            node = {**kinds[0], **rest}
+        else:
+            return node
+
+
+def _unknown_key(
+    name: str, table: Schema, others: Mapping[str, type[BaseModel]]
+) -> tuple[str, str]:
+    """Return the key that was meant, and the words that say so; both empty if none is alike."""
+    known = table.get("properties", {})
+    if f"{name}_file" in known:
+        near = f"{name}_file"
+        return near, f"; write {near} = {_example(near, known[near])}, a file that holds it"
+    from difflib import get_close_matches  # noqa: PLC0415  not at each start
+
+    for head, model in others.items():
+        if name in model.model_json_schema()["properties"]:
+            return "", f"; it belongs {head}"
+    near = next(iter(get_close_matches(name.lower(), known, 1, 0.6)), "")
+    if near:
+        return near, f"; is {near} meant?"
+    return "", "; `hearthlog config schema` lists the keys" if known else ""
+
+
+def _words(error: Any, place: _Place, key: Key) -> str:
+    """Say what is wrong with a value, and what to write."""
+    kind, value, about = error["type"], error["input"], place.about
+    name = place.name
+    if kind in {"value_error", "assertion_error"}:
+        return str(error["msg"]).removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    if kind == "missing":
+        return f"is missing; write {name} = {_example(name, about)}"
+    if kind.startswith("union_tag"):
+        which = str(error["ctx"]["discriminator"]).strip("'")
+        tags = list(about.get("discriminator", {}).get("mapping", {}))
+        listed = ", ".join(json.dumps(tag) for tag in tags)
+        return f"{which} is one of {listed}; write {which} = {json.dumps(tags[0])}"
+    if problem := _problem_of_table(value, about, key, name):
+        return problem
+    if kind in {"too_long", "too_short"}:
+        limits = ("at least", "minItems"), ("at most", "maxItems")
+        counts = [f"{words} {about[limit]}" for words, limit in limits if limit in about]
+        return f"has {len(value)} entries; write {' and '.join(counts)}"
+    example = _example_of_value(name, value, place)
+    what = f"{_shown(value)} is not {_description(about)}"
+    return f"{what}; write {name} = {example}"
+
+
+def _problem_of_table(value: Any, about: Schema, key: Key, name: str) -> str:
+    """Say how the table is written that something else stands for; empty if it is no table."""
+    items = about.get("items", {})
+    head = _dotted(tuple(part for part in key if isinstance(part, str)))
+    if about.get("type") == "array" and ("$ref" in items or "oneOf" in items):
+        return f"write [[{head}]], with two brackets, above the keys of each {name}"
+    if "properties" in about:
+        is_many = isinstance(value, list)
+        once = "with one bracket, above its keys, once" if is_many else "and its keys below it"
+        return f"is a table; write [{head}] {once}"
+    return ""
+
+
+def _description(about: Schema) -> str:
+    """Describe the values that a key takes."""
+    if choices := about.get("enum", [about["const"]] if "const" in about else []):
+        return f"one of {', '.join(map(json.dumps, choices))}"
+    if "anyOf" in about:
+        return "a size in bytes"
+    kind, text = about.get("type"), "a text in quotes"
+    if kind in {"integer", "number"}:
+        return _description_of_number(about, "a whole number" if kind == "integer" else "a number")
+    if "maxLength" in about:
+        text += f" of at most {about['maxLength']} characters"
+    if kind == "array":
+        return f"a list of {_PLURALS.get(about.get('items', {}).get('type'), 'values')}"
+    if about.get("format") == "path":
+        return "a path in quotes"
+    return {"object": "a table of paths", "boolean": "true or false"}.get(str(kind), text)
+
+
+def _description_of_number(about: Schema, kind: str) -> str:
+    least = about.get("minimum", about.get("exclusiveMinimum"))
+    most = about.get("maximum", about.get("exclusiveMaximum"))
+    if least is None:
+        return kind if most is None else f"{kind} up to {most}"
+    return f"{kind} of at least {least}" if most is None else f"{kind} from {least} to {most}"
+
+
+def _example_of_value(name: str, value: Any, place: _Place) -> str:
+    """Return what to write instead of a value: that value, if only its form is wrong."""
+    about = place.named
+    kind, items = about.get("type"), about.get("items", {})
+    is_word = isinstance(value, str) and "://" not in value and 0 < len(value) <= _LONGEST
+    if kind == "array" and items.get("type") == "string" and is_word and place.about is about:
+        return json.dumps([value], ensure_ascii=False)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind == "string" and "format" not in about and "enum" not in about and is_number:
+        return json.dumps(str(value))
+    if kind in {"integer", "number"} and is_word and (found := _MEASURED.fullmatch(value)):
+        return f"{_without_unit(name, found, about)}, without a unit"
+    return _example(name, about)
+
+
+def _without_unit(name: str, found: re.Match[str], about: Schema) -> str:
+    """Return a number that was written with a unit, in seconds where the key counts them."""
+    number = float(found[1])
+    if _SECONDS.search(name):
+        number *= _UNITS.get(found[2].lower(), 1)
+    number = min(max(number, about.get("minimum", number)), about.get("maximum", number))
+    return f"{number:.10g}"
+
+
+def _example(name: str, about: Schema) -> str:
+    """Return an example of a value, as TOML."""
+    examples = [*about.get("examples", ()), about.get("default")]
+    for value in examples:
+        if value not in (None, "", [], {}):
+            return _toml(value)
+    return {
+        "integer": str(about.get("minimum", 1)),
+        "number": str(about.get("minimum", 1.0)),
+        "boolean": "true",
+        "array": '["text"]',
+        "object": f'{{{name} = "file"}}',
+    }.get(str(about.get("type")), '"file"' if about.get("format") == "path" else '"text"')
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_toml(each)}' for key, each in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _shown(value: Any) -> str:
+    """Show a value, but for what may be a secret: an address, or what is in a list or a table."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        text = "a number of more than 40 digits" if 1e40 <= abs(value) < math.inf else str(value)
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+    if isinstance(value, str) and "://" not in value:
+        return repr(value) if len(value) <= _LONGEST else f"{value[:_LONGEST]!r}…"
+    words = {list: "a list", dict: "a table", str: "an address", type(None): "null"}
+    return words.get(type(value), "a date or a time")
