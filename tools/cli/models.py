@@ -85,7 +85,8 @@ def compare(
     folder: _Folder = None,
     data: Annotated[Path | None, typer.Option(help=CLIPS)] = None,
     logs: Annotated[
-        Path | None, typer.Option(help="Folder of logs with review layers, or one log.")
+        Path | None,
+        typer.Option(help="Folder of logs with review layers, or one log.", readable=False),
     ] = None,
     live: Annotated[
         bool,
@@ -157,7 +158,11 @@ def promote(
     ] = "champion",
     logs: Annotated[
         list[Path] | None,
-        typer.Option(help="Logs of the home to judge it by.", show_default="where they are made"),
+        typer.Option(
+            help="Logs of the home to judge it by.",
+            readable=False,
+            show_default="where they are made",
+        ),
     ] = None,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Let it label without a judgement, or against it.")
