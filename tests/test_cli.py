@@ -182,7 +182,7 @@ def test_info_of_nothing_but_damaged_logs_fails(hearthlog, tmp_path):
     assert result.returncode == 1
     assert result.stdout == ""
     assert result.stderr.splitlines() == [
-        f"hearthlog: {tmp_path / name}: is no MCAP file" for name in ("a.mcap", "b.mcap")
+        f"hearthlog: {tmp_path / name}: is not an MCAP file" for name in ("a.mcap", "b.mcap")
     ]
 
 
