@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -181,7 +182,7 @@ def test_what_it_lacks_is_named_with_the_command_that_installs_it_before_anythin
     status, out, err, made = done[command]
     assert (status, out, made) == (1, "", [])
     (line,) = err.splitlines()
-    assert "not installed; try: " in line
+    assert re.match(r"hearthlog: \w[\w, -]+ not installed; try: ", line)
     assert "install" in line
     assert f"[{extra}]'" in line
 

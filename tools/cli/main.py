@@ -177,7 +177,7 @@ def _usage_text(error: typer.TyperException) -> str:
 
 
 def _message(error: Exception) -> str:
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ModuleNotFoundError) and not isinstance(error, HearthlogError):
         from hearthlog.analyzer.extras import missing
 
         return missing(error.name or "")
