@@ -22,12 +22,15 @@ test: $(VENV)/.dev
 test-fast: $(VENV)/.dev
 	$(BIN)/pytest -n 2 -m fast $(if $(SEED),--hypothesis-seed=$(SEED))
 
-# Every verb of the wheel, in an environment of its own: without Rerun, and with it.
+# Every verb of the wheel, in an environment of its own: the recorder alone, without Rerun, and with it.
 test-wheel: dist
 	$(PYTHON) -m venv --clear build/wheel
 	build/wheel/bin/pip install --quiet uv
 	build/wheel/bin/uv pip install --quiet --python build/wheel/bin/python \
-		"$$(ls build/dist/*.whl)[headless]" pytest pytest-timeout pytest-xdist
+		"$$(ls build/dist/*.whl)" pytest pytest-timeout pytest-xdist
+	build/wheel/bin/pytest --noconftest tests/test_bare.py
+	build/wheel/bin/uv pip install --quiet --python build/wheel/bin/python \
+		"$$(ls build/dist/*.whl)[headless]"
 	build/wheel/bin/pytest -n 2 tests/test_verbs.py
 	build/wheel/bin/uv pip install --quiet --python build/wheel/bin/python \
 		"$$(ls build/dist/*.whl)[analyzer]"

@@ -26,6 +26,10 @@ _EXTRAS = {
 _NAMES = {"sklearn": "scikit-learn", "paho": "paho-mqtt", "rerun": "Rerun", "rerun_cli": "Rerun"}
 
 
+class MissingModuleError(HearthlogError, ModuleNotFoundError):
+    """A module of an extra is not installed."""
+
+
 def require(*modules: str) -> None:
     """Check that modules of an extra can be imported, before any work is done that needs them.
 
@@ -36,12 +40,12 @@ def require(*modules: str) -> None:
 
     Raises
     ------
-    HearthlogError
+    MissingModuleError
         If one is not installed.
     """
     absent = [module for module in modules if find_spec(module) is None]
     if absent:
-        raise HearthlogError(missing(*absent))
+        raise MissingModuleError(missing(*absent))
 
 
 def missing(*modules: str) -> str:

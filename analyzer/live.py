@@ -11,7 +11,7 @@ from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
 from hearthlog.recorder.rest import paused_until
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import find_logs, is_active, log_name
+from hearthlog.schemas.logs.files import check_allowed, find_logs, is_active, log_name
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
@@ -68,6 +68,7 @@ def examine_live(folder: Path) -> list[State]:
     LogError
         If there is no such folder.
     """
+    check_allowed(folder)
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; name the one that the recorder writes to")
     locks = node_locks(folder)

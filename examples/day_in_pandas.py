@@ -21,4 +21,9 @@ def main(path: str, day: str, zone: str = "UTC") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) not in (3, 4):
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except hearthlog.HearthlogError as error:
+        sys.exit(str(error))

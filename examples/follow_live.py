@@ -19,5 +19,10 @@ def main(path: str, microphone: str = "mic") -> None:
 
 
 if __name__ == "__main__":
-    with suppress(KeyboardInterrupt):
-        main(*sys.argv[1:])
+    if len(sys.argv) not in (2, 3):
+        sys.exit(__doc__)
+    try:
+        with suppress(KeyboardInterrupt):
+            main(*sys.argv[1:])
+    except hearthlog.HearthlogError as error:
+        sys.exit(str(error))

@@ -18,4 +18,9 @@ def main(learn: str, test: str, scenario: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except hearthlog.HearthlogError as error:
+        sys.exit(str(error))

@@ -100,7 +100,7 @@ class LogReader:
     Raises
     ------
     LogError
-        If this is no MCAP file, or if it is damaged before its end.
+        If this is not an MCAP file, or if it is damaged before its end.
     """
 
     def __init__(self, path: Path) -> None:

@@ -10,10 +10,11 @@ import pytest
 from homelife import HOUR, at, midnight, write_day
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import betaincinv
 from spliced import run
 
 from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, read_checked_minutes
-from hearthlog.analyzer.accuracy.count_range import FEWEST, checked_rates, strata_of
+from hearthlog.analyzer.accuracy.count_range import FEWEST, beta_quantile, checked_rates, strata_of
 from hearthlog.analyzer.accuracy.events import MINUTE, events_of, television_minutes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -322,6 +323,11 @@ def test_too_few_checked_minutes_say_how_many_more_are_needed(tmp_path, checked_
     for hour in range(8, 8 + checked_here):
         check(logs, at(f"{hour:02}:00"))
     assert any(line.startswith(left) for line in Accuracy(find_home_logs([tmp_path])).lines())
+
+
+@given(st.floats(0.5, 5e3), st.floats(0.5, 5e3), st.sampled_from((0.025, 0.05, 0.5, 0.95, 0.975)))
+def test_a_quantile_of_a_beta_distribution_is_that_of_scipy(a, b, share):
+    assert beta_quantile(a, b, share) == pytest.approx(float(betaincinv(a, b, share)), rel=1e-9)
 
 
 def test_an_interval_of_few_checks_is_wide_and_of_many_narrow():

@@ -290,7 +290,7 @@ def test_a_command_without_words_shows_its_help(hearthlog, verb):
 def test_info_of_what_is_no_log(refused, tmp_path, content):
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
-    assert refused("info", path).startswith(f"{path}: is no MCAP file")
+    assert refused("info", path).startswith(f"{path}: is not an MCAP file")
 
 
 @pytest.mark.parametrize("verb", ["info", "doctor", "cat", "record", "report", "watch"])

@@ -429,14 +429,14 @@ def test_of_many_logs_the_damaged_ones_are_named_and_the_rest_is_printed(
     told = sorted(done.stderr.splitlines())
     assert len(told) == 2
     assert told[0].startswith(f"hearthlog: {logs[0]}: damaged at byte ")
-    assert told[1] == f"hearthlog: {logs[-1]}: is no MCAP file"
+    assert told[1] == f"hearthlog: {logs[-1]}: is not an MCAP file"
     printed = done.stdout.splitlines()
     others = set(whole) - set(first) - set(last)
     assert others <= set(printed) <= set(whole) - set(last)
     assert len(first) // 2 < len(set(first) & set(printed)) < len(first)
 
     alone = hearthlog("cat", logs[-1])
-    assert (alone.returncode, alone.stderr) == (1, f"hearthlog: {logs[-1]}: is no MCAP file\n")
+    assert (alone.returncode, alone.stderr) == (1, f"hearthlog: {logs[-1]}: is not an MCAP file\n")
 
 
 def test_of_many_logs_with_the_same_fault_the_first_are_named_and_the_others_counted(

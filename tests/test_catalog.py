@@ -343,7 +343,7 @@ def test_a_damaged_log_is_a_row_with_its_error_and_is_looked_at_every_time(fleet
     garbage(path)
     row = write_catalog(fleet).current(path)
     assert (row.state, row.span, row.frames) == (DAMAGED, None, 0)
-    assert row.error == "is no MCAP file"
+    assert row.error == "is not an MCAP file"
     path.write_bytes(whole)
     os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
     assert write_catalog(fleet, read_catalog(fleet)).current(path).state == FINISHED
@@ -395,7 +395,7 @@ def test_logs_outside_of_a_span_are_not_opened_where_a_catalogue_knows_theirs(fl
         garbage(path)
     assert select([fleet], (), None, end - SECOND) == before
     assert set(before.logs) == {first, *cut}
-    with pytest.warns(HearthlogWarning, match="is no MCAP file"):
+    with pytest.warns(HearthlogWarning, match="is not an MCAP file"):
         select([fleet / "north"], (), None, end - SECOND)  # where there is no catalogue
 
 
@@ -653,11 +653,11 @@ def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
     garbage(path)
     done = run(capfd, "catalog", fleet, "--json")
     assert done.returncode == 3
-    assert done.stderr == f"hearthlog: {path}: is no MCAP file\n"
+    assert done.stderr == f"hearthlog: {path}: is not an MCAP file\n"
     said = json.loads(done.stdout)
     catalog = read_catalog(fleet)
     assert said["files"] == len(catalog)
-    assert said["damaged"] == {path.relative_to(fleet).as_posix(): "is no MCAP file"}
+    assert said["damaged"] == {path.relative_to(fleet).as_posix(): "is not an MCAP file"}
     assert [home["home"] for home in said["homes"]] == ["bert", "north/anna"]
     assert [home["hours"] for home in said["homes"]] == [home.hours for home in homes(catalog)]
     minutes = sum(one["minutes"] for row in catalog.rows() for one in row.labels)

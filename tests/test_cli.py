@@ -1,6 +1,7 @@
 """The command line tells what is in a log, stays light where it must, and shows the whole way."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -12,12 +13,14 @@ import soundfile
 from conftest import HEARTHLOG
 from mcap.writer import Writer as McapWriter
 
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
 
+needs_setpriv = pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv")
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
 
@@ -61,14 +64,14 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     minutes = figures["segment_minutes"]["hall"].values()
     assert sum(minutes) == pytest.approx(3, abs=0.1)
     assert re.findall(r"([\d.]+) min", heard) == [f"{each:.1f}" for each in minutes]
-    assert heard.startswith("hall heard (in so many pieces): ")
+    assert heard.startswith("hall heard (how often): ")
     rattles = figures["segments"]["hall"]["objects_activity"]
     assert re.search(rf"household sounds [\d.]+ min \({rattles}\)", heard)
     amounts = figures["unsure"]["hall"]
     doubt = f"{amounts['minutes']:.1f} min ({amounts['segments']})"
     assert unsure.startswith(f"hall is unsure of: {doubt} of these, and 0.0 min (0) of no class")
     assert last == f"next: {figures['next']}"
-    assert last == f"next: ten spans to judge: hearthlog review {logs} --queue"
+    assert last == f"next: ten spans to go through: hearthlog review {logs} --queue"
     assert figures["streams"][0]["starter"] is False
 
 
@@ -182,7 +185,7 @@ def test_info_of_nothing_but_damaged_logs_fails(hearthlog, tmp_path):
     assert result.returncode == 1
     assert result.stdout == ""
     assert result.stderr.splitlines() == [
-        f"hearthlog: {tmp_path / name}: is no MCAP file" for name in ("a.mcap", "b.mcap")
+        f"hearthlog: {tmp_path / name}: is not an MCAP file" for name in ("a.mcap", "b.mcap")
     ]
 
 
@@ -245,7 +248,7 @@ def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
     assert (folder / "day.rrd").stat().st_size > 100_000
     assert len(list(folder.rglob("*.mcap"))) == 1
     assert result.stdout.splitlines()[-1].endswith("hearthlog record")
-    shares = re.search(r"right are (\d+)% of the labels, (\d+)% of those of sounds", result.stdout)
+    shares = re.search(r"(\d+)% of the labels are right, and (\d+)% of those of", result.stdout)
     assert 60 < int(shares[1]) <= 100
     assert 30 < int(shares[2]) <= 100
     assert re.search(r"\d+ sounds, of \d+ recordings; made up: \d+", result.stdout)
@@ -254,3 +257,79 @@ def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
     again = hearthlog("demo", "--output", folder)
     assert again.returncode == 1
     assert again.stderr.startswith(f"hearthlog: {folder}: exists already")
+
+
+def as_another_account(*command):
+    """Run a command as somebody whom permissions bind, even where these tests are run by root."""
+    bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if not os.geteuid() else []
+    done = subprocess.run(
+        [*bound, *HEARTHLOG, *map(str, command)], capture_output=True, text=True, check=False
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.fixture
+def denied(logs, tmp_path):
+    """Two logs, and a function that lets nobody read a path; in the end it is as it was."""
+    folder = shutil.copytree(logs, tmp_path / "denied")
+    paths = []
+
+    def deny(path):
+        path.chmod(0)
+        paths.append(path)
+
+    yield folder, deny
+    for path in paths:
+        path.chmod(0o700)
+
+
+@needs_setpriv
+@pytest.mark.parametrize("verb", ["info", "doctor", "cat", "voices", "pause", "catalog", "watch"])
+def test_no_permission_is_not_no_logs(denied, verb):
+    folder, deny = denied
+    deny(folder)
+    status, said = as_another_account(verb, folder)
+    assert status == 1
+    assert said.startswith(f"hearthlog: {folder}: may not be read by you (owner ")
+    assert said.count("\n") == 1
+
+
+@needs_setpriv
+def test_what_may_be_read_of_a_folder_is_used_and_the_rest_is_a_line(denied):
+    folder, deny = denied
+    first, second = find_logs(folder)
+    deny(second)
+    (folder / "inner").mkdir()
+    deny(folder / "inner")
+    status, said = as_another_account("cat", folder, "--topics", "/hall/segment")
+    assert (status, said.count("\n")) == (3, 1)
+    assert f"{folder}: 2 of its files and folders, left out, may not be read by you" in said
+    deny(first)
+    status, said = as_another_account("cat", folder)
+    assert (status, said.count("\n")) == (1, 1)
+    assert "what is in it may not be read by you" in said
+
+
+def test_the_doctor_takes_many_paths_and_names_those_that_are_not_there(logs, hearthlog):
+    first, second = find_logs(logs)
+    both = hearthlog("doctor", first, second, second)
+    assert (both.returncode, both.stderr) == (0, "2 files: 0 errors, 0 warnings\n")
+    with_gone = hearthlog("doctor", "gone.mcap", first)
+    assert with_gone.returncode == 1
+    assert with_gone.stderr.splitlines() == [
+        "hearthlog: gone.mcap: no such log",
+        "1 file: 0 errors, 0 warnings",
+    ]
+
+
+def test_a_diff_and_an_import_may_leave_out_the_folder_of_logs(logs, hearthlog, tmp_path):
+    own = {"HEARTHLOG_OUTPUT": str(logs)}
+    assert "unsure" in hearthlog("diff", "live", "--queue", env=own).stdout
+    alone = hearthlog("annotate", "import", tmp_path / "none.txt", env=own)
+    assert alone.stderr == f"hearthlog: {tmp_path / 'none.txt'}: no such label file\n"
+
+
+def test_a_model_of_another_folder_is_shown_by_its_path(model_file, hearthlog, tmp_path):
+    shown = hearthlog("models", "show", model_file, "--folder", tmp_path)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "macro F1" in shown.stdout

@@ -95,3 +95,19 @@ def test_the_readme_has_a_line_for_each():
     text = (EXAMPLES / "README.md").read_text("utf-8")
     names = {path.name for path in EXAMPLES.iterdir()} - {"README.md"}
     assert set(re.findall(r"^- \[`(.+?)`\]", text, re.MULTILINE)) == names
+
+
+@pytest.mark.parametrize("name", [path.name for path in EXAMPLES.glob("*.py")])
+def test_an_example_without_arguments_says_how_it_is_used(name):
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert f"python {name} " in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_an_example_ends_at_an_error_with_its_line(tmp_path):
+    command = [sys.executable, EXAMPLES / "plot_week.py", tmp_path, tmp_path / "week.png"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, f"{tmp_path}: no log (*.mcap) in this folder\n")

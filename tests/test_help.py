@@ -1,5 +1,6 @@
 """The command says what it is, what its options are, and what is missing where it cannot run."""
 
+import json
 import os
 import re
 import subprocess
@@ -11,8 +12,9 @@ import typer
 from typer.testing import CliRunner
 
 from hearthlog import __version__
+from hearthlog.analyzer.extras import missing
 from hearthlog.recorder.config import Settings
-from hearthlog.tools.cli.main import make_app
+from hearthlog.tools.cli.main import PANELS, make_app
 
 _WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
 _TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
@@ -197,3 +199,56 @@ def test_what_a_verb_was_called_before_names_the_verb_of_now(hearthlog, words, v
     assert f"say `hearthlog {verb} " in result.stderr
     assert result.stderr.count("\n") == 1
     assert tuple(verb.split()) in VERBS
+
+
+def test_the_help_shows_every_verb_in_its_panel():
+    shown = CliRunner().invoke(make_app(), ["--help"], env=_WIDE).output
+    parts = re.split(r"╭─ ([\w ]+) ─", shown)
+    panels = dict(zip(parts[1::2], parts[2::2], strict=True))
+    del panels["Options"]
+    assert list(panels) == list(PANELS)
+    for panel, verbs in PANELS.items():
+        first = re.findall(r"^│ ([a-z-]+) ", panels[panel], re.MULTILINE)
+        assert sorted(first) == sorted(verb.replace("_", "-") for verb in verbs)
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: " ".join(verb) or "hearthlog")
+def test_the_help_names_no_type_of_python_and_breaks_no_sentence(verb):
+    shown = CliRunner().invoke(make_app(), [*verb, "--help"], env=_WIDE).output
+    assert not re.search(r"<\w+>|list\[|\b(bool|str|int|float|Path)\b  ", shown)
+    text = shown.partition("╭")[0]
+    lines = [line.rstrip() for line in text.splitlines() if line.strip()][1:]
+    assert [line for line in lines if line[-1] not in ".…"] == []
+
+
+@pytest.mark.parametrize(
+    ("origin", "command"),
+    [
+        (
+            {"url": "file:///tmp", "dir_info": {"editable": True}},
+            "install --editable '/tmp[headless]'",
+        ),
+        ({"url": "file:///tmp", "dir_info": {}}, "install '/tmp[headless]'"),
+        (
+            {"url": "file:///nowhere", "dir_info": {}},
+            "install '.[headless]' in a clone of hearthlog",
+        ),
+        (
+            {"url": "https://example.org/h.git", "vcs_info": {"vcs": "git"}},
+            "install 'hearthlog[headless] @ git+https://example.org/h.git'",
+        ),
+        (None, "install '.[headless]' in a clone of hearthlog"),
+    ],
+)
+def test_what_is_missing_is_installed_as_hearthlog_was(origin, command, tmp_path, monkeypatch):
+    about = tmp_path / "hearthlog-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: hearthlog\nVersion: 1\n")
+    if origin is not None:
+        (about / "direct_url.json").write_text(json.dumps(origin))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert missing("sklearn.svm").startswith("scikit-learn is not installed; try: ")
+    assert missing("sklearn.svm").endswith(command)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    (tmp_path / "pipx_metadata.json").touch()
+    assert "try: pipx install --force " in missing("sklearn")

@@ -62,7 +62,13 @@ def sdist(tracked, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sdist")
     litter = [
         *("tests/typescript/node_modules/a/b.js", "tests/__pycache__/c.pyc", "demo/day.rrd"),
-        *("models/home-1.safetensors", "models/.champion.json", "ten.txt", "logs/a.mcap"),
+        *(
+            "models/home-1.safetensors",
+            "models/.champion.json",
+            "models/judgements/a.json",
+            "ten.txt",
+            "logs/a.mcap",
+        ),
     ]
     for name in [*tracked, *litter]:
         target = folder / "checkout" / name

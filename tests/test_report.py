@@ -577,7 +577,8 @@ def test_a_damaged_log_is_not_heard_and_the_command_says_so(hearthlog, tmp_path)
     [
         (["--day", "2026-04-01"], 1, "no logs of 2026-04-01 .* there are 2026-03-01$"),
         (["--week", "2026-W20"], 1, "no logs of 2026-05-11 to 2026-05-17"),
-        (["--day", "yesterday"], 2, "--day yesterday: not a day such as 2026-03-01"),
+        (["--day", "someday"], 2, "--day someday: not a day such as 2026-03-01, today or yest"),
+        (["--day", "yesterday"], 1, r"no logs of \d{4}-\d\d-\d\d .* there are 2026-03-01$"),
         (["--week", "9999-W52"], 2, "--week 9999-W52: not a week"),
         (["--day", "2026-03-01", "--week", "2026-W09"], 2, "exclude each other"),
         (["--labels", "pub-7"], 1, "no labelling 'pub-7' beside these logs; there is live"),

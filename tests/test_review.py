@@ -747,7 +747,7 @@ def test_logs_that_cannot_be_read_are_named_and_the_rest_is_saved(home, capfd, t
     (home / "broken.mcap").write_bytes(b"not a log")
     done = run(capfd, "review", home, "--save", tmp_path / "a.rrd")
     assert done.returncode == 3
-    assert "broken.mcap: is no MCAP file" in done.stderr
+    assert "broken.mcap: is not an MCAP file" in done.stderr
     assert (tmp_path / "a.rrd").exists()
 
 

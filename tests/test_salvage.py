@@ -831,7 +831,7 @@ def test_of_several_logs_each_is_recovered_on_its_own(small, hearthlog, tmp_path
     paths = [tmp_path / f"{name}.mcap" for name in "abc"]
     result = hearthlog("recover", *paths)
     assert result.returncode == 1
-    assert f"{paths[1]}: is no MCAP file" in result.stderr
+    assert f"{paths[1]}: is not an MCAP file" in result.stderr
     assert len(result.stdout.splitlines()) == 2
     assert hearthlog("recover", *paths, "-o", tmp_path / "x.mcap").returncode == 2
 

@@ -329,7 +329,7 @@ def test_a_log_that_becomes_shorter_while_it_is_read_is_one_line(store):
 
 def test_what_is_no_log_is_said_of_a_store(empty):
     (empty / "text.mcap").write_bytes(b"no log at all")
-    with pytest.raises(LogError, match=r"text.mcap: is no MCAP file"):
+    with pytest.raises(LogError, match=r"text.mcap: is not an MCAP file"):
         LogFile(empty / "text.mcap")
     with pytest.raises(LogError, match="none: no log"):
         find_logs(empty / "none")

@@ -212,7 +212,7 @@ def test_a_bad_model_is_refused_once_and_the_old_one_goes_on(folder, tmp_path, d
     assert process.errors.splitlines() == [f"hearthlog: {line}" for line in refused]
     assert [line.startswith("model champion refused: ") for line in refused] == [True] * 3
     assert [line.endswith("; going on with one") for line in refused] == [True] * 3
-    assert "bad.safetensors: is no model file" in refused[0] == refused[1]
+    assert "bad.safetensors: is not a model file" in refused[0] == refused[1]
     assert "no such model file" in refused[2]
     found = [s for m in read(logs, "diagnostics") for s in m.status if s.name.endswith(" model")]
     assert [status.level for status in found] == [1, 1, 1, 0]

@@ -390,7 +390,7 @@ def test_a_damaged_log_is_a_loss_and_the_others_are_shown(tmp_path, folder):
     timeline = read_timeline([logs])
     assert len(timeline.losses) == 2
     assert any(str(own[1]) in loss for loss in timeline.losses)
-    assert any("empty.mcap: is no MCAP file" in loss for loss in timeline.losses)
+    assert any("empty.mcap: is not an MCAP file" in loss for loss in timeline.losses)
     _, stamps, _ = features(own[2])
     heard = ~np.isnan(timeline.microphones["mic"].level)
     assert heard[timeline.grid.find(stamps)].all()
@@ -915,7 +915,7 @@ def test_what_cannot_be_written_or_read_is_one_line_and_leaves_nothing(tmp_path,
     with pytest.raises(DataError, match="there is no folder"):
         save_timeline(timeline, tmp_path / "none" / "a.rrd")
     (tmp_path / "b.mcap").write_bytes(b"not a log")
-    with pytest.raises(DataError, match="is no MCAP file"):
+    with pytest.raises(DataError, match="is not an MCAP file"):
         read_timeline([tmp_path / "b.mcap"])
     with pytest.raises(LogError, match="no such log"):
         read_timeline([tmp_path / "c.mcap"])

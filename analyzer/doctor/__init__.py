@@ -7,21 +7,27 @@ from hearthlog.analyzer.doctor.file_checks import ExaminedFile, examine_file
 from hearthlog.analyzer.doctor.findings import Finding, Findings
 from hearthlog.analyzer.doctor.folder_checks import check_leftovers, check_series
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.files import check_allowed, find_logs
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 __all__ = ["ExaminedFile", "Finding", "Findings", "examine", "examine_file"]
 
 
-def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
-    """Check a log, or all logs of a folder and how they follow each other.
+def examine(
+    paths: Path | Sequence[Path],
+    progress: Progress = ignore_progress,
+    missing: list[str] | None = None,
+) -> list[Findings]:
+    """Check logs, or all logs of folders and how they follow each other.
 
     Parameters
     ----------
-    path : Path
-        A log, or a folder of logs.
+    paths : Path or sequence of Path
+        Logs, or folders of logs.
     progress : callable, optional
         Is told the share of the bytes that is done, 0 to 1.
+    missing : list of str, optional
+        Is appended to: which of several paths have no log, and why; the others are checked.
 
     Returns
     -------
@@ -34,14 +40,24 @@ def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
     LogError
         If there is neither a log nor such a file.
     """
-    left = list(check_leftovers(path)) if path.is_dir() else []
-    try:
-        logs = find_logs(path, enrolled=True)
-    except LogError:
-        if not left:
-            raise
-        logs = []
-    files = _examine_all(logs, progress)
+    paths = [paths] if isinstance(paths, Path) else paths
+    logs: dict[Path, Path] = {}
+    left: list[Findings] = []
+    for path in paths:
+        check_allowed(path)
+        own = list(check_leftovers(path)) if path.is_dir() else []
+        left += own
+        try:
+            found = find_logs(path, enrolled=True)
+        except LogError as error:
+            if not own and (missing is None or len(paths) == 1):
+                raise
+            if not own and missing is not None:
+                missing.append(str(error))
+            continue
+        for log in found:
+            logs.setdefault(log.resolve(), log)
+    files = _examine_all(list(logs.values()), progress)
     check_series(files)
     return [*(file.findings for file in files), *left]
 

@@ -37,7 +37,7 @@ def channels_of(log: Path) -> list[ChannelType]:
     Raises
     ------
     LogError
-        If it cannot be read, is no MCAP file, or is damaged.
+        If it cannot be read, is not an MCAP file, or is damaged.
     """
     with LogFile(log) as file:
         read_definitions(file)

@@ -162,4 +162,4 @@ def _add_contents(summary: Summary, contents: Contents) -> None:
         summary.label_seconds[microphone] = Counter(frames)
     summary.gaps = contents.gaps
     summary.streams = contents.streams
-    summary.health = contents.health
+    summary.health = summary.latest_health = contents.health

@@ -76,6 +76,7 @@ class Summary:
     # what the files say of themselves: microphone, device, feature set, model
     streams: list[dict[str, Any]] = field(default_factory=list)
     health: Status | None = None  # the worst that was said, and of that the last
+    latest_health: Status | None = None  # the same of the latest file
 
     @property
     def span(self) -> Span | None:
@@ -136,6 +137,8 @@ class Summary:
         self.gaps += other.gaps
         self.streams += [stream for stream in other.streams if stream not in self.streams]
         self.health = worse(self.health, other.health)
+        both = [one for one in (self.latest_health, other.latest_health) if one is not None]
+        self.latest_health = max(both, key=lambda status: status.time, default=None)
 
 
 def worse(one: Status | None, other: Status | None) -> Status | None:

@@ -124,7 +124,7 @@ def load_model(path: Path) -> Model:
     try:
         arrays = load(data)
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
-        raise ModelError(f"{path}: is no model file ({one_line(error)})") from error
+        raise ModelError(f"{path}: is not a model file ({one_line(error)})") from error
     description = _description(path, data)
     arrays = _widened(description, arrays)
     _check(path, description, arrays)
@@ -211,7 +211,7 @@ def _pointed_to(path: Path) -> Path:
 
 def _check_header(path: Path, data: bytes) -> None:
     if int.from_bytes(data[:8], "little") > _HEADER_LIMIT:
-        raise ModelError(f"{path}: is no model file (its header is too large)")
+        raise ModelError(f"{path}: is not a model file (its header is too large)")
 
 
 def _description(path: Path, data: bytes) -> Description:

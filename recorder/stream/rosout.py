@@ -29,7 +29,9 @@ def info_line(info: Any) -> bytes:
     if info.model:
         labels = f"{len(info.labels)} labels by {info.model} ({info.model_sha256[:12]})"
     stamp = nanoseconds(info.header.stamp)
-    return _line(stamp, info.header.frame_id, _INFO, f"recording {info.device}: {labels}")
+    return _line(
+        stamp, info.header.frame_id, _INFO, f"recording {info.device or 'no microphone'}: {labels}"
+    )
 
 
 def segment_line(microphone: str, segment: Segment, label: str) -> bytes:

@@ -27,7 +27,7 @@ def log_digest(log: Path) -> str:
     Raises
     ------
     LogError
-        If the log cannot be read, or is no MCAP file.
+        If the log cannot be read, or is not an MCAP file.
     """
     with LogFile(log, indexed=False) as file:
         size = file.size

@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -9,12 +10,17 @@ from itertools import count, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap.formats import OTHER_SUFFIXES, not_mcap
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 from hearthlog.schemas.storage.new_files import readers_of
-from hearthlog.schemas.storage.regular_file import may_be_regular, open_regular
+from hearthlog.schemas.storage.regular_file import (
+    denied_text,
+    is_denied,
+    may_be_regular,
+    open_regular,
+)
 from hearthlog.schemas.times import NANOSECONDS
 
 SUFFIX = ".mcap"
@@ -251,13 +257,14 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     Returns
     -------
     list of Path
-        Logs and layers, by name.
+        Logs and layers, by name. Those in the folder that this user may not read are left out, with
+        a `HearthlogWarning`.
 
     Raises
     ------
     LogError
-        If there is no log, if the path is that of a pipe, a socket or a device, or if the store of
-        the path cannot be used.
+        If there is no log, if this user may not read it, if the path is that of a pipe, a socket or
+        a device, or if the store of the path cannot be used.
     """
     every = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)
@@ -270,12 +277,34 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     return logs
 
 
+def check_allowed(path: Path) -> None:
+    """Check that this user may read a log, or list a folder; it need not exist.
+
+    Raises
+    ------
+    LogError
+        If this user may not.
+    """
+    if is_local(path) and is_denied(path):
+        raise LogError(f"{path}: {denied_text(path)}")
+
+
 def _find_local(path: Path) -> list[Path]:
+    check_allowed(path)
     if path.is_dir():
-        logs = sorted(Path(entry.path) for entry in walk_logs(path))
+        denied: list[str] = []
+        logs: list[str] = []
+        for entry in walk_logs(path, denied):
+            allowed = os.access(entry.path, os.R_OK) or not is_denied(entry.path)
+            (logs if allowed else denied).append(entry.path)
+        if denied and not logs:
+            raise LogError(f"{path}: what is in it {denied_text(denied[0])}")
+        if denied:
+            text = f"{len(denied)} of its files and folders, left out, {denied_text(denied[0])}"
+            warnings.warn(HearthlogWarning(text, path), stacklevel=3)
         if not logs:
             raise LogError(f"{path}: no log (*{SUFFIX}) in this folder{_others_in(path)}")
-        return logs
+        return sorted(map(Path, logs))
     if not path.exists():
         raise LogError(f"{path}: no such log")
     if not may_be_regular(path):
@@ -292,13 +321,15 @@ def _others_in(folder: Path) -> str:
     return ""
 
 
-def walk_logs(folder: Path) -> Iterator["os.DirEntry[str]"]:
+def walk_logs(folder: Path, denied: list[str] | None = None) -> Iterator["os.DirEntry[str]"]:
     """List the logs in a folder of this machine, in any order.
 
     Parameters
     ----------
     folder : Path
         Links to other folders in it are not followed; folders that cannot be read are left out.
+    denied : list of str, optional
+        Is appended to: folders that this user may not read.
 
     Yields
     ------
@@ -307,9 +338,11 @@ def walk_logs(folder: Path) -> Iterator["os.DirEntry[str]"]:
     """
     waiting = [os.fspath(folder)]
     while waiting:
-        inside = look_into(waiting.pop())
+        inside = look_into(path := waiting.pop())
         waiting += [entry.path for entry in inside.folders]
         yield from inside.logs
+        if denied is not None and not inside.is_all and is_denied(path):
+            denied.append(path)
 
 
 class Inside(NamedTuple):

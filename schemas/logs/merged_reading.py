@@ -71,7 +71,7 @@ def time_spans(
     Raises
     ------
     LogError
-        If a log cannot be read, is no MCAP file, or is damaged.
+        If a log cannot be read, is not an MCAP file, or is damaged.
     """
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)
@@ -213,7 +213,7 @@ def iterate_messages(  # noqa: PLR0913
     Raises
     ------
     LogError
-        If a log cannot be read, is no MCAP file, or is damaged.
+        If a log cannot be read, is not an MCAP file, or is damaged.
     """
     query = _query(topics, start, end)._replace(on_damage=on_damage, once=once)
     return _iterate(logs, query, list)
@@ -250,7 +250,7 @@ def iterate_pieces(  # noqa: PLR0913
     Raises
     ------
     LogError
-        If a log cannot be read, is no MCAP file, or is damaged; also what `function` raises.
+        If a log cannot be read, is not an MCAP file, or is damaged; also what `function` raises.
     """
     return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
 

@@ -79,4 +79,4 @@ def not_mcap(start: bytes) -> str:
     for magic, what in _OTHERS.items():
         if start.startswith(magic):
             return what
-    return "is no MCAP file"
+    return "is not an MCAP file"

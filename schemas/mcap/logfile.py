@@ -85,7 +85,7 @@ class LogFile:
     Raises
     ------
     LogError
-        If it cannot be read, is no MCAP file, or is damaged.
+        If it cannot be read, is not an MCAP file, or is damaged.
     """
 
     def __init__(self, path: Path, *, indexed: bool = True) -> None:

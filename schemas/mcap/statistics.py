@@ -38,7 +38,7 @@ def time_span(path: Path) -> tuple[int, int] | None:
     Raises
     ------
     LogError
-        If it cannot be read, is no MCAP file, or is damaged.
+        If it cannot be read, is not an MCAP file, or is damaged.
     """
     stated = stated_span(path)
     if stated is not None:

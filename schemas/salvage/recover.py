@@ -57,7 +57,7 @@ def recover_log(
     Raises
     ------
     NothingWholeError
-        If the source is no MCAP file, or nothing in it is whole.
+        If the source is not an MCAP file, or nothing in it is whole.
     LogError
         If it cannot be read, or the copy does not hold what was written to it.
     OSError
@@ -83,7 +83,9 @@ def recover_log(
                 what = not_mcap(stream.read(2 * len(MAGIC)))
             if what != not_mcap(b""):
                 raise NothingWholeError(f"{source}: {what}")
-            raise NothingWholeError(f"{source}: is no MCAP file, and holds no whole piece of one")
+            raise NothingWholeError(
+                f"{source}: is not an MCAP file, and holds no whole piece of one"
+            )
         raise NothingWholeError(f"{source}: holds nothing that could be saved")
     check_copy(copy, recovery.topics)
     return recovery
@@ -109,7 +111,7 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
     Raises
     ------
     NothingWholeError
-        If the log is no MCAP file, or nothing in it is whole.
+        If the log is not an MCAP file, or nothing in it is whole.
     LogError
         If it is being written, cannot be read, or there is a file of a name needed here; or if the
         copy cannot be written, or does not hold what was written to it.

@@ -2,7 +2,9 @@
 
 import errno
 import os
+import pwd
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -65,3 +67,30 @@ def may_be_regular(path: Path) -> bool:
         return stat.S_ISREG(path.stat().st_mode)
     except OSError:
         return True
+
+
+def is_denied(path: str | Path) -> bool:
+    """Tell whether there is a file or a folder that this user may not read."""
+    if os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):  # noqa: PTH112
+        return False
+    try:
+        os.stat(path)  # noqa: PTH116  a name of one of many
+    except PermissionError:
+        return True
+    except OSError:  # there is none
+        return False
+    return True
+
+
+def denied_text(path: str | Path) -> str:
+    """Say whose a file or a folder is that this user may not read, and what to do."""
+    owner = ""
+    for place in (Path(path), *Path(path).absolute().parents):
+        with suppress(OSError, KeyError):
+            owner = pwd.getpwuid(place.stat().st_uid).pw_name
+            break
+    run = "sudo" if owner in {"", "root"} else f"sudo -u {owner}"
+    return (
+        f"may not be read by you{f' (owner {owner})' if owner else ''}: run this as "
+        f'`{run} …`, or let the recorder have readable_by = "group"'
+    )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.tools.cli.options import End, Json, Logs, Start, Timezone, parse_span
+from hearthlog.tools.cli.options import End, Json, Start, Timezone, log_location, parse_span
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import (
@@ -36,7 +36,14 @@ def _group() -> None:
 
 @alerts.command()
 def replay(
-    logs: Logs,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Logs, or folders of logs, or URLs such as s3://bucket/home.",
+            parser=log_location,
+            show_default="those of the configuration",
+        ),
+    ] = None,
     *,
     config: Annotated[
         Path, typer.Option(help="Configuration, a TOML file with tables `bridge.alert`.")
@@ -61,7 +68,7 @@ def replay(
     settings, own = load_bridge_settings(config)
     if not own.alert:
         wrong_use(f"{config}: has no rule; docs/alerts.md says how to write a [[bridge.alert]]")
-    home = find_home_logs(logs)
+    home = find_home_logs(logs or [settings.output])
     _check_node(home, settings.node)
     if timezone is None and "timezone" in settings.model_fields_set:
         timezone = settings.timezone  # by which the bridge goes

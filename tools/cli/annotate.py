@@ -6,14 +6,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
 from hearthlog.schemas.text import listed, shortened
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.cli.options import LocalLog, Microphone, reviewer_name
+from hearthlog.tools.cli.options import LocalLog, Microphone, logs_folder, reviewer_name
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
 from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, number, tell, wrong_use
 
@@ -35,7 +35,10 @@ annotate = typer.Typer(
 @annotate.command("import")
 def import_labels(
     log: LocalLog,
-    labels: Annotated[Path, typer.Argument(help=f"Labels: {PATTERNS}.")],
+    labels: Annotated[
+        Path | None,
+        typer.Argument(help=f"Labels: {PATTERNS}; alone, of the logs in logs.", show_default=False),
+    ] = None,
     *,
     class_map: Annotated[
         Path | None,
@@ -87,6 +90,7 @@ def import_labels(
     )
     from hearthlog.analyzer.review.queue.review_list import read_list
 
+    log, labels = _log_and_labels(log, labels)
     _check_use(labels, scenario)
     name, now = reviewer_name(reviewer), time.time_ns()
     choice = Choice(tier or (), _columns(column or []))
@@ -104,9 +108,7 @@ def import_labels(
         tell(f"{number(count, 'label')} of {other}, by the file, are taken as of {microphone}")
     losses = list(_losses(left_out))
     if not by_log:
-        for line in losses:
-            tell(line)
-        raise typer.Exit(1)
+        _end_without_labels(losses)
     said = [mark for marks in by_log.values() for mark in marks]
     looked = looked_at(spans, said, coverage, name, now)
     taken: list[Mark] = []
@@ -173,6 +175,17 @@ def export_labels(
     }
     write_labels(output, sorted(marks, key=lambda mark: (mark.start, mark)), coverage)
     print(output)
+
+
+def _log_and_labels(first: Path, second: Path | None) -> tuple[Path, Path]:
+    """Tell apart the logs and the labels: of one argument, it is the labels."""
+    return (Path(logs_folder()), first) if second is None else (first, second)
+
+
+def _end_without_labels(losses: list[str]) -> NoReturn:
+    for line in losses:
+        tell(line)
+    raise typer.Exit(1)
 
 
 def _check_use(path: Path, scenario: str) -> None:

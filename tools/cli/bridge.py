@@ -14,7 +14,9 @@ def bridge(
     logs: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder that the recorder writes to.", show_default="that of the configuration"
+            help="Folder that the recorder writes to.",
+            readable=False,
+            show_default="that of the configuration",
         ),
     ] = None,
     *,
@@ -33,10 +35,17 @@ def bridge(
     from hearthlog.analyzer.bridge.saying import Saying
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.bridge.state_folder import state_folder
+    from hearthlog.analyzer.extras import require
     from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.timezone import time_zone
 
     settings, own = load_bridge_settings(config)
+    needed = {
+        "paho": own.mqtt,
+        "prometheus_client": own.prometheus,
+        "apprise": own.alert and own.delivery.urls_file,
+    }
+    require(*(module for module, table in needed.items() if table))
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
@@ -46,7 +55,9 @@ def bridge(
         say(line)
     outputs, since = open_outputs(own, home, state_folder(own.state, home.folder), say)
     if not outputs:
+        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
         wrong_use(
-            "nobody is to be told anything: docs/bridge.md says how, by a table [bridge.mqtt]"
+            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
+            "tell others"
         )
     Bridge(home, since, outputs, say).run(stop)

@@ -13,6 +13,7 @@ def print_recording(path: Path) -> None:
 
     print(path)
     print(f"open it with: rerun {hidden_options()} {shlex.quote(str(path))}")
+    tell("by --bind and --port no web page finds what Rerun shows")
 
 
 def show_page(address: str) -> None:

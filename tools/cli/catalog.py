@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import Json, Scheduler, log_location
+from hearthlog.schemas.logs.files import check_allowed
+from hearthlog.tools.cli.options import Json, Scheduler, log_location, logs_folder
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
@@ -29,6 +30,8 @@ def catalog(
         typer.Argument(
             help="Folder that holds the logs or homes, or a URL such as s3://bucket/homes.",
             parser=log_location,
+            default_factory=logs_folder,
+            show_default="logs",
         ),
     ],
     *,
@@ -50,6 +53,7 @@ def catalog(
     from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, UNFINISHED
     from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts, scenario_amounts
 
+    check_allowed(folder)
     if folder.is_file():
         wrong_use(f"{folder} is a file; give the folder that holds the logs or homes")
     files = _write(folder, workers, scheduler)

@@ -57,8 +57,10 @@ def demo(
     took = time.perf_counter() - began
     print(f"recorded and labelled at {60 * minutes / took:.0f} times the speed of life")
     right, of_known = _agreement(logs, start, truth.spans, model)
-    print(f"right are {right:.0%} of the labels, {of_known:.0%} of those of sounds that the model")
-    print("knows; any other sound is right as unknown (it has learned from none of the recordings)")
+    print(
+        f"{right:.0%} of the labels are right, and {of_known:.0%} of those of sounds that it knows"
+    )
+    print("(it has learned from none of these recordings; any other sound is right as unknown)")
 
     _say(f"3. hearthlog info {logs}")
     info(logs)
@@ -67,6 +69,7 @@ def demo(
     save_timeline(read_timeline([logs]), timeline)
 
     _say(f"Look at it:           {_command('rerun')} {hidden_options()} {timeline}")
+    print("                      (by these options no web page finds what Rerun shows)")
     print(f"What is true:         {day.with_suffix('.txt')}, a label track for Audacity")
     print(f"Record a microphone:  {_command('hearthlog')} record")
 

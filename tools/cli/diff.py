@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from hearthlog.tools.cli.diff_tables import print_difference, print_queue
-from hearthlog.tools.cli.options import End, Json, Log, Microphone, Start, check_output, parse_span
+from hearthlog.tools.cli.options import (
+    LOG_HELP,
+    End,
+    Json,
+    Microphone,
+    Start,
+    check_output,
+    log_location,
+    logs_folder,
+    parse_span,
+)
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.text import end_with_warnings, tell, unfinished_lines, wrong_use
 
@@ -22,10 +32,13 @@ _SHOWN, _QUEUED = 10, 60
 
 
 def diff(
-    log: Log,
-    a: Annotated[
-        str, typer.Argument(help="A labelling: live, review, or the model of a relabel layer.")
+    log: Annotated[
+        str, typer.Argument(help=f"{LOG_HELP} It may be left out, if it is the folder logs.")
     ],
+    a: Annotated[
+        str | None,
+        typer.Argument(help="A labelling: live, review, or the model of a relabel layer."),
+    ] = None,
     b: Annotated[str | None, typer.Argument(help="Another one; --queue needs none.")] = None,
     *,
     queue: Annotated[
@@ -53,11 +66,14 @@ def diff(
     from hearthlog.analyzer.review.queue.review_list import write_list
     from hearthlog.schemas.messages.topics import labelling_topic
 
+    place = log_location(log)
+    if a is None or (b is None and not queue and not place.exists()):
+        place, a, b = log_location(logs_folder()), log, a
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
     check_output("--list", output, ".csv", "a list of spans")
     limits = parse_span(start, end)
-    sources = find_labellings(log)
+    sources = find_labellings(place)
     name = sources.microphone(microphone)
     chosen = [sources.find(name, labelling) for labelling in (a, b) if labelling is not None]
     if len(set(chosen)) < len(chosen):

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.options import End, Json, Start, Timezone, parse_span, reviewer_name
+from hearthlog.tools.cli.options import (
+    End,
+    Json,
+    LocalLogs,
+    Start,
+    Timezone,
+    parse_span,
+    reviewer_name,
+)
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, number, print_json, tell, wrong_use
@@ -27,7 +35,7 @@ _LABELS = 2  # that are shown of a group
 
 
 def discover(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.")],
+    logs: LocalLogs,
     *,
     of: Annotated[
         str, typer.Option(help="Which sounds: all, unsure (by their labels), or unknown.")
@@ -62,11 +70,14 @@ def discover(
     from hearthlog.analyzer.discover.groups_file import locked_groups
     from hearthlog.analyzer.discover.naming import Looked
     from hearthlog.analyzer.discover.sound_spans import CHOICES
+    from hearthlog.analyzer.extras import require
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
 
     if of not in CHOICES:
         wrong_use(f"--of {of}: it is one of {', '.join(CHOICES)}")
+    if not (name or undo):
+        require("sklearn", "scipy")
     looked = Looked(of, *parse_span(start, end))
     names, who = _names(name or []), reviewer_name(reviewer)
     home = find_home_logs(logs)
@@ -115,9 +126,6 @@ def _group(
     home: "HomeLogs", file: Path, looked: "Looked", least: int, zone: "tzinfo"
 ) -> tuple["HomeSummary", list[str]]:
     """Group what is heard, and keep the groups and their summary."""
-    from hearthlog.analyzer.extras import require
-
-    require("sklearn", "scipy")
     from hearthlog.analyzer.discover.discover import discover as find_groups
     from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
     from hearthlog.analyzer.discover.read_sounds import read_sounds

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.options import Json, LocalLog, check_output
+from hearthlog.tools.cli.options import Json, LocalLogs, check_output
 from hearthlog.tools.cli.text import number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def doctor(
-    path: LocalLog,
+    paths: LocalLogs,
     *,
     live: Annotated[
         bool, typer.Option("--live", help="Look at the recorders of the folder, not at its logs.")
@@ -52,24 +52,29 @@ def doctor(
         wrong_use("--ping and --ping-file go with --live")
     if ping_url is not None and ping_file is not None:
         wrong_use("give either --ping or --ping-file")
+    if (live or bundle is not None) and len(paths) > 1:
+        wrong_use("--live and --bundle are of one folder of logs")
     if bundle is not None:
-        _write_bundle(bundle, path)
+        _write_bundle(bundle, paths[0])
         return
     if live:
-        _examine_live(path, ping_url, ping_file, as_json=as_json)
+        _examine_live(paths[0], ping_url, ping_file, as_json=as_json)
         return
     from hearthlog.analyzer.doctor import examine
     from hearthlog.tools.cli.progress import share_done
 
+    missing: list[str] = []
     with share_done("reading logs") as progress:
-        files = examine(path, progress)
+        files = examine(paths, progress, missing)
+    for error in missing:
+        tell(error)
     if as_json:
         print(json.dumps(_as_json(files), indent=2))
     else:
         _print(files)
     levels = {level for findings in files for level, _ in findings.counts}
-    if levels:
-        raise typer.Exit(1 if "error" in levels else 3)
+    if levels or missing:
+        raise typer.Exit(1 if "error" in levels or missing else 3)
 
 
 def _write_bundle(bundle: Path, folder: Path) -> None:

@@ -22,7 +22,8 @@ def enrol(
         list[Path] | None, typer.Option(help="Audio file to enrol; may be given again.")
     ] = None,
     log: Annotated[
-        Path | None, typer.Option(help="Log, or folder of logs, to enrol a span of.")
+        Path | None,
+        typer.Option(help="Log, or folder of logs, to enrol a span of.", readable=False),
     ] = None,
     start: Start = None,
     end: End = None,

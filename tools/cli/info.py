@@ -20,6 +20,7 @@ from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.summary import Summary
     from hearthlog.schemas.logs.scenario_record import RecordedScenario
+    from hearthlog.schemas.logs.statuses import Status
     from hearthlog.tools.cli.accuracy_text import Accuracy
 
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
@@ -180,15 +181,15 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
         },
         "gaps": [gap._asdict() | {"start": moment(gap.start)} for gap in summary.gaps],
         "gap_seconds": summary.gap_seconds,
-        "health": _health(summary),
+        "health": _health(summary.health),
+        "latest_health": _health(summary.latest_health),
         "attachments": sorted(summary.attachments),
         "metadata": sorted(summary.metadata),
         "schema_versions": sorted(summary.schema_versions),
     }
 
 
-def _health(summary: "Summary") -> dict[str, str] | None:
-    health = summary.health
+def _health(health: "Status | None") -> dict[str, str] | None:
     if health is None:
         return None
     level = _LEVELS[min(health.level, len(_LEVELS) - 1)]
@@ -246,13 +247,15 @@ def _lines(summary: "Summary") -> Iterator[str]:
     yield from first_of("layer", [str(path) for path in summary.layers])
     for stream in summary.streams:
         model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
+        device = stream["device"] or "no microphone"
         yield (
-            f"{stream['microphone']}: {stream['device']}, features {stream['feature_set']}, "
+            f"{stream['microphone']}: {device}, features {stream['feature_set']}, "
             f"model {model}{', a starter, which has never heard this home' * stream['starter']}"
         )
-    health = _health(summary)
-    if health is not None:
-        yield f"health: {health['level']}, {health['time']} {health['name']}: {health['message']}"
+    latest, worst = _health(summary.latest_health), _health(summary.health)
+    for what, one in (("health", latest), ("health, at its worst", worst)):
+        if one is not None and not (one is worst and worst == latest):
+            yield f"{what}: {one['level']}, {one['time']} {one['name']}: {one['message']}"
 
 
 def _gap_lines(summary: "Summary") -> Iterator[str]:

@@ -9,7 +9,6 @@ from hearthlog.analyzer.logs.summary import Summary
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
-from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.tools.cli.options import models_folder
 from hearthlog.tools.cli.text import JUDGED_BY, number
@@ -28,7 +27,7 @@ def gist(summary: Summary) -> Iterator[str]:
             f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
             for label in known
         )
-        yield f"{microphone} heard (in so many pieces): {', '.join(amounts)}"
+        yield f"{microphone} heard (how often): {', '.join(amounts)}"
         other = seconds.keys() - set(known)
         yield (
             f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "
@@ -51,6 +50,8 @@ def next_step(summary: Summary, path: Path) -> str | None:
     heard: Counter[str] = Counter()
     for counts in summary.segments.values():
         heard.update(map(class_name, counts))
+    if not (heard or summary.label_seconds):
+        return "nothing was heard, not even quiet: hearthlog devices lists the microphones"
     if not heard.keys() - {SILENCE}:
         return "nothing but quiet was heard yet: leave it recording, or try the microphone"
     marked = any(name.partition("/")[2] == REVIEW for name in summary.segments)
@@ -59,9 +60,7 @@ def next_step(summary: Summary, path: Path) -> str | None:
             f"a model of this home, from what is marked ({JUDGED_BY}): "
             f"hearthlog train --home {place}"
         )
-    kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())
-    what = "listen to" if kept else "judge"
-    return f"ten spans to {what}: hearthlog review {place} --queue"
+    return f"ten spans to go through: hearthlog review {place} --queue"
 
 
 def _has_learned(layers: Sequence[Path]) -> bool:

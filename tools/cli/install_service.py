@@ -55,7 +55,7 @@ def install_service(
     else:
         tell("it is enabled, and starts when systemd does")
     if user and not (_LINGER / getpass.getuser()).exists():
-        tell("it ends when you log out, unless you say: loginctl enable-linger")
+        tell("it ends when you log out; to let it run on: loginctl enable-linger")
 
 
 def _install_bridge(config: Path | None, account: str | None) -> None:

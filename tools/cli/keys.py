@@ -1,5 +1,7 @@
 """Keys that are pressed in a terminal, one by one; where there is none, lines of input."""
 
+import os
+import stat
 import sys
 import termios
 import threading
@@ -11,7 +13,10 @@ from queue import SimpleQueue
 
 @contextmanager
 def read_keys(keys: "SimpleQueue[str]") -> Iterator[None]:
-    """Put keys into a queue as they are pressed; the end of the input, after some, is `q`."""
+    """Put keys into a queue as they are pressed; the end of the input is `q`.
+
+    Not that of /dev/null: what is started from a desktop has no other input, and has a window.
+    """
     if not sys.stdin.isatty():
         threading.Thread(target=_read_lines, args=[keys], daemon=True).start()
         yield
@@ -31,10 +36,8 @@ def _read_terminal(keys: "SimpleQueue[str]") -> None:
 
 
 def _read_lines(keys: "SimpleQueue[str]") -> None:
-    pressed = False
     for line in sys.stdin:
         for key in line.strip():
-            pressed = True
             keys.put(key)
-    if pressed:
+    if not stat.S_ISCHR(os.fstat(sys.stdin.fileno()).st_mode):
         keys.put("q")

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from inspect import getdoc
 from typing import Annotated, Any
 
 from hearthlog.schemas.blas import kernel_environment
@@ -18,20 +19,28 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.update(kernel_environment())
 
 import typer
+from typer.core import TyperArgument, TyperOption
 
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
+from hearthlog.schemas.storage.regular_file import denied_text, is_denied
 from hearthlog.tools.cli.output import OutputClosedError, checked_output
 from hearthlog.tools.cli.text import tell
 
-# In the order of the help; each is a function, or an app of its own, in the module of its name.
-VERBS = (
-    *("record", "pause", "resume", "install_service", "devices", "info", "catalog", "cat"),
-    *("export", "merge", "cut", "doctor", "recover", "retain", "manifest", "train", "enrol"),
-    *("diff", "discover", "voices", "review", "watch", "bridge", "report", "replay", "relabel"),
-    *("demo", "alerts", "annotate", "config", "evaluate", "models"),
-)
+# As the help shows them; each is a function, or an app of its own, in the module of its name.
+PANELS = {
+    "Every day": ("record", "devices", "info", "watch", "report", "pause", "resume", "demo"),
+    "A model of the home": (
+        *("review", "train", "enrol", "discover", "voices", "relabel", "models", "annotate"),
+    ),
+    "House and service": ("bridge", "install_service", "retain", "alerts", "config"),
+    "Files": ("doctor", "recover", "cat", "export", "cut", "merge", "catalog"),
+    "Research": ("replay", "diff", "manifest", "evaluate"),
+}
+VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
 _MODULES = {"resume": "pause"}  # of a verb that shares one
+_TYPES = {"str": "TEXT", "int": "NUMBER", "float": "NUMBER"}
+_TYPES |= dict.fromkeys(("Path", "path", "file", "directory"), "PATH")
 _NAMED = 10  # of many files with the same fault
 _WORDS = (  # for those of the library that reads options
     (re.compile(r"Input should be greater than or equal to "), "it must be at least "),
@@ -54,11 +63,35 @@ def make_app(verbs: Iterable[str] = VERBS) -> typer.Typer:
     for verb in verbs:
         module = import_module(f"hearthlog.tools.cli.{_MODULES.get(verb, verb)}")
         command = getattr(module, verb)
+        panel = next(panel for panel, inside in PANELS.items() if verb in inside)
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=verb)
+            for one in command.registered_commands:
+                one.help = _without_line_breaks(one.callback)
+            app.add_typer(command, name=verb, rich_help_panel=panel)
         else:
-            app.command(cls=getattr(module, "COMMAND_CLASS", None))(command)
+            own, text = getattr(module, "COMMAND_CLASS", None), _without_line_breaks(command)
+            app.command(cls=own, help=text, rich_help_panel=panel)(command)
     return app
+
+
+def _without_line_breaks(function: Any) -> str:
+    """Return a docstring with each paragraph in one line, which the help breaks to the window."""
+    return "\n\n".join(" ".join(part.split()) for part in (getdoc(function) or "").split("\n\n"))
+
+
+def _option_type(option: TyperOption, ctx: Any) -> str | None:
+    """Name what an option takes as people do, where typer names the type of Python."""
+    if option.is_flag:
+        return None
+    if option.metavar is not None:
+        return option.metavar
+    shown = option.display_type(ctx).strip("<>")
+    kind = shown.removeprefix("list[").removesuffix("]").split()[0]
+    return _TYPES.get(kind, shown)
+
+
+setattr(TyperOption, "display_type_rich", _option_type)  # noqa: B010  for mypy, which knows another
+setattr(TyperArgument, "display_type_rich", lambda *_, **_options: None)  # noqa: B010  named so
 
 
 def _print_version(shown: bool) -> None:
@@ -158,10 +191,12 @@ def _usage_text(error: typer.TyperException) -> str:
 
 
 def _message(error: Exception) -> str:
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ModuleNotFoundError) and not isinstance(error, HearthlogError):
         from hearthlog.analyzer.extras import missing
 
         return missing(error.name or "")
+    if isinstance(error, PermissionError) and is_denied(error.filename or ""):
+        return f"{error.filename}: {denied_text(error.filename)}"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return str(error)

@@ -63,7 +63,7 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
 
 @models.command()
 def show(
-    name: Annotated[str, typer.Argument(help="A model, an alias, or a starter.")],
+    name: Annotated[str, typer.Argument(help="A model, an alias, a starter, or a file.")],
     folder: _Folder = None,
     as_json: Json = False,
 ) -> None:
@@ -85,7 +85,8 @@ def compare(
     folder: _Folder = None,
     data: Annotated[Path | None, typer.Option(help=CLIPS)] = None,
     logs: Annotated[
-        Path | None, typer.Option(help="Folder of logs with review layers, or one log.")
+        Path | None,
+        typer.Option(help="Folder of logs with review layers, or one log.", readable=False),
     ] = None,
     live: Annotated[
         bool,
@@ -157,7 +158,11 @@ def promote(
     ] = "champion",
     logs: Annotated[
         list[Path] | None,
-        typer.Option(help="Logs of the home to judge it by.", show_default="where they are made"),
+        typer.Option(
+            help="Logs of the home to judge it by.",
+            readable=False,
+            show_default="where they are made",
+        ),
     ] = None,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Let it label without a judgement, or against it.")
@@ -274,13 +279,15 @@ def _recordings(
 
 
 def _named(folder: Path, name: str) -> "Model":
-    """Load a model of the folder, or a starter model."""
+    """Load a model of the folder, a starter model, or a file."""
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.modelfile.registry import load
     from hearthlog.models.starter import STARTERS, starter_file
 
     if name in STARTERS and not folder.is_dir():
         return load_model(starter_file(name))
+    if Path(name).name != name and Path(name).exists():  # a file of another folder
+        return load_model(Path(name))
     return load(folder, name)
 
 

@@ -32,17 +32,64 @@ def log_location(text: str) -> Path:
     return location(text)
 
 
+LOG_HELP = "A log, or a folder of logs, or a URL such as s3://bucket/home."
+
+
+def logs_folder() -> str:
+    """Return the folder that a recorder writes to: `logs`, unless the environment names another."""
+    from hearthlog.recorder.config import load_settings
+
+    return str(load_settings(None, {}, {}).output)
+
+
+def _logs_folders() -> list[str]:
+    return [logs_folder()]
+
+
+# Whether they may be read is found out where they are, and said better than by typer.
 Log = Annotated[
     Path,
     typer.Argument(
-        help="A log, or a folder of logs, or a URL such as s3://bucket/home.", parser=log_location
+        help=LOG_HELP,
+        parser=log_location,
+        default_factory=logs_folder,
+        show_default="logs",
     ),
 ]
-LocalLog = Annotated[Path, typer.Argument(help="A log, or a folder of logs.")]
+LocalLog = Annotated[
+    Path,
+    typer.Argument(
+        help="A log, or a folder of logs.",
+        readable=False,
+        default_factory=logs_folder,
+        show_default="logs",
+    ),
+]
 Logs = Annotated[
     list[Path],
     typer.Argument(
-        help="Logs, or folders of logs, or URLs such as s3://bucket/home.", parser=log_location
+        help="Logs, or folders of logs, or URLs such as s3://bucket/home.",
+        parser=log_location,
+        default_factory=_logs_folders,
+        show_default="logs",
+    ),
+]
+LocalLogs = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Logs, or folders of logs.",
+        readable=False,
+        default_factory=_logs_folders,
+        show_default="logs",
+    ),
+]
+LogsFolder = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder that a recorder writes to.",
+        readable=False,
+        default_factory=logs_folder,
+        show_default="logs",
     ),
 ]
 Topics = Annotated[
@@ -51,9 +98,15 @@ Topics = Annotated[
 ]
 Start = Annotated[
     str | None,
-    typer.Option(help="From this log time on, as 2026-03-01T07:00 (UTC unless it says otherwise)."),
+    typer.Option(
+        metavar="TIME",
+        help="From this log time on, as 2026-03-01T07:00 (UTC unless it says otherwise).",
+    ),
 ]
-End = Annotated[str | None, typer.Option(help="Up to this log time, which is not part of it.")]
+End = Annotated[
+    str | None,
+    typer.Option(metavar="TIME", help="Up to this log time, which is not part of it."),
+]
 RetentionDays = Annotated[
     int | None,
     typer.Option(
@@ -68,6 +121,7 @@ MaxBagFiles = Annotated[
 MaxRecordSize = Annotated[
     str | None,
     typer.Option(
+        metavar="SIZE",
         help="Delete the oldest logs beyond so many bytes, such as 20G, of all.",
         show_default="no limit",
     ),
@@ -75,6 +129,7 @@ MaxRecordSize = Annotated[
 MinFreeSpace = Annotated[
     str | None,
     typer.Option(
+        metavar="SIZE",
         help="Delete the oldest logs while fewer bytes are free on the disk; 0: none.",
         show_default="500M",
     ),

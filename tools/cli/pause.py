@@ -7,16 +7,15 @@ from typing import Annotated
 
 import typer
 
+from hearthlog.tools.cli.options import LogsFolder
 from hearthlog.tools.cli.text import wrong_use
 
 _UNITS = {"m": "minutes", "h": "hours", "d": "days"}
 _LONGEST = timedelta(days=366)
 
-_Logs = Annotated[Path, typer.Argument(help="Folder of logs.")]
-
 
 def pause(
-    logs: _Logs = Path("logs"),
+    logs: LogsFolder,
     duration: Annotated[
         str | None,
         typer.Option("--for", help="How long, such as 30m, 2h or 1d.", show_default="until resume"),
@@ -31,7 +30,7 @@ def pause(
     print(f"{logs}: paused {until}; its recorders close their microphones within a second")
 
 
-def resume(logs: _Logs = Path("logs")) -> None:
+def resume(logs: LogsFolder) -> None:
     """End a pause."""
     from hearthlog.recorder import rest
 

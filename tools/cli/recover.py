@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 
 def recover(
-    logs: Annotated[list[Path], typer.Argument(help="Logs that were cut or damaged.")],
+    logs: Annotated[
+        list[Path], typer.Argument(help="Logs that were cut or damaged.", readable=False)
+    ],
     *,
     output: Annotated[
         Path | None,

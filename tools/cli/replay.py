@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hearthlog.tools.cli.browser import print_recording
-from hearthlog.tools.cli.options import Json, Microphone, scenario_files
+from hearthlog.tools.cli.options import Json, LocalLog, Microphone, scenario_files
 from hearthlog.tools.cli.text import moment, tell, wrong_use
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _MAX_RATE = "max"
 
 
 def replay(
-    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of one recorder.")],
+    path: LocalLog,
     *,
     output: Annotated[
         Path | None,

@@ -1,6 +1,6 @@
 """`hearthlog report`: a day or a week of a home, for a carer."""
 
-from datetime import date, timedelta
+from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 _YEARS = range(1970, 2200)
+_NEAR = {"today": 0, "yesterday": 1}  # days before today
 
 
 def report(
@@ -21,7 +22,9 @@ def report(
     *,
     day: Annotated[
         str | None,
-        typer.Option(help="As 2026-03-01; without --week the last whole day in the logs."),
+        typer.Option(
+            help="As 2026-03-01, today or yesterday; without --week the last whole day in the logs."
+        ),
     ] = None,
     week: Annotated[
         str | None, typer.Option(help="As 2026-W09, or a day in it: Monday to Sunday.")
@@ -48,7 +51,7 @@ def report(
     from hearthlog.analyzer.extras import require
 
     require("jinja2", "matplotlib")
-    first = None if day is None and week is None else _first_day(day, week)
+    first = None if day in {None, *_NEAR} and week is None else _first_day(day, week)
 
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
@@ -56,8 +59,10 @@ def report(
 
     home_logs = find_home_logs(logs)
     zone = home_zone(timezone, home_logs.records())
-    if first is None:
+    if first is None and day is None:
         first = home_logs.last_whole_day(zone)
+    elif first is None:
+        first = datetime.now(zone).date() - timedelta(days=_NEAR[day or ""])
     count = 1 if week is None else WEEK
     page = output or Path(_name(home_logs, first, count))
     with share_done("reading what was heard") as progress:
@@ -75,7 +80,7 @@ def _first_day(day: str | None, week: str | None) -> date:
     except ValueError:
         start = None
     if start is None or start.year not in _YEARS:
-        example = "2026-03-01" if week is None else "2026-W09, or a day in it"
+        example = "2026-03-01, today or yesterday" if week is None else "2026-W09, or a day in it"
         wrong_use(f"{option} {text}: not a {option[2:]} such as {example}")
     return start if week is None else start - timedelta(days=start.weekday())
 

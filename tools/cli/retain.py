@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 def retain(
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder of logs.", show_default="logs")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder of logs.", readable=False, show_default="logs"),
     ] = None,
     node: Annotated[
         str | None, typer.Option(help="Name of the recorder.", show_default="home")

@@ -19,6 +19,7 @@ from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
 from hearthlog.tools.cli.options import (
     End,
+    LocalLogs,
     Microphone,
     Start,
     Timezone,
@@ -47,7 +48,7 @@ _QUEUE = "--queue"
 
 
 def review(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.")],
+    logs: LocalLogs,
     day: Annotated[
         str | None, typer.Option(help="A day of the home, as 2026-03-01, today or yesterday.")
     ] = None,
@@ -106,7 +107,6 @@ def review(
         wrong_use("--save makes a file: --web and --port go without it")
     if day is not None and (start or end):
         wrong_use("--day is a span of its own: leave out --start and --end")
-    from hearthlog.analyzer.extras import require
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
@@ -126,14 +126,7 @@ def review(
     if save is not None and queue is not None:
         _save_queue(save, logs, chosen, timezone)
         return
-    try:
-        require("rerun", "rerun_cli")
-    except HearthlogError as error:
-        if queue is None:
-            raise
-        raise HearthlogError(
-            f"{error}; or without a viewer, as a text file: --save ten.txt"
-        ) from error
+    _require_viewer(queue)
     if save is not None:
         from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
 
@@ -148,6 +141,17 @@ def review(
             timeline = read()
             _show(viewer, timeline, logs, chosen)
     end_with_warnings(timeline.losses)
+
+
+def _require_viewer(queue: str | None) -> None:
+    from hearthlog.analyzer.extras import require
+
+    try:
+        require("rerun", "rerun_cli")
+    except HearthlogError as error:
+        if queue is None:
+            raise
+        raise HearthlogError(f"{error}; or, as a text file: --queue --save ten.txt") from error
 
 
 class ReviewCommand(TyperCommand):

@@ -55,7 +55,8 @@ def train(
     home: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Logs, with review layers if there are any, and enrolled sounds, to learn from."
+            help="Logs, with review layers if there are any, and enrolled sounds, to learn from.",
+            readable=False,
         ),
     ] = None,
     base: Annotated[
@@ -96,7 +97,11 @@ def train(
     if speakers or data:
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
     elif not home or scheduler or (cost, gamma) != (None, None):
-        wrong_use("give --data and --scenario, or --home without what is about --data")
+        wrong_use(
+            "say what to learn from: `hearthlog train --home logs` for a model of this home, or "
+            "`hearthlog train --data MANIFEST.csv --scenario general -o general.safetensors`; "
+            "--scheduler, --cost and --gamma go with --data"
+        )
     else:
         base = base or _model_of(home, check_scenario_name(scenario) if scenario else "")
     if output is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.tools.cli.options import End, Json, Start, Timezone, parse_span
+from hearthlog.tools.cli.options import End, Json, LocalLogs, Start, Timezone, parse_span
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, number, print_json, tell, wrong_use
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def voices(
-    logs: Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.")],
+    logs: LocalLogs,
     *,
     start: Start = None,
     end: End = None,

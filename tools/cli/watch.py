@@ -10,7 +10,7 @@ import typer
 
 from hearthlog.tools.cli.browser import show_page
 from hearthlog.tools.cli.foxglove import show_in_foxglove
-from hearthlog.tools.cli.options import Timezone, parse_span
+from hearthlog.tools.cli.options import LogsFolder, Timezone, parse_span
 from hearthlog.tools.cli.text import TellOnce, tell, wrong_use
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _MINUTES = 5
 
 
 def watch(
-    logs: Annotated[Path, typer.Argument(help="Folder that a recorder writes to.")] = Path("logs"),
+    logs: LogsFolder,
     *,
     web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
     serve: Annotated[
@@ -82,7 +82,9 @@ def watch(
         signal.signal(number, lambda *_: stop.set())
 
     from hearthlog.analyzer.review.timeline.live import last_time
+    from hearthlog.schemas.logs.files import check_allowed
 
+    check_allowed(logs)
     newest = last_time(logs)
     if newest is None and start is None and end is None:
         tell(f"no log in {logs} yet; waiting for a recorder")

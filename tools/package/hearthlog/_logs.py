@@ -21,6 +21,7 @@ from hearthlog.analyzer.export.exporter import (
     tables_of,
     with_numbers,
 )
+from hearthlog.analyzer.extras import require
 from hearthlog.analyzer.logs.bearings import Bearings, as_vectors, mean_bearings
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -142,8 +143,8 @@ class Logs:
         LogError
             If there is no such topic, a log is damaged, or the topic has several types, or a field
             of a type changed so that no column holds all of its values.
-        ModuleNotFoundError
-            If pyarrow is not installed.
+        HearthlogError
+            If pyarrow is not installed; it is a `ModuleNotFoundError` too.
 
         Examples
         --------
@@ -180,8 +181,8 @@ class Logs:
         ------
         LogError
             If there is no such topic, or a log is damaged.
-        ModuleNotFoundError
-            If pandas is not installed.
+        HearthlogError
+            If pandas is not installed; it is a `ModuleNotFoundError` too.
 
         Examples
         --------
@@ -450,8 +451,6 @@ def _elements(columns: Columns, path: str) -> dict[str, NDArray[Any]]:
 
 
 def _optional(module: str) -> Any:
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        message = f"{module} is not installed; try: pip install {module}"
-        raise ModuleNotFoundError(message, name=module) from error
+    """Import a module that is part of the extra `headless`."""
+    require(module)
+    return import_module(module)
