@@ -134,8 +134,8 @@ def find_kept_sound(
             layers.append(layer)
         except LogError as error:
             losses.append(str(error))
-    edges = [np.concatenate(each) for each in zip(*times, strict=True)]
-    return KeptSound(layers, topic, joined(*edges))
+    starts, ends = (np.concatenate(each) for each in zip(*times, strict=True))
+    return KeptSound(layers, topic, joined(starts, ends))
 
 
 def sound_files(

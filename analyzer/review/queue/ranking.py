@@ -209,8 +209,8 @@ def _useful(
     if audible is None:
         return rows[cover(points, gamma, shares, eligible, count)]
     kept, row, _ = pieces(some, audible)
-    heard = np.bincount(row, kept.ends - kept.starts, len(some))
-    heard = heard > _MOSTLY * (some.ends - some.starts)
+    length = np.bincount(row, kept.ends - kept.starts, len(some))
+    heard = length > _MOSTLY * (some.ends - some.starts)
     first = cover(points, gamma, shares, eligible & heard, count)
     rest = cover(points, gamma, shares, eligible & ~heard, count - len(first))
     return rows[np.concatenate([first, rest])]
