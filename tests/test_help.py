@@ -66,7 +66,7 @@ def test_the_help_of_a_verb_shows_the_defaults_that_it_documents(verb):
 @pytest.mark.parametrize(
     ("verb", "default"),
     [
-        ("record", "the first file's modification time"),
+        ("record", "what their names or metadata say, else a guess"),
         ("recover", "LOG.recovered.mcap"),
         ("review", "the login name"),
         ("review", "what the logs say, or UTC"),

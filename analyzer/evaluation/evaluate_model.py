@@ -10,7 +10,7 @@ from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detec
 from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of
 from hearthlog.analyzer.training.rooms import captured, steady_noise
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
@@ -71,7 +71,9 @@ def evaluate_model(
     data = cut_recordings(listener.overhear(recordings, scenario), scenario, features)
     if not len(data):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
-        raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
+        raise DataError(
+            f"no clip has a segment to test on ({reasons[:300]}{example_of(data.left_out)})"
+        )
     probabilities = segment_probabilities(
         classifier, of_segments(classifier.inputs, data.windows, data.floor)
     )

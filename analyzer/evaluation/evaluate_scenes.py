@@ -28,7 +28,7 @@ from hearthlog.analyzer.evaluation.scenes import (
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.training.dataset import UNREADABLE, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import Scores
 from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
@@ -195,8 +195,8 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
     if not by_label:
         reasons = "; ".join(f"{count}: {reason}" for reason, count in sorted(skipped.items()))
         raise DataError(
-            f"no clip can be laid into a scene ({reasons[:300]}); give clips of "
-            f"{', '.join(wanted)[:300]}"
+            f"no clip can be laid into a scene ({reasons[:300]}{example_of(left_out)}); "
+            f"give clips of {', '.join(wanted)[:300]}"
         )
     laid = [clip for same in by_label.values() for clip in same]
     silence = scenario.find(SILENCE) or SILENCE

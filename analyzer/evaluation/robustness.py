@@ -13,7 +13,7 @@ from hearthlog.analyzer.evaluation.evaluate_model import fitted, segment_probabi
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of
 from hearthlog.analyzer.training.rooms import (
     RoomCopy,
     band_limits,
@@ -183,7 +183,7 @@ def robustness(
     target, group = np.concatenate(targets), np.concatenate(group_numbers)
     if not len(target):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in skipped.items())
-        raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
+        raise DataError(f"no clip has a segment to test on ({reasons[:300]}{example_of(left_out)})")
     first, *others = np.concatenate(predictions, axis=1)
     classes = tuple(scenario.classes)
     sure = np.eye(len(classes))

@@ -76,6 +76,16 @@ def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
     return lines
 
 
+def example_of(left_out: Sequence[LeftOut]) -> str:
+    """Name the first clip that was left out, behind the reasons; empty if there is none.
+
+    Parameters
+    ----------
+    left_out : sequence of LeftOut
+    """
+    return f", such as {left_out[0].clip}" if left_out else ""
+
+
 class _RowError(DataError):
     """One line of a manifest is of no use."""
 
