@@ -22,7 +22,7 @@ from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
 from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, by_start, not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
-from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
+from hearthlog.schemas.mcap.large_chunks import ContentStream, TooLargeError, read_parts
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
@@ -169,7 +169,9 @@ def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
             ids = file.channel_set(frozenset(np.unique(channels).tolist()))
             rows.extend([offset, 0, 0, part.size, *(min(time, LAST_TIME) for time in span)])
             rows.extend([ids, part.first])
-    except (McapError, UnicodeDecodeError) as error:
+    except TooLargeError as error:
+        raise LogError(f"{file.path}: {error}, at byte {offset}") from error
+    except McapError as error:
         raise file.damaged(offset, error) from error
     return np.frombuffer(rows, CHUNKS)
 
