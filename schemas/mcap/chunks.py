@@ -428,10 +428,10 @@ class _Batch(NamedTuple):
         parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
         without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
         parts = parts[~np.isin(parts[:, 1], others)]
-        identities, firsts = np.unique(parts[:, 1], return_index=True)
+        identities, firsts, counts = np.unique(parts[:, 1], return_index=True, return_counts=True)
+        by_channel = np.split(parts[np.argsort(parts[:, 1], kind="stable")], np.cumsum(counts)[:-1])
         entries_of = {
-            identity: [self._entries(parts[parts[:, 1] == identity])]
-            for identity in identities[np.argsort(firsts)].tolist()
+            int(identities[i]): [self._entries(by_channel[i])] for i in np.argsort(firsts).tolist()
         }
         channels = self.file.channels.keys()
         known = entries_of.keys() <= channels
