@@ -19,7 +19,7 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, by_start, not_empty
+from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, LATE, by_start, not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
 from hearthlog.schemas.mcap.large_chunks import ContentStream, TooLargeError, read_parts
@@ -27,7 +27,6 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
 
-_LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
 _STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
 _WRONG_INDEX = "the index of a chunk does not belong to it"
@@ -515,7 +514,7 @@ class _Batch(NamedTuple):
         heads = gather_heads(self.buffer, starts)
         late = (heads["log_time"] < 0) | (heads["log_time"] > LAST_TIME)
         if late.any() and self.file.late:
-            warnings.warn(HearthlogWarning(_LATE, self.file.path, each=True), stacklevel=2)
+            warnings.warn(HearthlogWarning(LATE, self.file.path, each=True), stacklevel=2)
             entries, number, rest = entries[~late], number[~late], rest[~late]
             starts, heads = starts[~late], heads[~late]
         sound = (
