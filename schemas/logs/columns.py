@@ -236,7 +236,7 @@ def decode_readable(
         message is left.
     """
     decoded = (_decode_readable(raw, fields) for raw in messages)
-    return _joined([columns for columns in decoded if columns is not None])
+    return _joined([_with_known_times(columns) for columns in decoded if columns is not None])
 
 
 def unreadable(channel: Channel, schema: Schema | None) -> str:
@@ -369,20 +369,20 @@ def _decode(
         schema.name,
         raw.channel.metadata,
         np.ascontiguousarray(raw.heads["log_time"]),
-        _publish_times(raw),
+        np.ascontiguousarray(raw.heads["publish_time"]),
         np.ascontiguousarray(raw.heads["sequence"]),
         values,
     )
 
 
-def _publish_times(raw: RawMessages) -> Int64:
-    times = np.ascontiguousarray(raw.heads["publish_time"])
-    late = times < 0  # 2**63 or more, in the file
-    if late.any():
-        text = "publish times after the year 2262 are not known here: 2262-04-11 stands for them"
-        warnings.warn(HearthlogWarning(text, raw.channel.topic), stacklevel=2)
-        return np.where(late, LAST_TIME, times)
-    return times
+def _with_known_times(columns: Columns) -> Columns:
+    """Put the last time that there is in the place of later publish times, with a warning."""
+    late = columns.publish_times < 0  # 2**63 or more, in the file
+    if not late.any():
+        return columns
+    text = "publish times after the year 2262 are not known here: 2262-04-11 stands for them"
+    warnings.warn(HearthlogWarning(text, columns.topic), stacklevel=2)
+    return replace(columns, publish_times=np.where(late, LAST_TIME, columns.publish_times))
 
 
 def join(parts: Sequence[Columns]) -> Columns:

@@ -27,6 +27,7 @@ CHUNKS = np.dtype(
     ]
 )
 LAST_TIME = (1 << 63) - 2  # ns; later log times, as of clocks that ran below zero, are not read
+LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
 _EMPTY = 80  # bytes that a chunk without records has at most
 _RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
 

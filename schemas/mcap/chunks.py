@@ -19,15 +19,14 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, by_start, not_empty
+from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, LATE, by_start, not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
-from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
+from hearthlog.schemas.mcap.large_chunks import ContentStream, TooLargeError, read_parts
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
 
-_LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
 _STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
 _WRONG_INDEX = "the index of a chunk does not belong to it"
@@ -169,7 +168,9 @@ def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
             ids = file.channel_set(frozenset(np.unique(channels).tolist()))
             rows.extend([offset, 0, 0, part.size, *(min(time, LAST_TIME) for time in span)])
             rows.extend([ids, part.first])
-    except (McapError, UnicodeDecodeError) as error:
+    except TooLargeError as error:
+        raise LogError(f"{file.path}: {error}, at byte {offset}") from error
+    except McapError as error:
         raise file.damaged(offset, error) from error
     return np.frombuffer(rows, CHUNKS)
 
@@ -426,10 +427,10 @@ class _Batch(NamedTuple):
         parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
         without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
         parts = parts[~np.isin(parts[:, 1], others)]
-        identities, firsts = np.unique(parts[:, 1], return_index=True)
+        identities, firsts, counts = np.unique(parts[:, 1], return_index=True, return_counts=True)
+        by_channel = np.split(parts[np.argsort(parts[:, 1], kind="stable")], np.cumsum(counts)[:-1])
         entries_of = {
-            identity: [self._entries(parts[parts[:, 1] == identity])]
-            for identity in identities[np.argsort(firsts)].tolist()
+            int(identities[i]): [self._entries(by_channel[i])] for i in np.argsort(firsts).tolist()
         }
         channels = self.file.channels.keys()
         known = entries_of.keys() <= channels
@@ -513,7 +514,7 @@ class _Batch(NamedTuple):
         heads = gather_heads(self.buffer, starts)
         late = (heads["log_time"] < 0) | (heads["log_time"] > LAST_TIME)
         if late.any() and self.file.late:
-            warnings.warn(HearthlogWarning(_LATE, self.file.path, each=True), stacklevel=2)
+            warnings.warn(HearthlogWarning(LATE, self.file.path, each=True), stacklevel=2)
             entries, number, rest = entries[~late], number[~late], rest[~late]
             starts, heads = starts[~late], heads[~late]
         sound = (

@@ -23,6 +23,10 @@ _CLAIMED, _RATIO = 1 << 30, 256
 Read = Callable[[int, int], bytes]  # bytes of a file from an offset on
 
 
+class TooLargeError(McapError):
+    """A chunk claims more than is worth the time."""
+
+
 class ContentStream:
     """The records of a chunk, decompressed piece by piece.
 
@@ -55,7 +59,7 @@ class ContentStream:
         if HEAD.unpack_from(begin)[0] != Opcode.CHUNK:
             raise McapError("here should be a chunk")
         if self.head.size > _CLAIMED + _RATIO * stored:
-            raise McapError("a chunk is larger than hearthlog reads")
+            raise TooLargeError("a chunk is larger than hearthlog reads")
         self._crc = 0
         source = _Stored(read, offset + HEAD.size + self.head.data.start, stored)
         self._stream = _decompressing(self.head.compression, io.BufferedReader(source, _PIECE))

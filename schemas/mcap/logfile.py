@@ -20,6 +20,7 @@ from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap.chunk_table import (
     CHUNKS,
     LAST_TIME,
+    LATE,
     ChunkRow,
     RecordLocation,
     by_start,
@@ -130,9 +131,14 @@ class LogFile:
     @property
     def span(self) -> tuple[int, int] | None:
         """First and last log time of the chunks that were met; None if there are none."""
-        if not len(self.chunks):
+        chunks = self.chunks
+        if self.late:
+            chunks = chunks[chunks["start"] < LAST_TIME]
+            if len(chunks) < len(self.chunks):
+                warnings.warn(HearthlogWarning(LATE, self.path, each=True), stacklevel=2)
+        if not len(chunks):
             return None
-        return int(self.chunks["start"].min()), int(self.chunks["end"].max())
+        return int(chunks["start"].min()), int(chunks["end"].max())
 
     def is_at(self, path: Path) -> bool:
         """Tell whether a path leads to this open file, and not to another one or none."""
