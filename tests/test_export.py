@@ -748,6 +748,15 @@ def test_one_bad_topic_or_message_is_left_out_of_every_format(hearthlog, tmp_pat
         assert arrays["data"].tolist() == [5]
 
 
+def test_a_type_of_two_definitions_is_named_for_readers_of_rosbag2(hearthlog, tmp_path):
+    own = (OWN, "int32 a\n", struct.pack("<i", 1)), (OWN, "int32 b\n", struct.pack("<i", 2))
+    log = changing(tmp_path / "x.mcap", *own)
+    result = hearthlog("export", log, "-o", tmp_path / "bag", "--format", "rosbag2")
+    assert result.returncode == 3
+    assert f"{OWN} is defined in two ways, of which readers of rosbag2 take one" in result.stderr
+    assert len(raw_messages(tmp_path / "bag" / "bag.mcap")) == 2
+
+
 def test_texts_that_are_not_utf_8_are_readable_in_a_ros_1_bag(hearthlog, tmp_path):
     texts = b"caf\xe9", b"caf\xc3\xa9"
     payloads = [struct.pack("<I", len(text) + 1) + text + b"\0" for text in texts]

@@ -1,11 +1,13 @@
 """Logs as a rosbag2 folder."""
 
 import warnings
+from typing import Any
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import is_for_rosbag2, write_log
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.messages.type_definitions import defined_types
 from hearthlog.schemas.progress import Progress
 
 _NO_PLACE = (
@@ -23,6 +25,7 @@ def _save(selection: Selection, files: OutputFiles, progress: Progress) -> int:
         warnings.warn(HearthlogWarning(f"{_NO_PLACE}: left out", topic, each=True), stacklevel=2)
     if len(topics) < len(selection.channels):
         selection = selection.only(topics)
+    _warn_of_definitions(selection)
     log = files.path / f"{files.output.name}.mcap"
     with log.open("xb") as stream:
         record, repeated = write_log(selection, stream, log.name, progress)
@@ -31,6 +34,21 @@ def _save(selection: Selection, files: OutputFiles, progress: Progress) -> int:
     text = f"rosbag2_bagfile_information: {information}\n"
     (files.path / "metadata.yaml").write_text(text, "utf-8")
     return repeated
+
+
+def _warn_of_definitions(selection: Selection) -> None:
+    """Warn of types with several definitions: readers of rosbag2 decode all by one of them."""
+    known: dict[str, Any] = {}
+    for topic, channels in selection.channels.items():
+        for schema in [schema for _, schema in channels if schema is not None]:
+            try:
+                types = defined_types(schema.name, schema.encoding, schema.data)
+            except LogError:
+                continue  # its messages are copied all the same
+            for name, (_, fields) in types.items():
+                if known.setdefault(name, fields) != fields:
+                    text = f"{name} is defined in two ways, of which readers of rosbag2 take one"
+                    warnings.warn(HearthlogWarning(text, topic), stacklevel=2)
 
 
 EXPORTER = Exporter(_save)
