@@ -382,9 +382,9 @@ def test_an_address_of_the_network_comes_with_a_warning(tmp_path):
 
 
 @pytest.mark.parametrize("bind", ["localhost", "box.example", ""])
-def test_an_address_that_is_a_name_is_refused(tmp_path, bind):
-    with pytest.raises(BridgeError, match="in digits"):
-        HomePage(PageSettings(bind=bind), Home(tmp_path, "home", UTC), tmp_path, print)
+def test_an_address_that_is_a_name_is_refused(bind):
+    with pytest.raises(ValidationError, match="in digits"):
+        PageSettings(bind=bind)
 
 
 def test_a_port_that_is_taken_is_named(served, tmp_path):
