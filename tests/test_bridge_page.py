@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import socket
 import time
 from contextlib import ExitStack, suppress
@@ -392,7 +393,9 @@ def test_a_port_that_is_taken_is_named(served, tmp_path):
         HomePage(PageSettings(port=served.port), served.home, tmp_path, print)
 
 
-def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path):
+def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path, monkeypatch):
+    journal = os.fstat(2)
+    monkeypatch.setenv("JOURNAL_STREAM", f"{journal.st_dev}:{journal.st_ino}")
     said = []
     for _ in range(2):
         home = Home(tmp_path, "home", UTC)
@@ -402,13 +405,11 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path):
     assert {path.stat().st_mode & 0o777 for path in secrets.values()} == {0o600}
     token = secrets["page-token"].read_text().strip()
     assert secrets["page-address"].read_text().strip().endswith(f"/?token={token}")
-    # A service would say it to its journal.
     assert not any(path.read_text().strip() in line for path in secrets.values() for line in said)
     assert all(str(secrets["page-address"]) in line for line in said)
 
 
-def test_a_terminal_is_shown_the_whole_address(tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+def test_who_starts_the_bridge_is_shown_the_whole_address(tmp_path):
     said = []
     HomePage(
         PageSettings(port=free_port()), Home(tmp_path, "home", UTC), tmp_path, said.append

@@ -1,10 +1,11 @@
 """The page of the home, made of what the bridge knows, once a second where something changed."""
 
 import json
-import sys
+import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -82,14 +83,10 @@ class HomePage:
         except BridgeError:
             self._server.end()
             raise
-        # A service says it to its journal, which others may read.
-        is_shown = sys.stderr is not None and sys.stderr.isatty()
-        place = (
-            whole
-            if is_shown
-            else f"{address}; its whole address, which opens it, is in {file.absolute()}"
-        )
-        say(f"the page of the home: {place}")
+        # Others may read the journal.
+        if _writes_to_journal():
+            whole = f"{address}; its whole address, which opens it, is in {file.absolute()}"
+        say(f"the page of the home: {whole}")
         if not bind.is_loopback:
             say(
                 f"the page listens on {settings.bind}: it crosses the network in the clear, and "
@@ -153,3 +150,11 @@ def _day_key(news: News) -> Any:
         )
         for each in microphones
     ]
+
+
+def _writes_to_journal() -> bool:
+    """Whether standard error is the journal of systemd, which says so as DEVICE:INODE."""
+    with suppress(OSError):
+        status = os.fstat(2)
+        return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+    return False
