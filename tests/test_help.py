@@ -167,7 +167,7 @@ def test_completing_a_word_imports_nothing_that_takes_long():
         ("rerun", "viewer", ("review", "none", "--save", "day.rrd")),
         ("distributed", "cluster", (*_TRAIN, "--scheduler", "tcp://127.0.0.1:1")),
         ("upath", "cluster", ("info", "s3://homes/anna")),
-        ("sklearn", "analyzer", _TRAIN),
+        ("sklearn", "headless", _TRAIN),
     ],
 )
 def test_what_is_not_installed_is_named_with_a_command_that_installs_it(
@@ -177,7 +177,7 @@ def test_what_is_not_installed_is_named_with_a_command_that_installs_it(
     path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
     result = hearthlog(*verb, env={"PYTHONPATH": path})
     assert result.returncode == 1
-    assert result.stderr.endswith(f"; try: pip install '.[{extra}]' in a clone of hearthlog\n")
+    assert re.search(rf"; try: \S.* '\S+\[{extra}\]'", result.stderr)
     assert result.stderr.count("\n") == 1
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.schemas.logs.files import check_allowed
 from hearthlog.tools.cli.options import Json, Scheduler, log_location, logs_folder
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
@@ -48,6 +47,7 @@ def catalog(
     is unfinished or damaged.
     """
     from hearthlog.analyzer.extras import require
+    from hearthlog.schemas.logs.files import check_allowed
 
     require("pyarrow")
     from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, UNFINISHED
