@@ -40,6 +40,9 @@ def resume(logs: LogsFolder) -> None:
 
 
 def _check_folder(logs: Path) -> None:
+    from hearthlog.schemas.logs.files import check_allowed
+
+    check_allowed(logs)
     if not logs.is_dir():
         wrong_use(f"{logs}: no such folder; name the folder that the recorder writes to")
 
