@@ -285,7 +285,7 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     logs = write_day(tmp_path / "home", DAY, coughs)
     page = tmp_path / "before.html"
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), page)
-    assert "as labelled, not checked here" in page.read_text()
+    assert "How often, as labelled" in page.read_text()
     assert "nine times in ten" not in page.read_text()
     for hour in range(8, 14):
         check(logs, at(f"{hour:02}:00"), [(5, 7, "objects_activity")] if hour % 2 else [])
