@@ -136,7 +136,8 @@ def _mixer(name: str, channels: int, channel: int | None) -> Any:
 
     def mix(samples: "array[int]") -> bytes:
         nonlocal recent, count
-        block = np.frombuffer(samples, np.int16).reshape(-1, channels) / np.float32(32768)
+        values = np.frombuffer(samples, np.int16).reshape(-1, channels).astype(np.float32)
+        block = values / np.float32(32768)
         if channel is None:
             count += len(block)
             recent = np.concatenate([recent, block])
