@@ -110,6 +110,8 @@ def file_time(path: Path, zone: tzinfo, pattern: str = "") -> FileTime:
     SourceError
         If the file cannot be read, or its name does not fit the pattern.
     """
+    if not path.exists():
+        raise SourceError(f"{path}: no such file")
     if pattern:
         return _placed(path, _by_pattern(path, pattern), zone, NAME)
     refused: list[str] = []
@@ -202,9 +204,6 @@ def _by_pattern(path: Path, pattern: str) -> _Moment:
     )
     folders = pattern.count("/")
     name = "/".join(path.absolute().parts[-1 - folders :])
-    refusal = SourceError(
-        f"{path}: its name does not fit {pattern[:80]!r}, by which it should say when it begins"
-    )
     refusal = SourceError(
         f"{path}: its name does not fit {pattern[:80]!r}, by which it should say when it begins"
     )
