@@ -1,4 +1,4 @@
-"""What is wrong in a configuration, each slip in a line that says what to write instead."""
+"""The slips of a configuration, each in a line that says what to write instead."""
 
 import json
 import math

@@ -55,7 +55,7 @@ class RecordingSummary:
 
 @dataclass
 class RecorderState:
-    """What a recorder is doing, for a terminal; other threads may read it at any time.
+    """The state of a recorder, for a terminal; other threads may read it at any time.
 
     Attributes
     ----------

@@ -251,7 +251,7 @@ class HomeState:
         return [each for each in self.microphones.values() if not self.is_left_out(each.name)]
 
     def is_left_out(self, name: str) -> bool:
-        """Tell whether the recorder has a microphone, or a scenario of it, no more.
+        """Return whether the recorder no longer has a microphone, or a scenario of it.
 
         Parameters
         ----------

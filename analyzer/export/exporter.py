@@ -1,4 +1,4 @@
-"""What the modules of export formats have in common: the tables of topics, and their files."""
+"""Tables of topics and their files, which the modules of export formats share."""
 
 import io
 import os
@@ -217,7 +217,7 @@ class OutputFiles:
 
     @property
     def remedy(self) -> str:
-        """What to do where one file is not enough."""
+        """The advice where one file is not enough."""
         return f"name a folder, with --format {self._suffix}, for a file of each"
 
     def new(self, stem: str) -> Path:

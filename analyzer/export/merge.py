@@ -275,7 +275,7 @@ class _Log:
 
 
 def is_for_rosbag2(channels: Sequence[Described]) -> bool:
-    """Tell whether rosbag2 has one description for the channels of a topic.
+    """Return whether rosbag2 has one description for the channels of a topic.
 
     Parameters
     ----------

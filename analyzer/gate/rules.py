@@ -124,12 +124,12 @@ def _sure_lost(evidence: Evidence, champion: str) -> Iterator[str]:
         much = sure >= min(_MUCH * total, _MUCH_OF_SOUND * sound)
         others = evidence.sure[i].copy()
         others[i] = 0
-        asked = sum(
+        corrected = sum(
             float(others[j])
             for j, new in enumerate(changes.classes)
-            if _is_asked_for(evidence, name, new)
+            if _is_correction(evidence, name, new)
         )
-        if sure and much and kept + asked < _KEPT * sure:
+        if sure and much and kept + corrected < _KEPT * sure:
             most = class_words(changes.classes[int(others.argmax())])
             yield (
                 f"of {changes.words(sure)} of {class_words(name)} of which {champion} is sure "
@@ -137,7 +137,7 @@ def _sure_lost(evidence: Evidence, champion: str) -> Iterator[str]:
             )
 
 
-def _is_asked_for(evidence: Evidence, name: str, new: str) -> bool:
+def _is_correction(evidence: Evidence, name: str, new: str) -> bool:
     """See whether marks of a new class say that a class was wrong, and none that it was right."""
     if new not in evidence.taught:
         return False

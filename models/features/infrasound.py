@@ -1,6 +1,6 @@
-"""What is below hearing: an offset, a drift or a rumble, taken out of frames where it stands out.
+"""A filter of offsets, drifts and rumbles below hearing, for frames in which they stand out.
 
-It is no sound, yet it sets the floor of the room and hides what is above it. Polynomials follow it
+What is below hearing sets the floor of the room and hides the sound above it. Polynomials follow it
 through each frame on its own, so that a step leaves no trace behind it. Frames in which it does not
 stand out stay as they are, to the last bit: feature sets and models know them so.
 """

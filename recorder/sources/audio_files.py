@@ -98,7 +98,7 @@ class FileSource:
 
     @property
     def warnings(self) -> list[str]:
-        """What of the files was not heard, or not at its time, as far as they were read."""
+        """Parts of the files that were not heard, or not at their time, so far."""
         lines = list(self._choices)
         if self._hole_seconds:
             lines.append(f"{self.device}: {self._hole_seconds:.2f} s are left out: {_NO_NUMBERS}")

@@ -295,7 +295,7 @@ class LogFile:
         return True
 
     def _lists_all_messages(self) -> bool:
-        """Tell whether the message indexes of all chunks have as many entries as are counted."""
+        """Return whether the message indexes of all chunks have as many entries as are counted."""
         if self.statistics is None:
             return False
         counts = np.array([len(channels) for channels in self.channel_sets] or [0])

@@ -252,7 +252,7 @@ class Salvage:
             raise McapError("no record begins where this one ends")
 
     def _like_message(self, record: bytes) -> bool:
-        """Tell whether a record of an unknown kind was a message of a channel, but for a bit."""
+        """Return whether a record of an unknown kind was a message of a channel, but for a bit."""
         if len(record) < MESSAGE.size or (record[0] ^ Opcode.MESSAGE).bit_count() != 1:
             return False
         _, _, channel, _, log_time, _ = MESSAGE.unpack_from(record)

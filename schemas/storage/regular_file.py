@@ -70,7 +70,7 @@ def may_be_regular(path: Path) -> bool:
 
 
 def is_denied(path: str | Path) -> bool:
-    """Tell whether there is a file or a folder that this user may not read."""
+    """Return whether there is a file or a folder that this user may not read."""
     if os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):  # noqa: PTH112
         return False
     try:

@@ -1,4 +1,4 @@
-"""What a broker was given to keep, and what it is not told of: remembered between two starts.
+"""The topics that a broker keeps, and the classes it hears nothing of, between two starts.
 
 Nothing of this is read back from the broker: whoever may write there could change it.
 """
@@ -22,7 +22,7 @@ _LIMIT = 4 << 20  # bytes
 
 
 class Place(NamedTuple):
-    """What a topic is about; parts that do not apply are empty."""
+    """The subject of a topic; parts that do not apply are empty."""
 
     kind: str
     microphone: str = ""
@@ -98,7 +98,7 @@ class Announced:
             return sorted(self._muted)
 
     def is_told(self, label: str) -> bool:
-        """Tell whether the broker is told when a class is heard."""
+        """Return whether events of a class are published."""
         with self._lock:
             return label not in self._muted
 

@@ -129,7 +129,7 @@ class Connection:
         self._unsent = dict.fromkeys(self._values)
 
     def is_taken(self) -> bool:
-        """Tell whether the broker has all values."""
+        """Return whether the broker has all values."""
         if self._unsent or self._last_kept is None:
             return not self._unsent
         with suppress(RuntimeError, ValueError):

@@ -54,7 +54,7 @@ class Topics(NamedTuple):
 
     @property
     def told_filter(self) -> str:
-        """What all names of `of_told` match."""
+        """The subscription that matches all names of `of_told`."""
         return f"{self.root}/told/+"
 
     def parse_told(self, topic: str) -> str | None:

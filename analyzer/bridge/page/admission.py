@@ -56,7 +56,7 @@ class PageAdmission:
         return self._pass(int(time.time()) + _YEAR)
 
     def is_pass(self, text: str) -> bool:
-        """Tell whether a text is a pass that is valid now."""
+        """Return whether a text is a pass that is valid now."""
         until, _, _ = text.partition("-")
         if not (until.isascii() and until.isdecimal()) or len(until) > 12:
             return False
@@ -116,13 +116,13 @@ class PageAdmission:
         return f"{reason}{_WHOLE}"
 
     def _is_named(self, host: str) -> bool:
-        """Tell whether the page may be asked for by the host of a request."""
+        """Return whether the page opens under the host of a request."""
         if host in self.names or host_name(f"//{host}") in self.names:
             return True
         return bool(host) and is_asked_in_digits(self.bind, host)
 
     def _is_own(self, origin: str, host: str) -> bool:
-        """Tell whether an origin is that of the page itself."""
+        """Return whether an origin is that of the page itself."""
         scheme, _, place = origin.partition("://")
         return scheme in {"http", "https"} and (place == host or place in self.names)
 

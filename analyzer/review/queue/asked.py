@@ -1,4 +1,4 @@
-"""What a label file was made to ask: its lines, and beside it the sounds and a list of the spans.
+"""The label file of a queue: its lines, and beside it the sounds and a list of the spans.
 
 By the list an import knows what was looked at.
 """
@@ -58,7 +58,7 @@ def _stem(labels: Path) -> str:
 
 
 class KeptSound(NamedTuple):
-    """What sound of a microphone was kept.
+    """The kept sound of a microphone.
 
     Attributes
     ----------
