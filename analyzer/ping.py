@@ -84,6 +84,9 @@ def ping(url: str, *, is_well: bool) -> str:
             problems[:] = [what or type(reason).__name__]
 
     thread = Thread(target=ask, daemon=True)
-    thread.start()
+    try:
+        thread.start()
+    except RuntimeError:
+        return "no thread is free"
     thread.join(_SECONDS)
     return "".join(problems)

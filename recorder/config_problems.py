@@ -162,7 +162,7 @@ def _words(error: Any, place: _Place, key: Key) -> str:
     if problem := _problem_of_table(value, about, key, name):
         return problem
     if kind in {"too_long", "too_short"}:
-        limits = ("at least", "minItems"), ("at most", "maxItems")
+        limits = ("at least", "minItems"), ("at most", "maxItems"), ("at most", "maxProperties")
         counts = [f"{words} {about[limit]}" for words, limit in limits if limit in about]
         return f"has {len(value)} entries; write {' and '.join(counts)}"
     example = _example_of_value(name, value, place)

@@ -14,10 +14,12 @@ from killed_bridge import ZONE, kill_at_random, start_recorder
 from livehome import LiveHome, following, midday_zone
 
 from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.mqtt import publisher
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.rest import paused_until
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
@@ -162,6 +164,23 @@ def test_a_microphone_that_the_newest_log_has_no_more_is_cleared_and_nobody_else
     assert {topic: kept[topic] for topic in foreign} == foreign
     own = {topic for topic in kept if "/mic" in topic or "kitchen" in topic} - {*foreign}
     assert own == set()
+
+
+@pytest.mark.parametrize(
+    ("hours", "is_renamed"),
+    [({"old": [7], "new": [8, 9]}, True), ({"old": [7, 9], "new": [8]}, False)],
+)
+def test_a_recorder_that_records_beside_another_one_is_no_other_name_of_it(
+    tmp_path, hours, is_renamed
+):
+    for node, times in hours.items():
+        for hour in times:
+            (tmp_path / f"{node}_20260301T{hour:02}0000Z.mcap").touch()
+    home = Home(tmp_path, "new", midday_zone())
+    assert publisher._is_renamed(home, "old") == is_renamed
+    assert not publisher._is_renamed(home, "new")
+    with FolderLock(tmp_path, "old"):
+        assert not publisher._is_renamed(home, "old")
 
 
 @pytest.mark.parametrize(
@@ -342,7 +361,7 @@ def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_
             listener.wait_for(f"{COUGHING}/on", "ON")
             listener.publish(f"{ROOT}/command", json.dumps(command))
             listener.wait_for(f"{COUGHING}/on", "OFF")
-        memory = home.folder.parent / "bridge" / "mqtt.json"
+        memory = home.folder.parent / "bridge" / "mqtt-home.json"
         with Bridged(home.folder, broker) as bridged:
             home.heard("coughing", 0.1)
             home.heard("speech", 0.1)

@@ -14,7 +14,7 @@ from pydantic import (
 )
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
+from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings, SecretFile
 from hearthlog.analyzer.ping import is_ping_address
 from hearthlog.analyzer.ports import ip_of
 from hearthlog.recorder.config import BRIDGE, MicrophoneSettings, Settings, load_settings
@@ -48,6 +48,8 @@ def _check_ping_address(url: str) -> str:
 
 
 def _check_host(name: str) -> str:
+    if "/" in name or "@" in name:  # it may have a password in it
+        raise ValueError("is an address; write the name of the host alone, as broker.lan")
     try:
         encoded = name.encode("idna")
     except UnicodeError:
@@ -100,7 +102,7 @@ class MqttSettings(_Table):
     user: str = Field(
         default="", examples=["hearthlog"], description="Empty: nobody in particular."
     )
-    password_file: Path | None = Field(
+    password_file: SecretFile | None = Field(
         default=None, examples=["/etc/hearthlog/mqtt-password"], description="Of one line."
     )
     tls: bool = Field(default=False, description="Whether the connection is encrypted.")
@@ -129,7 +131,7 @@ class PrometheusSettings(_Table):
         description="For the textfile collector of node_exporter; ends in .prom.",
     )
     port: _Port | None = Field(default=None, description="On loopback; none: no port.")
-    token_file: Path | None = Field(
+    token_file: SecretFile | None = Field(
         default=None,
         description="Of one line, which who asks on the port has to show: the `credentials_file` "
         "of Prometheus.",
@@ -146,7 +148,7 @@ class PageSettings(_Table):
     bind: Annotated[str, AfterValidator(_check_bind)] = Field(
         default="127.0.0.1", description="Address of this machine; others than loopback, too."
     )
-    token_file: Path | None = Field(
+    token_file: SecretFile | None = Field(
         default=None,
         description="Of one line, which the address of the page has to have; by default one is "
         "made in the folder of the state.",
@@ -170,7 +172,7 @@ class PingSettings(_Table):
         examples=["https://hc-ping.com/your-uuid"],
         description="As of healthchecks.io.",
     )
-    url_file: Path | None = Field(
+    url_file: SecretFile | None = Field(
         default=None, description="Of one line, with that address: who knows it can ping, too."
     )
     every_seconds: float = Field(default=60.0, ge=5.0, le=86_400, description="Between pings.")

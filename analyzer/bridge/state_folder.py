@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.schemas.storage.new_files import private_folder
 
 _OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between them
 
@@ -31,7 +32,7 @@ def state_folder(configured: Path | None, logs: Path) -> Path:
     given = os.environ.get(_OF_SYSTEMD, "").partition(":")[0]
     folder = configured or (Path(given) if given else logs.absolute().parent / "bridge")
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private_folder(folder)
     except OSError as error:
         raise BridgeError(
             f"{folder}: cannot be made ({error.strerror}); name another one: bridge.state"

@@ -227,11 +227,11 @@ def new_folder(path: Path) -> Iterator[Path]:
     with _temporary(path) as temporary:
         temporary.mkdir(mode=0o700)
         yield temporary
+        _give(temporary, 0o700)  # before the files, which go to whom it belongs to
         for file in temporary.iterdir():
             _give(file, 0o600)
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             list(pool.map(sync_file, temporary.iterdir()))
-        _give(temporary, 0o700)
         sync_folder(temporary)
         path.mkdir()  # the name is ours now; only an empty folder is replaced
         temporary.replace(path)

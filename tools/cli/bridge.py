@@ -1,6 +1,7 @@
 """`hearthlog bridge`: what is heard, told to the systems of the home."""
 
 import signal
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
 from typing import Annotated
@@ -45,7 +46,9 @@ def bridge(
         "prometheus_client": own.prometheus,
         "apprise": own.alert and own.delivery.urls_file,
     }
-    require(*(module for module, table in needed.items() if table))
+    lacking = [name for name, table in needed.items() if table and find_spec(name) is None]
+    if not (own.page or own.ping or any(needed[name] for name in needed if name not in lacking)):
+        require(*lacking)  # what else there is goes on without them
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())

@@ -73,10 +73,10 @@ def install_bridge(config: Path, account: str | None) -> Installed:
 
 def _check_files(bridge: BridgeSettings) -> None:
     """Check that the service sees what it reads besides; a relative name is of a credential."""
-    tables = bridge.mqtt, bridge.page, bridge.delivery
+    tables = bridge.mqtt, bridge.page, bridge.delivery, bridge.prometheus, bridge.ping
     for table in (each for each in tables if each is not None):
         for key, path in table:
-            if isinstance(path, Path) and path.is_absolute():
+            if isinstance(path, Path) and path.is_absolute() and key != "text_file":  # is written
                 check_seen(key, path)
 
 

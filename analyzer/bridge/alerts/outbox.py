@@ -10,7 +10,7 @@ from typing import Any
 
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import private_folder, replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -66,7 +66,7 @@ class Outbox:
         self._most = most
         self._lock = Lock()
         self._waiting: dict[str, Waiting] = {}
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private_folder(folder)
         for path in sorted(folder.glob(f"*{_SUFFIX}")):
             self._load(path)
         self._early = frozenset(self._waiting)  # what was there may be evaluated once more

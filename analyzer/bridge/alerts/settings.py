@@ -1,8 +1,18 @@
 """How alerts are delivered."""
 
 from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+
+def _check_secret_file(value: Any) -> Any:
+    if "://" in str(value):  # a secret, which no message may repeat
+        raise ValueError("names a file; write the address into that file, on a line of its own")
+    return value
+
+
+SecretFile = Annotated[Path, BeforeValidator(_check_secret_file)]
 
 
 class DeliverySettings(BaseModel):
@@ -10,7 +20,7 @@ class DeliverySettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    urls_file: Path | None = Field(
+    urls_file: SecretFile | None = Field(
         default=None,
         examples=["/etc/hearthlog/alert-urls"],
         description="Addresses as Apprise reads them, one a line; they are secrets.",

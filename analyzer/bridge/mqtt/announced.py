@@ -14,10 +14,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import private_folder, replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
-_FILE, _LOCK = "mqtt.json", ".mqtt.lock"
+_PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
 _LIMIT = 4 << 20  # bytes
 
 
@@ -44,9 +44,14 @@ class Announced:
     Parameters
     ----------
     folder : Path
-        Of the state of the bridge; two bridges cannot share one.
+        Of the state of the bridge; two bridges of one recorder cannot share one.
+    node : str
+        Name of the recorder.
     broker : str
         Host and port. What another broker was given is forgotten.
+    is_renamed : callable
+        Given the name of another recorder, returns whether it has this name now: what was
+        remembered of it is taken over.
     say : callable
         Told what is wrong, in a line.
 
@@ -57,14 +62,30 @@ class Announced:
         Whether nothing was remembered.
     """
 
-    def __init__(self, folder: Path, broker: str, say: Callable[[str], None]) -> None:
-        self.path = folder / _FILE
+    def __init__(
+        self,
+        folder: Path,
+        node: str,
+        broker: str,
+        is_renamed: Callable[[str], bool],
+        say: Callable[[str], None],
+    ) -> None:
+        self.path = folder / f"{_PREFIX}{node}{_SUFFIX}"
         self._say = say
         self._lock = Lock()
         self._is_changed = False
         self._descriptor = self._take_lock(folder)
-        self.is_new = self._descriptor is None or not self.path.exists()
-        content = _Content() if self.is_new else self._load()
+        self._former: list[Path] = []  # of names that the recorder had
+        if self._descriptor is not None and not self.path.exists():
+            self._former = [
+                path
+                for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}"))
+                if is_renamed(path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX))
+            ]
+        source = self._former[-1] if self._former else self.path
+        self.is_new = self._descriptor is None or not source.exists()
+        content = _Content() if self.is_new else self._load(source)
+        self._is_changed = bool(self._former)
         self._broker = broker
         self.topics = content.topics if content.broker == broker else {}
         self._muted = set(content.muted)
@@ -146,6 +167,8 @@ class Announced:
                 with replaced_file(self.path) as temporary:
                     temporary.touch(0o600)
                     temporary.write_text(content.model_dump_json(), "utf-8")
+                for path in self._former:
+                    path.unlink(missing_ok=True)
             except (LogError, OSError) as error:
                 self._say(f"mqtt: {error}; topics that go are not cleared after the next start")
 
@@ -158,8 +181,10 @@ class Announced:
 
     def _take_lock(self, folder: Path) -> int | None:
         try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            private_folder(folder)
+            descriptor = os.open(
+                folder / f".{self.path.stem}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
+            )
         except OSError as error:
             self._say(f"mqtt: {folder}: cannot be used ({error.strerror}); nothing is remembered")
             return None
@@ -174,12 +199,10 @@ class Announced:
             return None
         return descriptor
 
-    def _load(self) -> _Content:
+    def _load(self, path: Path) -> _Content:
         try:
-            data = read_whole(self.path, "memory of what was published", _LIMIT, LogError)
+            data = read_whole(path, "memory of what was published", _LIMIT, LogError)
             return _Content.model_validate_json(data)
         except (HearthlogError, ValidationError):
-            self._say(
-                f"mqtt: {self.path}: cannot be read, and begins anew; all classes are told of"
-            )
+            self._say(f"mqtt: {path}: cannot be read, and begins anew; all classes are told of")
             return _Content()

@@ -125,8 +125,9 @@ class Connection:
         return False
 
     def repeat(self) -> None:
-        """Say all values again at the next `flush`."""
-        self._unsent = dict.fromkeys(self._values)
+        """Say all values again at the next `flush`; what was forgotten stays so."""
+        values = (topic for topic, value in self._values.items() if value)
+        self._unsent = dict.fromkeys([*self._unsent, *values])
 
     def is_taken(self) -> bool:
         """Return whether the broker has all values."""

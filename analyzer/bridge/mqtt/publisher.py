@@ -4,6 +4,7 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,8 @@ from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.recorder.log.folder_lock import node_locks
+from hearthlog.schemas.logs.files import is_layer, log_name, walk_logs
 from hearthlog.schemas.text import shortened
 
 if TYPE_CHECKING:
@@ -75,7 +78,9 @@ class MqttPublisher:
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
         self._say = say
-        self._announced = Announced(state_folder, place_of(settings), say)
+        self._announced = Announced(
+            state_folder, home.node, place_of(settings), partial(_is_renamed, home), say
+        )
         self._forgotten: set[str] = set()  # topics that the broker is just told to forget
         self._has_said_muted = False
         # Earlier versions left it to the broker to remember what is switched off.
@@ -361,3 +366,23 @@ def event_fields(event: Event, news: News) -> dict[str, str | float]:
         "seconds": round(event.seconds, 2),
         "confidence": round(event.confidence, 3),
     }
+
+
+def _is_renamed(home: Home, former: str) -> bool:
+    """Return whether another recorder of the folder has the name of this one now.
+
+    It does not record, and all of its logs are from before the first one of this recorder: two
+    recorders of one folder write theirs side by side.
+    """
+    if former == home.node:
+        return False
+    if any(each.node == former and each.is_held is not False for each in node_locks(home.folder)):
+        return False
+    names = [
+        log_name(Path(entry.name))
+        for entry in walk_logs(home.folder)
+        if not is_layer(Path(entry.name))
+    ]
+    own = min((each.time for each in names if each.node == home.node), default="")
+    last = max((each.time for each in names if each.node == former), default="")
+    return not own or last < own

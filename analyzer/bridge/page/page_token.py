@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
+from hearthlog.schemas.storage.new_files import private_folder
 from hearthlog.schemas.storage.small_file import read_whole
 
 _TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
@@ -88,7 +89,7 @@ def _kept(path: Path) -> str:
 def _write(path: Path, line: str) -> None:
     temporary = path.with_name(f".{path.name}-{os.getpid()}")
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private_folder(path.parent)
         temporary.unlink(missing_ok=True)
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w") as stream:
