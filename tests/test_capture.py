@@ -286,7 +286,9 @@ def test_a_microphone_that_is_lost_is_never_replaced_by_another_one(labmic, tmp_
 
 
 def test_several_microphones_are_heard_and_lost_apart_in_one_log(labmic, tmp_path):
+    labmic.configure(data=sound())
     second = labmic.beside("second")
+    second.configure(data=sound())
     logs, about = tmp_path / "logs", tmp_path / "home.toml"
     about.write_text(
         f"""

@@ -202,7 +202,7 @@ def test_holes_at_both_ends_are_gaps_and_a_file_of_nothing_else_is_refused(tmp_p
     assert (last.end, last.frames_lost) == (START + 25_000_000_000, 1)
     assert not any(isinstance(event, Gap) for event in more)
     path = written(tmp_path / "none.wav", noise(0.1) * np.nan)
-    with pytest.raises(SourceError, match=r"none.wav: 25.00 s are left out: the samples are no "):
+    with pytest.raises(SourceError, match=r"none.wav: the samples are no numbers"):
         events_of(path)
     with pytest.raises(SourceError, match=r"none.wav: samples of it are no numbers"):
         clip_frames(LabelledClip(path, "speech", "a", "b", "c"))

@@ -634,10 +634,9 @@ def test_without_the_sdk_it_is_said_what_to_install(logs):
     command = [sys.executable, "-c", f"{code}; main.main()", "watch", str(logs), "--foxglove"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 1
-    assert result.stderr == (
-        "hearthlog: foxglove is not installed; try: pip install '.[foxglove]' in a clone of "
-        "hearthlog\n"
-    )
+    assert result.stderr.startswith("hearthlog: foxglove is not installed; try: ")
+    assert "[foxglove]" in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_it_listens_by_ipv6_too(logs):

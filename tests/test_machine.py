@@ -1,5 +1,6 @@
 """The recorder tells how its machine is: in the log, and on standard error when that changes."""
 
+import numpy as np
 import pytest
 from logs import read
 from test_capture import wait_for_frames
@@ -62,6 +63,8 @@ def test_what_the_machine_cannot_tell_is_left_out(sys, tmp_path, text):
 
 def test_the_log_tells_of_the_machine_and_of_each_microphone(labmic, tmp_path):
     logs = tmp_path / "logs"
+    noise = np.random.default_rng(0).normal(0.0, 3000.0, 16_000)
+    labmic.configure(data=noise.astype(np.int16))
     with recording(labmic, logs):
         wait_for_frames(logs, 250)
     told = [status for each in read(logs, "diagnostics") for status in each.status]

@@ -168,7 +168,7 @@ def test_what_a_search_found_can_be_trained_with(clips, tmp_path, hearthlog):
         ("evaluate method wires --data d --scenario bathroom", "method 'wires' is not installed"),
         ("train -o m.safetensors --data d --scenario bathroom --cost 0", "--cost 0: it must"),
         ("train -o m.safetensors --data d --scenario bathroom --gamma nan", "--gamma nan: it must"),
-        ("train -o m.safetensors --base b --home h --cost 0", "without what is about --data"),
+        ("train -o m.safetensors --base b --home h --cost 0", "--gamma go with --data"),
     ],
 )
 def test_wrong_use_is_one_line(words, line, tmp_path, hearthlog):

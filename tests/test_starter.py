@@ -153,8 +153,9 @@ def test_a_starter_is_taken_by_its_name(record, tmp_path):
 
 
 def test_no_model_can_be_asked_for(record, tmp_path):
-    assert record("-o", "a", "--model", "none").stderr == ""
-    assert record("-o", "b", HEARTHLOG_MODEL="none").stderr == ""
+    start = "--start", "2026-03-01T07:00"
+    assert record("-o", "a", *start, "--model", "none").stderr == ""
+    assert record("-o", "b", *start, HEARTHLOG_MODEL="none").stderr == ""
     assert model_of(tmp_path / "a") == model_of(tmp_path / "b") == [""]
 
 

@@ -206,7 +206,7 @@ def test_a_training_goes_on_without_what_it_cannot_read_and_says_so(home):
 @pytest.mark.parametrize("rate", [RATE, 44_100])
 @pytest.mark.parametrize("suffix", ["wav", "ogg"])
 def test_a_part_of_a_long_file_is_heard_alone(tmp_path, rate, suffix):
-    silent, loud = np.zeros(25 * rate), np.full(3 * rate, 0.5)
+    silent, loud = np.zeros(25 * rate), 0.7 * np.sin(np.arange(3 * rate) * 880 * np.pi / rate)
     path = tmp_path / f"long.{suffix}"
     with soundfile.SoundFile(path, "w", rate, 1) as file:
         for second in np.concatenate([silent, loud, silent]).reshape(-1, rate):

@@ -109,7 +109,7 @@ def test_extreme_values_survive(tmp_path):
     }
     log = LogWriter(tmp_path / "log.mcap", [Topic("/" + name, name) for name in fields], {})
     for name, values in fields.items():
-        log.write("/" + name, 2**63 - 1, encode(message(name, header=header(0, "mic"), **values)))
+        log.write("/" + name, 2**63 - 2, encode(message(name, header=header(0, "mic"), **values)))
     path = log.finish()
     own = ours(LogReader(path))
     assert len(own) == len(fields)

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -212,6 +213,8 @@ def test_bridging_imports_nothing_of_the_folder(folder):
 
 @pytest.mark.parametrize("command", LISTENING)
 def test_a_verb_that_listens_imports_nothing_of_the_folder(folder, labmic, command):
+    noise = np.random.default_rng(0).normal(0.0, 3000.0, 16_000)
+    labmic.configure(data=noise.astype(np.int16))
     result = run(folder, command, labmic.env)
     assert (sprung(folder), exposed(folder)) == ([], [])
     assert result.returncode == 0, result.stderr

@@ -340,7 +340,7 @@ class _Level:
         if not self._samples:
             return {}
         mean = float(decibels(np.array(self._power / self._samples)))
-        peak = float(decibels(np.square(np.array(self._peak))))
+        peak = float(decibels(np.square(np.array(min(self._peak, 1.0)))))
         self._power = self._peak = 0.0
         self._samples = 0
         return {"level_dbfs": f"{mean:.1f}", "peak_dbfs": f"{peak:.1f}"}

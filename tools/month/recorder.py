@@ -119,9 +119,13 @@ def main() -> None:
     sound, rng = Sound(folder.sound), np.random.default_rng(seed)
 
     def capture(
-        _device: str, *, exact: bool = False, channels: int | None = None
+        _device: str,
+        *,
+        exact: bool = False,
+        channels: int | None = None,
+        channel: int | None = None,
     ) -> FastMicrophone:
-        del exact, channels
+        del exact, channels, channel
         return FastMicrophone(state, sound, month, rng)
 
     setattr(microphone, "CaptureProcess", capture)  # noqa: B010  it is imported there
