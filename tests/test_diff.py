@@ -297,6 +297,13 @@ def test_a_queue_has_spans_to_be_judged_that_do_not_overlap(logs, hearthlog, nam
     assert {bool(s["label_b"]) for s in found["spans"]} == {len(names) == 2}
 
 
+def test_a_queue_of_the_logs_here_needs_no_name_of_them(logs, hearthlog, monkeypatch):
+    monkeypatch.chdir(logs.parent)
+    named = hearthlog("diff", "logs", "live", "two", "--queue", "--json")
+    assert named.returncode == 0
+    assert hearthlog("diff", "live", "two", "--queue", "--json") == named
+
+
 def test_what_was_reviewed_is_no_more_in_the_queue(logs, hearthlog, tmp_path):
     listed = tmp_path / "queue.csv"
     hearthlog("diff", logs, "live", "--queue", "--spans", 5, "--list", listed)

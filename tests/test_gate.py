@@ -17,7 +17,14 @@ from spliced import run
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_frames, changes_of_labellings
-from hearthlog.analyzer.gate.evidence import Evidence, Right, _outcomes, _right, gather_evidence
+from hearthlog.analyzer.gate.evidence import (
+    Evidence,
+    Right,
+    _outcomes,
+    _right,
+    _taught,
+    gather_evidence,
+)
 from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import (
     Part,
@@ -29,7 +36,7 @@ from hearthlog.analyzer.gate.recent_time import (
 )
 from hearthlog.analyzer.gate.reference import Sound
 from hearthlog.analyzer.gate.rules import clearly_better, damages
-from hearthlog.analyzer.gate.two_models import LabelledFrames
+from hearthlog.analyzer.gate.two_models import LabelledFrames, TwoModels
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
@@ -501,6 +508,7 @@ def with_new_class(known):
             True,
         ),
         ({}, False),  # no mark says that coughing was wrong
+        ({("laughing", "coughing", "laughing"): 2}, False),  # and nothing is known of coughing
         ({("laughing", "music", "laughing"): 4}, False),
         (
             {
@@ -535,6 +543,10 @@ def test_what_a_new_class_takes_over_is_judged_by_marks_that_were_learned_from(l
     after = replace(one, description=about)
     talking = [(a, b) for a, b, name in truth(lived) if name == "speech" and b - a > SECOND]
     write_marks(log, [Mark("mic", *span, "giggle") for span in talking[:2]])
+    amount = Amount(sources=1, segments=1, seconds=1.0)
+    unnamed = training.model_copy(update={**update, "home": {**home, "no_class": amount}})
+    hostile = replace(after, description=about.model_copy(update={"training_data": unnamed}))
+    assert _taught(TwoModels(one, hostile), hostile) == {"giggle"}
     found = gather_evidence(one, after, recent_logs([Path("logs")]))
     assert found.taught == {"giggle"}
     right = sum(n for (true, _, new), n in found.known.items() if true == new == "giggle")
@@ -576,6 +588,8 @@ def test_sound_that_vanishes_and_a_class_that_multiplies_are_damage_unless_rando
     music = [[1290, 0, 10], [0, 30, 70], [0, 0, 15]]
     assert damages(evidence(music), "one") == ["music rises from 15 min a day to 1 h 35 min"]
     assert damages(evidence(music, Right(60, 20, 50, 32, 2)), "one") == []
+    quiet = replace(evidence(music), quiet=Right(40, 0, 40, 40, 0))
+    assert damages(quiet, "one") == ["music rises from 15 min a day to 1 h 35 min"]
 
 
 def test_what_the_champion_is_sure_of_stays():

@@ -321,6 +321,12 @@ def test_a_mark_makes_its_class_though_the_model_counts_that_sound_as_unknown(
     again = home_lessons([two_days], adapted).segments
     assert again.classes == adapted.classes
     assert number not in again.target[again.collection == again.collection_names.index(HOME)]
+    for log in logs_in(two_days):
+        review_path(log).unlink(missing_ok=True)
+    write_marks(logs_in(two_days)[0], [Mark("mic", *segments(two_days)[5])])
+    without = adapt_model(adapted, home_lessons([two_days], adapted).segments)
+    assert without.classes == base.classes
+    assert set(without.description.scenario["unknown"]) == {*before, *after}
 
 
 def test_too_few_marks_of_what_counts_as_unknown_teach_that_and_it_is_said(two_days, model_file):

@@ -56,27 +56,31 @@ def tracked():
     return {name for name in names if name and (ROOT / name).exists()}
 
 
+LITTER = (
+    *("tests/typescript/node_modules/a/b.js", "tests/__pycache__/c.pyc", "demo/day.rrd"),
+    *("models/home-1.safetensors", "models/champion.safetensors", "models/.champion.json"),
+    *("models/history", "models/.history.0.tmp", "models/judgements/a.json"),
+    *("models/old/home-0.safetensors", "ten.txt", "logs/a.mcap"),
+)
+
+
+def litter(checkout):
+    """Leave what somebody makes who works there, and ignore none of it."""
+    for name in LITTER:
+        (checkout / name).parent.mkdir(parents=True, exist_ok=True)
+        (checkout / name).touch()
+    (checkout / ".gitignore").write_text("")
+
+
 @pytest.fixture(scope="module")
 def sdist(tracked, tmp_path_factory):
     """The sdist, unpacked, of a checkout in which somebody has worked."""
     folder = tmp_path_factory.mktemp("sdist")
-    litter = [
-        *("tests/typescript/node_modules/a/b.js", "tests/__pycache__/c.pyc", "demo/day.rrd"),
-        *(
-            "models/home-1.safetensors",
-            "models/.champion.json",
-            "models/judgements/a.json",
-            "ten.txt",
-            "logs/a.mcap",
-        ),
-    ]
-    for name in [*tracked, *litter]:
+    for name in tracked:
         target = folder / "checkout" / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if name in tracked:
-            shutil.copy(ROOT / name, target)
-        else:
-            target.touch()
+        shutil.copy(ROOT / name, target)
+    litter(folder / "checkout")
     archive = build("sdist", folder / "checkout", folder)
     subprocess.run(["tar", "-xf", archive, "-C", folder], check=True)
     return folder / archive.name.removesuffix(".tar.gz")
@@ -84,9 +88,10 @@ def sdist(tracked, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def wheel(sdist, tmp_path_factory):
-    """The wheel, unpacked, that is built from the sdist."""
+    """The wheel, unpacked, that is built from the sdist, in which somebody has worked."""
     folder = tmp_path_factory.mktemp("wheel")
-    with zipfile.ZipFile(build("wheel", sdist, folder)) as file:
+    litter(shutil.copytree(sdist, folder / "source"))
+    with zipfile.ZipFile(build("wheel", folder / "source", folder)) as file:
         file.extractall(folder / "wheel")
     return folder / "wheel"
 

@@ -1,6 +1,7 @@
 """A queue that is worth a person's ten minutes: spans that teach, and minutes drawn at random."""
 
 import shutil
+from datetime import UTC
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.logs.spans import NONE, cut, joined, one, pieces
-from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
+from hearthlog.analyzer.review.queue import asked
 from hearthlog.analyzer.review.queue.coverage import cover, sample
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.analyzer.review.queue.random_minutes import (
@@ -25,7 +27,7 @@ from hearthlog.analyzer.review.queue.random_minutes import (
     whole_minutes,
 )
 from hearthlog.analyzer.review.queue.ranking import worth
-from hearthlog.analyzer.review.queue.review_list import read_list
+from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list
 from hearthlog.analyzer.review.queue.span_sounds import labelling_model, span_sounds
 from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
@@ -35,7 +37,7 @@ from hearthlog.recorder.clips.clip_choice import KeptSound
 from hearthlog.recorder.clips.clip_layer import ClipWriter
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.files import active_path, find_logs, is_layer
 from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
@@ -329,6 +331,31 @@ def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_l
     assert marks == {(read_time(a), read_time(b), c) for a, b, c, *_ in lines}
     again = run(capfd, "review", heard, "--queue", "--save", "ten.csv")
     assert (again.returncode, Path("ten.csv").exists()) == (1, False)
+
+
+def test_the_sound_of_the_hour_that_is_being_recorded_is_found(heard, tmp_path):
+    (layer,) = heard.rglob("*.audio.mcap")
+    before = asked.find_kept_sound(heard, "mic", EVER, [])
+    active = layer.rename(active_path(layer))
+    with active.open("r+b") as stream:
+        stream.truncate(active.stat().st_size - 8)  # without its end
+    after = asked.find_kept_sound(heard, "mic", EVER, [])
+    assert (list(after.layers), after.time.length) == ([active], before.time.length)
+    file = asked.SoundFile(1, 1, START, START + NANOSECONDS)
+    asked.write_sounds(tmp_path / "ten", [file], 1, after)
+    assert len(soundfile.read(tmp_path / "ten/01.wav")[0]) == 16_000
+
+
+def test_a_minute_whose_log_is_gone_has_no_lines():
+    middle, end = START + MINUTE // 2, START + MINUTE
+    minutes = [(START, end), (end, end + MINUTE)]
+    spans = [ReviewSpan("mic", *each, "live", "", "", "", None, RANDOM) for each in minutes]
+    marks = [Mark("mic", START, middle, "speech"), Mark("mic", middle, end, "music")]
+    kept = asked.KeptSound({}, "/mic/audio", one(START, end + MINUTE))
+    files = asked.sound_files(marks, spans, kept)
+    assert [(file.first, file.last) for file in files] == [(1, 1), (2, 2), (1, 2)]
+    lines = asked.label_lines(marks, spans, files, "ten", UTC).splitlines()
+    assert [line.count("a minute drawn at random, to line 2") for line in lines] == [1, 0]
 
 
 def test_labels_where_a_queue_did_not_ask_are_told_apart(home, tmp_path, capfd):

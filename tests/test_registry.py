@@ -247,8 +247,41 @@ def test_the_folder_is_that_of_the_configured_model(folder, capfd, monkeypatch, 
     monkeypatch.chdir("/")
     result = run(capfd, "models", "list")
     assert result.stderr.startswith("hearthlog: models: no such folder")
+    assert [line.split()[0] for line in result.stdout.splitlines()[1:]] == ["general", "bathroom"]
     monkeypatch.setenv("HEARTHLOG_MODEL", str(folder / "champion.safetensors"))
     assert run(capfd, "models", "show", "two").returncode == 0
+
+
+def test_a_starter_is_promoted_where_there_is_no_folder_yet(tmp_path, capfd):
+    folder = tmp_path / "models"
+    for name in ("bathroom", "general"):
+        done = run(capfd, "models", "promote", name, "--folder", folder, "--anyway")
+        assert (done.returncode, champion(folder)) == (0, name)
+    assert oct(folder.stat().st_mode)[-3:] == "700"
+    assert oct((folder / "history").stat().st_mode)[-3:] == "600"
+    with pytest.raises(ModelError, match="no such folder"):
+        promote(tmp_path / "nowhere", "two")
+    assert not (tmp_path / "nowhere").exists()
+    with pytest.raises(ModelError, match="history"):
+        list_models(folder / "history")
+    with pytest.raises(ModelError, match="history"):
+        promote(folder / "history", "general")
+
+
+def test_what_is_called_as_a_starter_is_not_returned_to_unjudged(folder):
+    (folder / "history").unlink(missing_ok=True)
+    other = adapted_from(folder, "general", load(folder, "two"))
+    with pytest.raises(ModelError, match=r"general\.safetensors: is not the starter"):
+        rollback(folder)
+    assert champion(folder) == "one"
+    assert read_judgement(folder, other.sha256) is None
+
+
+def test_a_history_that_cannot_be_written_is_refused_in_one_line(folder):
+    (folder / "history").mkdir()
+    with pytest.raises(ModelError, match=r"history: cannot be written"):
+        promote(folder, "two")
+    assert champion(folder) == "one"
 
 
 def test_a_folder_that_cannot_be_written_is_refused_in_one_line(folder):

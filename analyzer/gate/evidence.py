@@ -200,12 +200,11 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> R
 def _taught(models: TwoModels, after: Model) -> frozenset[str]:
     """Name the classes that the second model has from marks of the home, and the first has not."""
     training = after.description.training_data
-    of_home = {
-        name
-        for name, amount in training.home.items()
-        if amount.segments and not training.classes[name].segments
-    }
-    return frozenset(of_home & set(models.classes[models.before :]))
+    of_home, elsewhere = (
+        {name for name, amount in amounts.items() if amount.segments}
+        for amounts in (training.home, training.classes)
+    )
+    return frozenset((of_home - elsewhere) & set(models.classes[models.before :]))
 
 
 def _is_in(spans: Spans, sound: Sound) -> bool:

@@ -20,6 +20,7 @@ _MANY = 0.05  # of the time: a class that has become many times as much
 _TIMES = 4.0
 _CHANGED = 0.20  # of the time that is not silence
 _CHANGED_MINUTES = 10.0
+_MARKS_ALONE = 3  # that say a class was wrong, where no sound of that class is known
 
 
 def damages(evidence: Evidence, champion: str) -> list[str]:
@@ -47,7 +48,9 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
         )
         return [text]
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
-    if not clearly_better(evidence.random.plus(evidence.quiet)):
+    right = evidence.random
+    better = clearly_better(right.plus(evidence.quiet))
+    if not (better and right.sounds and right.gained >= right.lost):  # silence alone is too little
         reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
     return reasons
 
@@ -144,7 +147,8 @@ def _is_correction(evidence: Evidence, name: str, new: str) -> bool:
     wrong = sum(n for (true, old, _), n in evidence.known.items() if (true, old) == (new, name))
     own = [(after, n) for (true, _, after), n in evidence.known.items() if true == name]
     lost = sum(n for after, n in own if after == new)
-    return wrong > 0 and lost <= (1.0 - _KEPT) * sum(n for _, n in own)
+    enough = 1 if own else _MARKS_ALONE
+    return wrong >= enough and lost <= (1.0 - _KEPT) * sum(n for _, n in own)
 
 
 def _out_of_proportion(evidence: Evidence) -> Iterator[str]:

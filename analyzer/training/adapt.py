@@ -155,10 +155,11 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
     figures = {name: metrics.classes.get(name, unknown) for name in classes}
     amounts = {name: training.classes.get(name, none) for name in classes}
     bias = description.decision_bias
-    before = {name: tuple(labels) for name, labels in description.scenario.items()}
-    before = {name: before.get(name, (name,)) for name in classes if name in description.classes}
-    new = {name: (name,) for name in classes if name not in before}
-    labels = Scenario(description.scenario_name, before).with_taught(new).classes
+    new = {name: (name,) for name in classes if name not in description.classes}
+    labelled = {name: tuple(description.scenario.get(name, [name])) for name in description.classes}
+    before = Scenario(description.scenario_name, labelled)
+    kept = before.with_classes(name for name in classes if name not in new)
+    labels = kept.with_taught(new).classes
     update = {
         "classes": list(classes),
         "scenario": {name: list(labels[name]) for name in classes},

@@ -153,8 +153,7 @@ def _with_new_classes(
     A label that the scenario counts as unknown makes its class like any other, and until then is
     learned as unknown. Then what lacks of other classes, and the labels that cannot be learned.
     """
-    known = scenario_of(model)
-    known = Scenario(known.name, {name: known.classes[name] for name in base_classes(model)})
+    known = scenario_of(model).with_classes(base_classes(model))
     as_unknown = set(known.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}
     listed = {*known.classes, *known.class_of} - as_unknown
     others = [one for one in marked if not meant_by(one.label, listed)]

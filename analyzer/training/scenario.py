@@ -91,6 +91,19 @@ class Scenario:
         labels = tuple(sorted({label for label, _ in others}))
         return Scenario(self.name, {**self.classes, sound.UNKNOWN: labels}, self.ignored)
 
+    def with_classes(self, names: Iterable[str]) -> "Scenario":
+        """Return this scenario with some of its classes; labels of the others are unknown again.
+
+        Parameters
+        ----------
+        names : iterable of str
+        """
+        classes = {name: self.classes[name] for name in names}
+        if sound.UNKNOWN in classes:
+            others = [labels for name, labels in self.classes.items() if name not in classes]
+            classes[sound.UNKNOWN] += tuple(label for labels in others for label in labels)
+        return Scenario(self.name, classes, self.ignored)
+
     def with_taught(self, learned: Mapping[str, tuple[str, ...]]) -> "Scenario":
         """Return this scenario with the classes that a home teaches, which then are not unknown.
 

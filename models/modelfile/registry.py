@@ -20,7 +20,12 @@ from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.models.starter import GENERAL, STARTERS, starter_file
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import locked_folder, replaced_file, sync_folder
+from hearthlog.schemas.storage.new_files import (
+    locked_folder,
+    private_folder,
+    replaced_file,
+    sync_folder,
+)
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
 DEFAULT_FOLDER = Path("models")
@@ -52,14 +57,15 @@ def list_models(folder: Path) -> list[ModelEntry]:
     Returns
     -------
     list of ModelEntry
-        By name; one that cannot be used says why.
+        By name; one that cannot be used says why. The starters alone, if there is no such folder.
 
     Raises
     ------
     ModelError
-        If there is no such folder, or an alias is no link to a model file of it.
+        If this is no folder, or an alias is no link to a model file of it.
     """
-    _check_folder(folder)
+    if os.path.lexists(folder):
+        _check_folder(folder)
     named = {alias: target(folder, alias) for alias in ALIASES}
     names = {path.stem for path in folder.glob("[!.]*" + SUFFIX)} - set(ALIASES)
     names |= {name for name in named.values() if name is not None}
@@ -144,11 +150,11 @@ def load(folder: Path, name: str) -> Model:
     ModelError
         If there is no such folder, or `resolve` or `load_model` refuses the model.
     """
+    stem = name.removesuffix(SUFFIX)
+    if stem in STARTERS and not os.path.lexists(_path(folder, stem)):
+        return load_model(starter_file(stem))
     _check_folder(folder)
-    path = _path(folder, resolve(folder, name))
-    if name.removesuffix(SUFFIX) in STARTERS and not os.path.lexists(path):
-        path = starter_file(path.stem)
-    return load_model(path)
+    return load_model(_path(folder, resolve(folder, name)))
 
 
 def find_model(folder: Path, sha256: str) -> Path | None:
@@ -224,6 +230,8 @@ def first_starter(folder: Path) -> str | None:
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
     """Point an alias to a model, if that model can be used; a starter is copied to the folder.
 
+    For a starter the folder is made, if there is none.
+
     Whether it may label is for a judgement to say, which a recorder asks for.
 
     Parameters
@@ -247,7 +255,7 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
         If the model cannot be used, if the folder does not exist or cannot be written, or if a file
         in the place of the alias is no link to a model file.
     """
-    with _locked(folder):
+    with _locked(folder, make=name.removesuffix(SUFFIX) in STARTERS):
         before = target(folder, alias)
         model = load(folder, name)
         _copy_starter(folder, model)
@@ -295,6 +303,11 @@ def rollback(folder: Path) -> tuple[Model, str]:
         if starter is None:
             raise ModelError(f"{folder}: no champion before {before} can be used; promote a model")
         model = load(folder, starter)
+        if not is_starter(model.name, model.sha256):
+            raise ModelError(
+                f"{_path(folder, starter)}: is not the starter of this name; give it another name "
+                "to return to that, or promote a model"
+            )
         _copy_starter(folder, model)
         insist(folder, model.sha256)
         _point(folder, CHAMPION, model.name)
@@ -305,13 +318,9 @@ def rollback(folder: Path) -> tuple[Model, str]:
 def _copy_starter(folder: Path, model: Model) -> None:
     """Put a starter model into a folder, if no file of its name is there."""
     path = _path(folder, model.name)
-    if os.path.lexists(path):
-        return
-    try:
+    if not os.path.lexists(path):
         with replaced_file(path) as temporary:
             shutil.copyfile(starter_file(model.name), temporary)
-    except LogError as error:
-        raise ModelError(str(error)) from error
 
 
 def _entry(path: Path, aliases: tuple[str, ...]) -> ModelEntry:
@@ -341,12 +350,16 @@ def _check_folder(folder: Path) -> None:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _locked(folder: Path, *, make: bool = False) -> Iterator[None]:
     """Keep other processes from changing the aliases of a folder at the same time."""
-    _check_folder(folder)
     try:
+        if make:
+            private_folder(folder)
+        _check_folder(folder)
         with locked_folder(folder):
             yield
+    except LogError as error:
+        raise ModelError(str(error)) from error
     except OSError as error:
         raise ModelError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
@@ -372,11 +385,5 @@ def _earlier(folder: Path) -> list[str]:
 
 
 def _write_history(folder: Path, names: list[str]) -> None:
-    temporary = folder / f".{_HISTORY}.tmp"
-    temporary.touch(mode=0o600)
-    with temporary.open("w") as stream:
-        stream.writelines(f"{name}\n" for name in names[-_KEPT:])
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(folder / _HISTORY)
-    sync_folder(folder)
+    with replaced_file(folder / _HISTORY) as temporary:
+        temporary.write_text("".join(f"{name}\n" for name in names[-_KEPT:]))

@@ -67,7 +67,7 @@ def diff(
     from hearthlog.schemas.messages.topics import labelling_topic
 
     place = log_location(log)
-    if a is None or (b is None and not queue and not place.exists()):
+    if a is None or (b is None and not place.exists()):
         place, a, b = log_location(logs_folder()), log, a
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")

@@ -53,7 +53,10 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
     """List the models and the starters; exit status 3: one of them cannot be used."""
     from hearthlog.models.modelfile.registry import list_models
 
-    entries = list_models(models_folder(folder))
+    place = models_folder(folder)
+    entries = list_models(place)
+    if not place.is_dir():
+        tell(f"{place}: no such folder of models; these come with hearthlog")
     if as_json:
         print(json.dumps([_as_json(entry) for entry in entries], indent=2))
     else:
@@ -282,10 +285,7 @@ def _named(folder: Path, name: str) -> "Model":
     """Load a model of the folder, a starter model, or a file."""
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.modelfile.registry import load
-    from hearthlog.models.starter import STARTERS, starter_file
 
-    if name in STARTERS and not folder.is_dir():
-        return load_model(starter_file(name))
     if Path(name).name != name and Path(name).exists():  # a file of another folder
         return load_model(Path(name))
     return load(folder, name)

@@ -5,7 +5,7 @@ By the list an import knows what was looked at.
 
 import os
 import wave
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import NamedTuple
@@ -16,12 +16,12 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import SAMPLE_BYTES, kept_sound, kept_time
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import Spans, cut, joined, one, pieces
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, pieces
 from hearthlog.analyzer.marks.formats.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import AUDIO_SUFFIX, find_logs
+from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name
 from hearthlog.schemas.messages.topics import LIVE, RELABEL, labelling_topic, scenario_name
 from hearthlog.schemas.storage.new_files import new_folder
 from hearthlog.schemas.times import NANOSECONDS
@@ -62,13 +62,13 @@ class KeptSound(NamedTuple):
 
     Attributes
     ----------
-    layers : list of Path
-        That hold it.
+    layers : dict of Path to Spans
+        That hold it, and of which time.
     topic : str
     time : Spans
     """
 
-    layers: list[Path]
+    layers: dict[Path, Spans]
     topic: str
     time: Spans
 
@@ -124,17 +124,17 @@ def find_kept_sound(
     """
     topic = labelling_topic(microphone, LIVE, "audio")
     start, end = 0 if limits[0] is None else limits[0], _EVER if limits[1] is None else limits[1]
-    layers, times = [], [Spans(*(np.empty(0, np.int64),) * 2)]
+    layers: dict[Path, Spans] = {}
     near = logs if logs.is_dir() else logs.parent
     for layer in find_logs(near):
-        if not layer.name.endswith(AUDIO_SUFFIX):
+        if log_name(layer).layer != AUDIO_LAYER:
             continue
         try:
-            times.append(kept_time([layer], topic, start, end))
-            layers.append(layer)
+            layers[layer] = kept_time([layer], topic, start, end)
         except LogError as error:
             losses.append(str(error))
-    starts, ends = (np.concatenate(each) for each in zip(*times, strict=True))
+    times = zip(NONE, *layers.values(), strict=True)
+    starts, ends = (np.concatenate(each) for each in times)
     return KeptSound(layers, topic, joined(starts, ends))
 
 
@@ -151,8 +151,7 @@ def sound_files(
     kept : KeptSound
     """
     lines = [SoundFile(n, n, mark.start, mark.end) for n, mark in enumerate(marks, 1)]
-    minutes = [SoundFile(*_lines_of(span, marks), span.start, span.end) for span in _drawn(asked)]
-    files = [*lines, *(one for one in minutes if one.last > one.first)]
+    files = [*lines, *(one for one in _minutes(asked, marks) if one.last > one.first)]
     return [one for one in files if cut(kept.time, one.start, one.end).length >= _SHORTEST]
 
 
@@ -175,7 +174,12 @@ def write_sounds(folder: Path, files: Sequence[SoundFile], lines: int, kept: Kep
     with new_folder(folder) as temporary:
         temporary.chmod(0o700)
         for file in files:
-            rate, samples = kept_sound(kept.layers, kept.topic, file.start, file.end)
+            near = [
+                layer
+                for layer, time in kept.layers.items()
+                if cut(time, file.start, file.end).length
+            ]
+            rate, samples = kept_sound(near, kept.topic, file.start, file.end)
             path = temporary / file.name(lines)
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "wb") as stream, wave.open(stream, "wb") as sound:
@@ -206,9 +210,9 @@ def label_lines(
         Of the home.
     """
     notes: dict[int, list[str]] = {}
-    minutes = [_lines_of(span, marks) for span in _drawn(asked)]
-    for first, last in minutes:
-        notes.setdefault(first, []).append(f"a minute drawn at random, to line {last}")
+    for minute in _minutes(asked, marks):
+        text = f"a minute drawn at random, to line {minute.last}"
+        notes.setdefault(minute.first, []).append(text)
     for file in files:
         notes.setdefault(file.first, []).append(f"{folder}/{file.name(len(marks))}")
     return "".join(
@@ -229,14 +233,12 @@ def _clock(nanoseconds: int, zone: tzinfo) -> str:
     return f"{text[:19]}.{decimals}{text[19:]}" if decimals else text
 
 
-def _drawn(asked: Iterable[ReviewSpan]) -> list[ReviewSpan]:
-    return [span for span in asked if span.reason == RANDOM]
-
-
-def _lines_of(span: ReviewSpan, marks: Sequence[Mark]) -> tuple[int, int]:
-    """Return the first and the last line of a span."""
-    lines = [number for number, mark in enumerate(marks, 1) if _answers(mark, span)]
-    return lines[0], lines[-1]
+def _minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterator[SoundFile]:
+    """Yield the minutes that were drawn at random; one whose log is gone has no lines."""
+    for span in asked:
+        lines = [number for number, mark in enumerate(marks, 1) if _answers(mark, span)]
+        if span.reason == RANDOM and lines:
+            yield SoundFile(lines[0], lines[-1], span.start, span.end)
 
 
 def chosen_as(span: ReviewSpan) -> str:
