@@ -295,6 +295,17 @@ def test_no_permission_is_not_no_logs(denied, verb):
 
 
 @needs_setpriv
+def test_a_folder_that_may_not_be_read_leaves_the_others_to_the_doctor(denied, tmp_path):
+    folder, deny = denied
+    log = shutil.copy(find_logs(folder)[0], tmp_path)
+    deny(folder)
+    status, said = as_another_account("doctor", folder, log)
+    first, last = said.splitlines()
+    assert (status, last) == (1, "1 file: 0 errors, 0 warnings")
+    assert first.startswith(f"hearthlog: {folder}: may not be read by you (owner ")
+
+
+@needs_setpriv
 def test_what_may_be_read_of_a_folder_is_used_and_the_rest_is_a_line(denied):
     folder, deny = denied
     first, second = find_logs(folder)

@@ -292,6 +292,24 @@ def test_a_type_that_changed_gives_one_table_by_the_names_of_its_fields(
         assert [None if pd.isna(value) else value for value in frame[name]] == values
 
 
+def test_names_of_some_channels_and_long_arrays_of_others_are_in_one_csv(exported, tmp_path):
+    with (tmp_path / "x.mcap").open("xb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(OWN, "ros2msg", b"uint16[] a\n")
+        for time, names in enumerate(['["x", "y"]', "", '["x", "y"]']):
+            about = {"a_names": names} if names else {}
+            channel = writer.register_channel("/m", "cdr", schema, about)
+            values = range(2 if names else 5000)
+            data = struct.pack(f"<4sI{len(values)}H", b"\0\1\0\0", len(values), *values)
+            writer.add_message(channel, time, data, time)
+        writer.finish()
+    with exported(tmp_path / "x.mcap", "x.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["a.x"], row["a.y"]) for row in rows] == [("0", "1"), ("", ""), ("0", "1")]
+    assert [len(json.loads(row["a"] or "[]")) for row in rows] == [0, 5000, 0]
+
+
 @pytest.mark.parametrize(
     ("second", "why"),
     [
@@ -393,7 +411,9 @@ def test_an_export_that_is_killed_leaves_nothing(tmp_path):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while not (begun := list(tmp_path.glob(".out.*/t1.csv"))) and process.poll() is None:
             time.sleep(0.01)
+        process.send_signal(signal.SIGSTOP)  # so that it cannot come to its end before it is told
         process.terminate()
+        process.send_signal(signal.SIGCONT)
         message_text = process.stderr.read()
     assert begun
     assert (process.returncode, message_text) == (128 + signal.SIGTERM, "")

@@ -18,6 +18,7 @@ from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.formats import MAGIC
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.type_definitions import message_type
 
 TYPE = "our_msgs/msg/C"
@@ -270,6 +271,12 @@ def test_of_a_clock_that_ran_below_zero_all_else_is_read(tmp_path, hearthlog, op
     assert about["end"].startswith("2023-11-14")
 
 
+def test_a_log_ends_with_its_last_message_whatever_follows_it(tmp_path):
+    path = late_bag(tmp_path / "late.mcap", FORMS["nothing but records"], LATE)
+    with pytest.warns(HearthlogWarning, match="2262"), LogFile(path) as file:
+        assert file.span == (T0, T0 + 3)
+
+
 @pytest.mark.parametrize("options", FORMS.values(), ids=FORMS)
 def test_recover_loses_the_messages_of_such_a_time_alone(tmp_path, hearthlog, options):
     path = late_bag(tmp_path / "late.mcap", options, LATE)
@@ -313,8 +320,8 @@ def defined(number, topic):
     return record(3, schema) + record(4, channel)
 
 
-def with_inserted(path, inserted, messages=0):
-    """Put records before the Data End of a bag, and count messages in its statistics."""
+def with_inserted(path, inserted, messages=0, indexed=b""):
+    """Put records before the Data End of a bag and into its index, and count messages there."""
     data = path.read_bytes()
     summary, offsets, _ = struct.unpack("<QQI", data[-28:-8])
     end = data.rfind(record(15, b"")[:1] + struct.pack("<Q", 4), 0, summary)
@@ -324,7 +331,7 @@ def with_inserted(path, inserted, messages=0):
     struct.pack_into("<Q", index, place, count + messages)
     head = data[:end] + inserted + record(15, bytes(4))
     footer = record(2, struct.pack("<QQI", len(head), 0, 0))
-    path.write_bytes(head + index + footer + data[:8])
+    path.write_bytes(head + index + indexed + footer + data[:8])
     return path
 
 
@@ -356,13 +363,33 @@ def test_a_topic_of_messages_outside_of_chunks_alone_is_listed_and_read(numbers,
     assert "/loose" in hearthlog("info", path).stdout
 
 
+@pytest.mark.parametrize("place", [(2**63, 9), (8, 2**62), (8, 300)])
+def test_an_index_that_leads_nowhere_is_named_where_its_records_are_wanted(
+    numbers, hearthlog, monkeypatch, place
+):
+    index = record(10, struct.pack("<5Q", *place, 0, 0, 0) + text("film") + text(""))
+    path = with_inserted(numbers, loose(1, 50, T0 + 50), 1, index)
+    done = hearthlog("cat", path)
+    assert (done.returncode, len(done.stdout.splitlines())) == (0, 51)
+    monkeypatch.setattr("hearthlog.analyzer.export.merge.LIMIT", 100)
+    done = hearthlog("merge", path, "--output", path.with_name("merged.mcap"))
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert f"damaged at byte {place[0]} " in done.stderr
+
+
 PRIVATE = record(0xC1, b"x" * 20)
 
 
 @pytest.mark.parametrize(
     "between",
-    [PRIVATE, PRIVATE * 40, record(0xFF, b""), record(0x20, b"later")],
-    ids=["one", "many", "empty", "of a later version"],
+    [
+        PRIVATE,
+        PRIVATE * 40,
+        record(0xFF, b""),
+        record(0x20, b"later"),
+        record(0xC1, bytes(17 << 20)),
+    ],
+    ids=["one", "many", "empty", "of a later version", "large"],
 )
 @pytest.mark.parametrize("ending", ["", "end"])
 def test_recover_keeps_what_stands_beside_records_that_are_not_known(
@@ -477,6 +504,25 @@ def test_a_chunk_above_the_limit_is_recovered_as_it_is(large_chunk, hearthlog, t
         f"hearthlog: {large_chunk}: 121 of 121 messages saved\n",
     )
     assert package.open_logs(copy).columns("/i")["data"].tolist() == list(range(0, 110, 10))
+
+
+def test_topics_that_a_large_chunk_alone_defines_are_read_from_the_chunks_behind_it(
+    tmp_path, hearthlog
+):
+    bag = Bag(tmp_path / "cut.mcap.active", chunk_size=LARGE - (1 << 19))
+    texts = bag.channel("/s", STRING)
+    for i in range(11):
+        bag.add(texts, string("x" * (LARGE // 10)), T0 + i)
+    bag.writer.flush()
+    end = bag.path.stat().st_size
+    bag.add(texts, string("last"), T0 + 10**9)
+    path = bag.close()
+    assert 0 < end < 1 << 20
+    data = path.read_bytes()
+    summary, _, _ = struct.unpack("<QQI", data[-28:-8])
+    path.write_bytes(data[:summary])
+    done = hearthlog("cat", path, "--start", "2023-11-14T22:13:20.5Z")
+    assert [line.rpartition("=")[2] for line in done.stdout.splitlines()] == ["last"]
 
 
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}], ids=["chunk", "no chunk"])

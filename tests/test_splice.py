@@ -20,6 +20,7 @@ from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import Attachment, TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import message
 from hearthlog.schemas.messages.topics import Quality, Topic
@@ -187,6 +188,14 @@ def test_what_is_merged_has_chunks_of_ten_seconds_as_a_recorder_writes_them(hear
         assert 400 <= len(saved) == len(set(saved)) <= 600
 
 
+def test_what_is_rare_is_merged_into_few_chunks(hearthlog, tmp_path):
+    rows = range(NANOSECONDS, 3601 * NANOSECONDS, 60 * NANOSECONDS)
+    log = small_log(tmp_path / "1.mcap", [FEATURES], rows=rows)
+    hearthlog("cut", log, "-o", tmp_path / "cut.mcap")
+    assert len(chunks_of(tmp_path / "cut.mcap")) <= 3
+    assert raw_messages(tmp_path / "cut.mcap") == raw_messages(log)
+
+
 def test_what_a_log_without_messages_carries_is_kept(hearthlog, refused, tmp_path):
     notes = [Attachment("map.pgm", "image/x-portable-graymap", b"map")]
     silent = small_log(tmp_path / "silent.mcap", [FEATURES], about=({"node": "a"}, notes))
@@ -250,7 +259,9 @@ def test_a_merged_log_has_the_records_of_its_sources_once(recorded, hearthlog, t
     assert len(topics) == len(set(topics))
 
 
-def test_records_that_differ_are_all_kept(hearthlog, tmp_path):
+@pytest.mark.parametrize("limit", [LIMIT, 1])
+def test_records_that_differ_are_all_kept(hearthlog, tmp_path, monkeypatch, limit):
+    monkeypatch.setattr("hearthlog.analyzer.export.merge.LIMIT", limit)  # of what is read at once
     for node, text in (("one", b"x"), ("two", b"y"), ("three", b"x")):
         notes = [Attachment("notes.txt", "text/plain", text), Attachment("raw", "", b"1")]
         small_log(tmp_path / f"{node}.mcap", [FEATURES], [1], about=({"node": node}, notes))
@@ -262,6 +273,7 @@ def test_records_that_differ_are_all_kept(hearthlog, tmp_path):
     found = LogReader(output).attachments
     assert found.keys() == {"notes.txt", "notes-2.txt", "raw"}
     assert {found["notes.txt"], found["notes-2.txt"]} == {b"x", b"y"}
+    assert "attachment" not in hearthlog("doctor", output).stdout
 
 
 def test_channels_that_say_the_same_become_one_and_others_stay_apart(hearthlog, tmp_path):
@@ -363,6 +375,9 @@ def profile(history, depth, durability="transient_local"):
         ([[("keep_all", 0)], [("keep_last", 1)]], [0, 2, 4, 5]),
         ([[("keep_last", 3, "volatile")], [("keep_last", 2)]], [3, 5]),
         ([[("unknown", 0)]], [0, 1, 2, 3, 4, 5]),
+        ([[("keep_last", None)]], [0, 1, 2, 3, 4, 5]),
+        ([[("keep_last", "2")]], [0, 1, 2, 3, 4, 5]),
+        ([[("keep_all", 0), ("keep_last", 10**400)]], [0, 1, 2, 3, 4, 5]),
         ([[("keep_last", 5, "volatile")]], []),
     ],
 )
@@ -389,6 +404,19 @@ def test_a_cut_log_begins_with_all_that_a_late_subscriber_receives(
     hearthlog("cut", tmp_path, "-o", tmp_path / "cut.mcap", "--start", start)
     found = [(row[4], row[5] - 10) for row in raw_messages(tmp_path / "cut.mcap")]
     assert found == [*((32, row) for row in held), (32, 22)]
+
+
+def test_copies_of_logs_do_not_count_for_what_a_late_subscriber_receives(hearthlog, tmp_path):
+    info = Topic("/mic/info", "std_msgs/msg/String", Quality(depth=3, transient_local=True))
+    small_log(tmp_path / "1.mcap", [FEATURES, info], rows=[1], info=[(2, "a"), (3, "b")])
+    small_log(tmp_path / "2.mcap", [FEATURES, info], rows=[10], info=[(11, "c")])
+    small_log(tmp_path / "3.mcap", [FEATURES, info], rows=[20], info=[(20, "d")])
+    for number in (2, 3):
+        shutil.copy(tmp_path / f"{number}.mcap", tmp_path / f"{number}-copy.mcap")
+    hearthlog("cut", tmp_path, "-o", tmp_path / "cut.mcap", "--start",
+              "1970-01-01T00:00:00.000000015")  # fmt: skip
+    rows = [row for row in raw_messages(tmp_path / "cut.mcap") if row[0] == "/mic/info"]
+    assert [row[7][8:9] for row in rows] == [b"b", b"c", b"d"]
 
 
 def test_messages_that_expire_are_not_repeated(hearthlog, tmp_path):

@@ -44,10 +44,11 @@ def examine(
     logs: dict[Path, Path] = {}
     left: list[Findings] = []
     for path in paths:
-        check_allowed(path)
-        own = list(check_leftovers(path)) if path.is_dir() else []
-        left += own
+        own: list[Findings] = []
         try:
+            check_allowed(path)
+            own = list(check_leftovers(path)) if path.is_dir() else []
+            left += own
             found = find_logs(path, enrolled=True)
         except LogError as error:
             if not own and (missing is None or len(paths) == 1):

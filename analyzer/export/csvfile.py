@@ -130,8 +130,11 @@ class CsvFile:
         width, own = self._widths[path], array_names(piece.columns.metadata, path)
         missing = pa.nulls(len(piece.columns), type_of(field._replace(size=None)))
         columns = {f"{path}.{name}": missing for name in self._names[path]}
-        if width is None and not own:
-            return columns | {column_name(path): _json_column(piece, path)}
+        if width is None:
+            texts = pa.nulls(len(piece.columns), pa.string()) if own else _json_column(piece, path)
+            columns[column_name(path)] = texts
+            if not own:
+                return columns
         columns |= {f"{path}[{i}]": missing for i in range(width or 0)}
         if path not in piece.fields:
             return columns

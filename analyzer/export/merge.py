@@ -4,16 +4,18 @@ import hashlib
 import json
 import math
 import sys
+import zlib
 from collections import Counter
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
@@ -27,6 +29,7 @@ from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
+from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, UINT32, UINT64
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
@@ -211,9 +214,9 @@ class _Log:
         names: dict[str, int] = {}
         for path in logs:
             with LogFile(path) as file:
-                for place in sorted(file.record_locations, key=lambda place: place.offset):
+                for place in sorted(set(file.record_locations), key=lambda place: place[1:]):
                     if place.opcode == Opcode.ATTACHMENT and place.length > LIMIT:
-                        self._copy_large_attachment(file, place, seen)
+                        self._copy_large_attachment(file, place, seen, names)
                         continue
                     record = file.record(place)
                     key = _key(record)
@@ -229,17 +232,24 @@ class _Log:
         return bool(seen)
 
     def _copy_large_attachment(
-        self, file: LogFile, place: RecordLocation, seen: set[Hashable]
+        self, file: LogFile, place: RecordLocation, seen: set[Hashable], names: dict[str, int]
     ) -> None:
         """Copy an attachment that is larger than is read at once."""
-        index = index_attachment(file.read(place.offset, _PIECE))
+        index = _index_of_large(file, place)
         digest = hashlib.sha256()
-        for piece in _pieces(file, place):
+        data = place.offset + _data_end(index) - index.data_size
+        for piece in _pieces(file, RecordLocation(place.opcode, data, index.data_size)):
             digest.update(piece)
-        key = index.name, digest.digest()
-        if key not in seen:
-            seen.add(key)
+        key = index.name, index.media_type, digest.digest()
+        if key in seen:
+            return
+        seen.add(key)
+        name = unused_name(index.name, names)
+        if name == index.name:
             self._writer.copy_attachment(_pieces(file, place), index)
+        else:
+            renamed = replace(index, name=name)
+            self._writer.copy_attachment(_renamed(file, place, index, name), renamed)
 
     def _channel(self, described: Described) -> int:
         key = identity(*described)
@@ -297,8 +307,44 @@ def _profile(logs: Sequence[Path]) -> str:
     return profiles.pop() if len(profiles) == 1 else ""
 
 
+def _index_of_large(file: LogFile, place: RecordLocation) -> AttachmentIndex:
+    """Read what an index says of an attachment; check that the attachment is where it should be."""
+    _, offset, length = place
+    head = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
+    if offset + length > file.size or file.read(offset, HEAD.size) != head:
+        raise file.damaged(offset, "here should be an attachment")
+    try:
+        index = index_attachment(file.read(offset, _PIECE))
+    except (McapError, UnicodeDecodeError) as error:
+        raise file.damaged(offset, error) from error
+    if _data_end(index) + UINT32.size > length:
+        raise file.damaged(offset, "an attachment is longer than its record")
+    return index
+
+
+def _data_end(index: AttachmentIndex) -> int:
+    """Return the byte of an attachment's record before which its data end."""
+    texts = len(index.name.encode()) + UINT32.size + len(index.media_type.encode())
+    return HEAD.size + ATTACHMENT.size + texts + UINT64.size + index.data_size
+
+
+def _renamed(
+    file: LogFile, place: RecordLocation, index: AttachmentIndex, name: str
+) -> Iterator[bytes]:
+    """Read an attachment of any size with another name, and the checksum that it has then."""
+    first, end = HEAD.size + ATTACHMENT.size + len(index.name.encode()), _data_end(index)
+    start = ATTACHMENT.pack(index.log_time, index.create_time, len(name.encode())) + name.encode()
+    yield HEAD.pack(Opcode.ATTACHMENT, len(start) + end - first + UINT32.size)
+    yield start
+    crc = zlib.crc32(start)
+    for piece in _pieces(file, RecordLocation(place.opcode, place.offset + first, end - first)):
+        crc = zlib.crc32(piece, crc)
+        yield piece
+    yield UINT32.pack(crc)
+
+
 def _pieces(file: LogFile, place: RecordLocation) -> Iterator[bytes]:
-    """Read a record of any size, a megabyte at a time."""
+    """Read bytes of a file, a megabyte at a time."""
     end = place.offset + place.length
     for start in range(place.offset, end, _PIECE):
         yield file.read(start, min(_PIECE, end - start))
@@ -323,13 +369,10 @@ def _held_messages(
         if any(held_count(channel) for channel, _ in same)
     }
     logs = _logs_of_held(selection, topics)
-    left: Counter[Hashable] = Counter()  # up to the first message of the span
-    for batch in _earlier(logs, topics, selection):
-        for messages in batch:
-            left[_publisher(messages)] += len(messages)
+    left = _counts(_earlier(logs, topics, selection))  # up to the first message of the span
     start = min(int(messages.log_times[0]) for messages in first)
     at_start: Counter[Hashable] = Counter()
-    for messages in first:
+    for messages in without_repeats(first):
         at_start[_publisher(messages)] += int((messages.log_times == start).sum())
     for batch in _earlier(logs, topics, selection):
         parts: dict[Hashable, list[RawMessages]] = {}
@@ -365,20 +408,41 @@ def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
     logs: list[Path] = []
     missing = set(topics)
     counts: Counter[Hashable] = Counter()
+    sources: Counter[str] = Counter()  # logs with messages of a topic
     for path in selection.earlier:
         if not missing:
             break
         logs.append(path)
         wanted: dict[str, dict[Hashable, float]] = {}
-        for batch in iterate_messages([path], missing, end=selection.start):
+        for batch in iterate_messages([path], missing, end=selection.start, once=True):
             for messages in batch:
                 publisher, topic = _publisher(messages), messages.channel.topic
                 counts[publisher] += len(messages)
                 wanted.setdefault(topic, {})[publisher] = held_count(messages.channel)
         for topic, depths in wanted.items():
-            if any(depths.values()) and all(counts[each] >= n for each, n in depths.items()):
+            sources[topic] += 1
+            if not any(depths.values()) or not _has_all(counts, depths):
+                continue
+            if sources[topic] == 1 or _has_all(
+                _counts(_earlier(logs, {topic}, selection)), depths
+            ):  # otherwise they are copies of each other
                 missing.remove(topic)
     return logs
+
+
+def _has_all(counts: Counter[Hashable], depths: Mapping[Hashable, float]) -> bool:
+    """Return whether the publishers have as many messages as they keep; copies have others."""
+    known = counts.keys() & depths.keys()
+    return bool(known) and all(counts[each] >= depths[each] for each in known)
+
+
+def _counts(batches: Iterable[Sequence[RawMessages]]) -> Counter[Hashable]:
+    """Count the messages of each publisher."""
+    counts: Counter[Hashable] = Counter()
+    for batch in batches:
+        for messages in batch:
+            counts[_publisher(messages)] += len(messages)
+    return counts
 
 
 def _publisher(messages: RawMessages) -> Hashable:
@@ -413,15 +477,22 @@ def held_count(channel: Channel) -> float:
     return sum(
         _held_by(profile)
         for profile in _profiles(channel)
-        if profile["durability"] == "transient_local"
-        and not 0 < profile["lifespan"]["sec"] < _FOREVER
+        if profile["durability"] == "transient_local" and not _expires(profile)
     )
+
+
+def _expires(profile: Mapping[str, Any]) -> bool:
+    seconds = profile["lifespan"]["sec"]
+    return isinstance(seconds, int) and 0 < seconds < _FOREVER
 
 
 def _held_by(profile: Mapping[str, Any]) -> float:
     if profile["history"] == "keep_all":
         return math.inf
-    return max(profile["depth"], 1) if profile["history"] == "keep_last" else _DEPTH
+    depth = profile["depth"]
+    if profile["history"] != "keep_last" or not isinstance(depth, int):
+        return _DEPTH
+    return min(max(depth, 1), _FOREVER)  # what is larger may not be a float
 
 
 def bag_metadata(channel: Channel) -> dict[str, str]:
@@ -438,7 +509,7 @@ def bag_metadata(channel: Channel) -> dict[str, str]:
         `offered_qos_profiles`, as JSON, and `topic_type_hash`; empty ones if it has none.
     """
     return {
-        "offered_qos_profiles": json.dumps(_profiles(channel)),
+        "offered_qos_profiles": json.dumps(_profiles(channel), default=str),
         "topic_type_hash": channel.metadata.get("topic_type_hash", ""),
     }
 
@@ -448,5 +519,5 @@ def _profiles(channel: Channel) -> list[Any]:
     text = channel.metadata.get("offered_qos_profiles", "")
     try:
         return list(dump_qos_v9(parse_qos(text if len(text) < _PROFILES_LIMIT else "")))
-    except (ReaderError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ReaderError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
         return []

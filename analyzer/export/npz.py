@@ -106,7 +106,8 @@ def _size(columns: Columns) -> int:
 
 def _arrays(pieces: Sequence[Columns], table: Table) -> dict[str, NDArray[Any]]:
     """Join the messages of a table, in the order of their log times."""
-    required = [path for path in table.fields if path not in table.optional]
+    optional = set(table.optional)
+    required = [path for path in table.fields if path not in optional]
     columns = join([with_numbers(piece, table, required) for piece in pieces])
     order = np.argsort(columns.log_times, kind="stable")
     is_sorted = (np.diff(columns.log_times) >= 0).all()

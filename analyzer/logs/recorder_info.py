@@ -115,7 +115,7 @@ def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
     """
     with LogFile(path) as file:
         if not file.channels:
-            read_chunks(file, file.chunks[:1])  # a log without an index says it there
+            read_chunks(file, file.chunks[:1], topics=())  # a log without an index says it there
         microphones = sorted(microphones_of(file, kind))
         if not microphones:
             return []

@@ -80,7 +80,8 @@ class ChunkRow:
         self.length += message.length
         self.size += message.size
         self.start = min(self.start, message.start)
-        self.end = max(self.end, message.end)
+        if not message.late:
+            self.end = max(self.end, message.end)
         self.late |= message.late
 
 

@@ -21,6 +21,7 @@ from hearthlog.schemas.mcap.stored_chunk import LATEST, ChunkBuilder, StoredChun
 from hearthlog.schemas.storage.prefetch import prefetch
 
 CHUNK_SIZE = 1 << 20
+_LEAST = 4 << 10  # bytes that a chunk has before the span of time can end it
 _COMPRESSORS = 2  # threads
 
 
@@ -36,7 +37,8 @@ class ChunkWriter:
     chunk_size : int
         Bytes of records, uncompressed; the message that goes beyond them is the last of its chunk.
     chunk_span : int, optional
-        Nanoseconds of log time that `write` puts into a chunk at most; no limit by default.
+        Nanoseconds of log time that `write` puts into a chunk at most, or 4 KiB if these take
+        longer; no limit by default.
     """
 
     def __init__(
@@ -119,13 +121,14 @@ class ChunkWriter:
             length += len(piece)
         self._attachments.append(replace(index, offset=offset, length=length))
 
-    def copy_record(self, record: bytes) -> None:
-        """Write a record of a kind that no index lists, as another file holds it.
+    def copy_record(self, record: Iterable[bytes]) -> None:
+        """Write a record of a kind that no index lists, as another file holds it, in pieces.
 
         The chunk in progress is written before it.
         """
         self.flush()
-        self._stream.write(record)
+        for piece in record:
+            self._stream.write(piece)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Add a schema.
@@ -382,6 +385,9 @@ class ChunkWriter:
             beyond = int(np.searchsorted(ends, offset + room, side="right"))
             start = chunk.start if chunk.entries else int(times[first])
             late = int(np.searchsorted(times, min(start + self._chunk_span, LATEST - 1)))
+            lacking = _LEAST - len(chunk.content)
+            if lacking > 0:
+                late = max(late, int(np.searchsorted(ends, offset + lacking)) + 1)
             last = min(beyond + 1, late, len(ends))
             if last <= first:
                 full.append(chunk)

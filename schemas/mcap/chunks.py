@@ -22,13 +22,14 @@ from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
 from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, LATE, by_start, not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
-from hearthlog.schemas.mcap.large_chunks import ContentStream, TooLargeError, read_parts
+from hearthlog.schemas.mcap.large_chunks import ContentStream, Part, TooLargeError, read_parts
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
 
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
 _STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
+_AGAIN = 16  # times the bytes of a large chunk that are decompressed once more, for their order
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
@@ -151,7 +152,7 @@ def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
     """Divide a large chunk into parts, and add what it defines to the file."""
     rows = array("q")
     try:
-        for part in read_parts(ContentStream(file.read, offset)):
+        for part in _parts_of(ContentStream(file.read, offset)):
             if part.size > LIMIT:
                 opcode, _, channel, _, time, _ = MESSAGE.unpack(part.content)
                 if opcode != Opcode.MESSAGE:
@@ -175,6 +176,16 @@ def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
     return np.frombuffer(rows, CHUNKS)
 
 
+def _parts_of(stream: ContentStream) -> Iterator[Part]:
+    """Read the parts of a large chunk, as long as it has no more records than its size allows."""
+    left = (1 << 20) + 4 * stream.head.data.stop
+    for part in read_parts(stream):
+        left -= len(part.messages) + len(part.others)
+        if left < 0:
+            raise TooLargeError("a chunk holds more messages than one of its size can")
+        yield part
+
+
 def _read_part(
     file: LogFile, row: NDArray[np.void], topics: TopicChoice | None
 ) -> list[RawMessages]:
@@ -192,6 +203,8 @@ def _read_part(
         return []
     try:
         content = _part_content(file, offset, first, size)
+    except TooLargeError as error:
+        raise LogError(f"{file.path}: {error}, at byte {offset}") from error
     except McapError as error:
         raise file.damaged(offset, error) from error
     if len(content) < size:
@@ -214,6 +227,9 @@ def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
         stream = max(before, key=attrgetter("position"), default=None)
         if stream is None:
             stream = ContentStream(file.read, offset)
+            file.again[offset] += first
+            if file.again[offset] > _AGAIN * stream.head.size:
+                raise TooLargeError("a chunk is too large for the order of its messages")
         others = [other for other in file.streams if other is not stream]
         file.streams = [*others[1 - _STREAMS :], stream]
         stream.skip(first - stream.position)
@@ -400,9 +416,12 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
     """Look for channels that nothing read so far defines, from the first chunk on."""
     damage = None
-    for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
+    chunks = file.chunks[file.chunks["index_length"] >= 0]
+    for chunk in chunks[np.argsort(chunks["offset"])]:
+        row = np.array([chunk])
         try:
-            _read(file, np.array([chunk])).index_records()
+            if in_parts(file, row) is row:
+                _read(file, row).index_records()
         except LogError as error:  # another chunk may define them
             damage = damage or error
         if identities <= file.channels.keys():

@@ -5,6 +5,7 @@ import threading
 import warnings
 import zlib
 from array import array
+from collections import Counter
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Self
@@ -104,7 +105,8 @@ class LogFile:
         self._end = len(MAGIC)  # of the records that were scanned
         self._sets: dict[frozenset[int], int] = {}
         self.streams: list[ContentStream] = []  # of large chunks that are being read
-        self.lock = threading.Lock()  # of `streams`
+        self.again: Counter[int] = Counter()  # bytes decompressed once more, by large chunk
+        self.lock = threading.Lock()  # of both
         try:
             self._check_magic()
             if indexed:
@@ -203,6 +205,8 @@ class LogFile:
         if location.length > LIMIT:
             what = "an attachment" if location.opcode == Opcode.ATTACHMENT else "a record"
             raise LogError(f"{self.path}: {what} at byte {location.offset}: {TOO_LARGE}")
+        if location.offset > self.size:
+            raise self.damaged(location.offset, "a record claims to be longer than the file")
         content = self.read(location.offset, location.length)[HEAD.size :]
         try:
             return self.parse(location.opcode, content)
@@ -305,7 +309,8 @@ class LogFile:
 
     def _walk_between(self, end: int) -> None:
         """Find what the index does not list, such as messages outside of chunks."""
-        places = [(each.offset, each.length) for each in self.record_locations]
+        every = [(each.offset, each.length) for each in self.record_locations]
+        places = [place for place in every if sum(place) <= self.size]
         chunks = self.chunks
         starts = np.array([place for place, _ in places] + [end], np.int64)
         ends = np.array([sum(place) for place in places] + [end], np.int64)

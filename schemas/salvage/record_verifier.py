@@ -383,11 +383,8 @@ class RecordVerifier:
         flipped = [kind for kind in _VARIABLE if (kind ^ opcode).bit_count() == 1]
         if not self.plausible(end) or (end, end) in [self.ends(offset, kind) for kind in flipped]:
             raise McapError("a record of unknown kind, or too short")
-        if length > LARGEST[0]:
-            raise McapError("a record claims to be too large")
-        return WholeRecord(
-            offset, end, whole_records.UnknownRecord(self.read(offset, end - offset))
-        )
+        head = self.read(offset, min(MESSAGE.size, end - offset))
+        return WholeRecord(offset, end, whole_records.UnknownRecord(head, (offset, end)))
 
     def _is_padded(self, inner: int, outer: int) -> bool:
         """Tell whether a record holds more than this version of the format knows.

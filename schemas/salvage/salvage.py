@@ -98,6 +98,7 @@ class Salvage:
     """
 
     def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:
+        self.path = path
         self.header: records.Header | None = None
         self.definitions = Definitions()
         self._damages = DamageList()
@@ -242,7 +243,7 @@ class Salvage:
                 raise McapError("messages are in chunks here")
             if self._reader.like_message_index(whole.offset):
                 raise McapError("a message index has become a message")
-        if isinstance(whole.record, UnknownRecord) and self._like_message(whole.record.record):
+        if isinstance(whole.record, UnknownRecord) and self._like_message(whole.record.head):
             raise McapError("a message has become another record")
         if not searching:
             return

@@ -8,6 +8,7 @@ from typing import BinaryIO, Protocol
 import numpy as np
 from mcap.records import Channel, Header, Message
 
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import provenance, rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
@@ -204,7 +205,7 @@ class SalvagedCopy:
         elif isinstance(piece, LargeChunk):
             self._add_large(piece)
         elif isinstance(piece, UnknownRecord):
-            self._writer.copy_record(piece.record)
+            self._writer.copy_record(self._salvage.stored(*piece.data))
         elif isinstance(piece, WholeAttachment | LargeAttachment):
             self._writer.copy_attachment(self._record_of(piece), piece.index_record)
         elif piece.name == provenance.METADATA and self._selection is not None:
@@ -243,6 +244,12 @@ class SalvagedCopy:
     def _add_large(self, piece: LargeChunk) -> None:
         """Copy a chunk that was not opened."""
         chunk, (start, end) = piece.stored, piece.data
+        dropped = [self._drops(number) for number in chunk.entries]
+        if dropped and all(dropped):
+            return
+        if any(dropped):
+            what = f"a chunk at byte {start} is too large to be thinned"
+            raise LogError(f"{self._salvage.path}: {what}")
         self._define(chunk.entries, piece.definitions[: piece.leading])
         self._writer.copy_large_chunk(chunk, end - start, self._salvage.stored(start, end))
         self._unread.update(piece.unread)

@@ -52,9 +52,10 @@ class LargeAttachment(NamedTuple):
 
 
 class UnknownRecord(NamedTuple):
-    """A record of a later version of MCAP, or of an application, as the file holds it."""
+    """A record of a later version of MCAP, or of an application, of any size."""
 
-    record: bytes
+    head: bytes  # its first bytes
+    data: tuple[int, int]  # bytes of the file at which it begins, and before which it ends
 
 
 class WholeAttachment(NamedTuple):
