@@ -36,9 +36,9 @@ ReadableBy = Literal["owner", "group", "all"]
 Keep = Literal["off", "events", "unsure", "always"]
 NO_MODEL = Path("none")  # in place of a model file: there are no labels
 BRIDGE = "bridge"  # the table of the file that is not the recorder's
-_MOST_DAYS = 36_500
-_MOST_FILES = 10_000_000
-_MOST_FRAMES = 1_728_000  # a day
+_MOST_DAYS = 700_000
+_MOST_FILES = 1 << 31
+_MOST_FRAMES = 1 << 31
 _MOST_MEGABYTES = 1_000_000_000
 _LEAST_BAG_SIZE = 1_000_000  # so that no two files begin in one second
 

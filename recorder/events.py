@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 from hearthlog.schemas.arrays import Float32, Int64
 
 OK, WARNING, ERROR = 0, 1, 2  # levels of diagnostic_msgs
+LISTENING = "listening"  # the summary of the health of a microphone
 READING = "reading"  # the summary of the health of audio files
 
 

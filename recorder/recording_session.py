@@ -11,7 +11,9 @@ from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk.keeper import DiskKeeper
 from hearthlog.recorder.events import (
+    LISTENING,
     OK,
+    READING,
     WARNING,
     Event,
     Frames,
@@ -64,7 +66,7 @@ class RecorderState:
     labels : dict of str to FrameLabels or None
         Of that sound.
     trouble : dict of str to str
-        What is wrong with a microphone; empty if nothing is.
+        Why a microphone is not heard, or not well; empty if it is.
     clip_frames : int
         Of sound that was kept.
     keeps : bool
@@ -177,10 +179,12 @@ class RecordingSession:
     def _update(self, state: RecorderState, microphone: str, event: Event) -> None:
         """Keep the state of the recorder true after an event."""
         if isinstance(event, Frames):
-            state.sound[microphone] = event
-            state.labels[microphone] = self._streams[microphone].pipeline.last_labels
+            pipeline = self._streams[microphone].pipeline
+            state.sound[microphone] = pipeline.last_frames or event
+            state.labels[microphone] = pipeline.last_labels
         elif isinstance(event, SourceHealth):
-            state.trouble[microphone] = event.summary if event.level != OK else ""
+            is_heard = event.level == OK and event.summary in {LISTENING, READING}
+            state.trouble[microphone] = "" if is_heard else event.summary
         state.clip_frames = self._clips.kept_frames
         state.keeps = self._settings.keep_audio != "off"
 

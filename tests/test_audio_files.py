@@ -5,6 +5,7 @@ import os
 import shutil
 import struct
 import subprocess
+import tracemalloc
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from hearthlog.recorder.sources.file_times import (
     GUESS,
     METADATA,
     NAME,
+    FileTime,
     arrange,
     check_pattern,
     file_time,
@@ -150,9 +152,31 @@ def test_a_pattern_of_ones_own_says_when_files_begin(wav):
         assert started(wav(name), BERLIN, pattern) == ("2026-03-01T06:00:00+00:00", NAME)
     with pytest.raises(SourceError, match="name does not fit '%Y%m%d-%H%M'"):
         file_time(wav("kitchen.wav"), BERLIN, "%Y%m%d-%H%M")
-    for wrong in ("%d%m%Y", "%H%M%S", "%Y%m%d_%H%M%Q", "", "%Y%m%d%H%M%"):
+    for name in ("00010101_000000.wav", "99991231_235959.wav"):
+        with pytest.raises(SourceError, match=f"'{name[:15]}' in its name is "):
+            file_time(wav(name), BERLIN, "%Y%m%d_%H%M%S")
+    for wrong in ("%Y%m%d_%H%M-%H%M", "%d%m%Y", "%H%M%S", "%Y%m%d_%H%M%Q", "", "%Y%m%d%H%M%"):
         with pytest.raises(ConfigurationError):
             check_pattern(wrong)
+
+
+def test_a_file_of_a_folder_that_does_not_fit_a_pattern_is_left_out(hearthlog, wav, tmp_path):
+    wav("card/01032026-0700.wav")
+    other = wav("card/notes.wav")
+    options = ("--start-pattern", "%d%m%Y-%H%M", "--model", "none", "-o", tmp_path / "logs")
+    result = hearthlog("record", tmp_path / "card", *options)
+    assert result.returncode == 3
+    assert f"left out: {other}: its name does not fit '%d%m%Y-%H%M'" in result.stderr
+    assert len(features(tmp_path / "logs")[0]) == 40
+    result = hearthlog("record", other, *options[:-1], tmp_path / "more")
+    assert result.returncode == 1
+
+
+def test_the_time_that_no_log_can_have_is_said(wav):
+    paths = [wav("a.wav"), wav("b.wav")]
+    times = [FileTime(read_time(f"{year}-01-02T00:00:00"), 0, NAME) for year in (2026, 2040)]
+    with pytest.raises(SourceError, match="sound of 2040-01-02"):
+        FileSource(paths, times[0].start, times=times)
 
 
 def with_chunk(path, name, content):
@@ -392,6 +416,37 @@ def test_a_cut_file_is_read_as_far_as_it_goes_with_a_word(sound, tmp_path, kind,
         np.testing.assert_array_equal(samples, np.tile(sound, 6)[: len(samples)])
 
 
+def test_a_part_that_begins_behind_the_cut_of_a_file_is_said_not_to_be_there(sound, tmp_path):
+    cut = tmp_path / "a.flac"
+    cut.write_bytes(bytes_of(np.tile(sound, 3), "FLAC")[:-80_000])
+    faults = []
+    assert not len(heard(cut, start=5.0, end=5.5, incomplete=faults.append))
+    assert faults == [f"{cut}: is damaged or cut short before 5.00 s"]
+
+
+def test_a_header_with_many_channels_takes_no_memory_for_sound_that_is_not_there(tmp_path):
+    path = tmp_path / "a.wav"
+    soundfile.write(path, np.zeros((1, 1024)), 768_000)
+    tracemalloc.start()
+    try:
+        heard(path)
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_recording_that_is_stopped_reads_no_more_of_what_is_no_sound(tmp_path):
+    path = tmp_path / "a.wav"
+    soundfile.write(path, np.full(60 * RATE, np.nan), RATE, subtype="FLOAT")
+    stop = Event()
+    stop.set()
+    assert list(FileSource([path], CLOSED).events(stop)) == []
+    events = FileSource([path], CLOSED).events(Event())
+    assert next(events).frames_lost == 1200, "one gap"
+    with pytest.raises(SourceError, match="no numbers"):
+        next(events)
+
+
 def test_a_recording_of_a_cut_file_goes_on_with_the_next(hearthlog, sound, wav, tmp_path):
     cut = tmp_path / "20260301_070000.flac"
     cut.write_bytes(bytes_of(np.tile(sound, 3), "FLAC")[:-20_000])
@@ -447,7 +502,9 @@ def test_a_file_that_leads_ffmpeg_elsewhere_is_refused(wav, tmp_path):
             heard(path)
 
 
-@pytest.mark.parametrize("script", ["exec sleep 60", "while :; do echo trouble >&2; done"])
+@pytest.mark.parametrize(
+    "script", ["exec sleep 60", "sleep 60 & wait", "while :; do echo trouble >&2; done"]
+)
 def test_an_ffmpeg_that_gives_no_sound_is_ended(tmp_path, monkeypatch, script):
     program = tmp_path / "ffmpeg"
     program.write_text(f"#!/bin/sh\n{script}\n")
@@ -457,6 +514,17 @@ def test_an_ffmpeg_that_gives_no_sound_is_ended(tmp_path, monkeypatch, script):
     path = tmp_path / "a.m4a"
     path.write_text("anything")
     with pytest.raises(SourceError, match="ffmpeg finds no more sound in it within"):
+        heard(path)
+
+
+def test_an_ffmpeg_that_cannot_be_run_ends_one_file(tmp_path, monkeypatch):
+    program = tmp_path / "ffmpeg"
+    program.write_bytes(b"\x7fELF of another machine")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    path = tmp_path / "a.m4a"
+    path.write_text("anything")
+    with pytest.raises(SourceError, match=r"a.m4a: cannot be read \(Exec format error\)"):
         heard(path)
 
 

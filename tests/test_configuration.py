@@ -23,6 +23,7 @@ from hearthlog.analyzer.bridge.settings import (
 )
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.config_origins import key_lines
+from hearthlog.recorder.disk.keeping import keep_disk
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.tools.reference import configuration_page
 
@@ -170,6 +171,19 @@ def test_every_slip_is_told_in_words_that_say_what_to_write(tmp_path, monkeypatc
         refused = [line.split(": ")[1].removesuffix(".a").rpartition(".")[2] for line in lines]
         assert sorted(refused) == sorted(keys)
         assert all(re.search("write|such as", line) for line in lines)
+
+
+def test_what_is_to_be_kept_for_ever_may_be_said_in_large_numbers(tmp_path):
+    settings = Settings(
+        output=tmp_path,
+        retention_days=100_000,
+        drop_features_days=700_000,
+        max_bag_files=1_000_000_000,
+        statistics_every=100_000_000,
+    )
+    (tmp_path / "home_20260301T070000Z.mcap").touch()
+    assert not keep_disk(settings.keeping_rules()).problem
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "-1e300", "9" * 40, "-" + "9" * 40])

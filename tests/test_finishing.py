@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from threading import Event as Flag
@@ -171,6 +172,23 @@ def test_a_rewriting_ends_with_the_recorder_and_the_next_start_does_it(live_hour
         time.sleep(0.01)
     (recovered,) = recover_active(tmp_path, "home")
     assert content(recovered.path) == expected
+
+
+def test_without_memory_for_a_thread_a_log_gets_its_name_when_the_recorder_ends(
+    live_hour, tmp_path, monkeypatch
+):
+    copy = Path(shutil.copy(live_hour[0], tmp_path / live_hour[0].name))
+
+    def refuse(_):
+        raise RuntimeError("can't start new thread")
+
+    finisher = LogFinisher()
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        finisher.add([copy])
+    finisher.close()
+    (log,) = tmp_path.iterdir()
+    assert log.suffix == ".mcap"
 
 
 def test_without_room_for_a_copy_a_log_gets_its_name_as_it_is(live_hour, tmp_path):

@@ -158,6 +158,22 @@ def test_the_truth_of_a_day_covers_it_without_holes_and_stands_beside_it(tmp_pat
         ]
 
 
+def test_a_clip_that_cannot_be_read_completely_is_refused_in_one_line(tmp_path):
+    noise = np.random.default_rng(1).normal(0, 0.1, 2 * SAMPLE_RATE)
+    soundfile.write(tmp_path / "cut.flac", noise, SAMPLE_RATE)
+    data = (tmp_path / "cut.flac").read_bytes()
+    (tmp_path / "cut.flac").write_bytes(data[: len(data) // 2])
+    noise[100] = np.nan
+    soundfile.write(tmp_path / "nan.wav", noise, SAMPLE_RATE, subtype="FLOAT")
+    rows = "cut.flac,speech,a,train\nnan.wav,yelling,b,train\n"
+    (tmp_path / "m.csv").write_text(f"path,label,source_group,split\n{rows}")
+    library = ClipLibrary(tmp_path / "m.csv")
+    for label, why in (("speech", "cut short after"), ("yelling", "no numbers")):
+        (clip,) = library.of(label)
+        with pytest.raises(SimulationError, match=f"{why}.*; take it out of the manifest"):
+            library.sound(clip, 20)
+
+
 def test_no_two_made_up_sounds_of_a_label_are_the_same():
     clips = MADE_UP.of("tap_water")
     alike = np.corrcoef([MADE_UP.sound(clip, 60) for clip in clips])

@@ -8,6 +8,7 @@ import subprocess
 import termios
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from select import select
@@ -22,8 +23,10 @@ from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
-from hearthlog.recorder.events import Frames
-from hearthlog.recorder.recording_session import RecorderState
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import OK, Frames, SourceHealth
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.recording_session import RecorderState, RecordingSession
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.cli.living_line import line_of
 
@@ -63,6 +66,29 @@ def test_several_microphones_have_one_line():
     assert line_of(state, EVENING) == (
         "20:14  kitchen: talking 87%  -20 dB  bath: talking 87%  -40 dB  hall: no microphone found"
     )
+
+
+class Nowhere:
+    device = "test"
+
+
+def test_a_pause_is_shown_from_the_start_on_and_a_level_is_one_without_an_offset(tmp_path):
+    state, start = RecorderState(), 1_772_348_400_000_000_000
+    settings = Settings(output=tmp_path)
+    session = RecordingSession(
+        settings, {"mic": Nowhere()}, {"mic": LabellingModels()}, state=state
+    )
+    paused = SourceHealth(start, OK, "paused until 07:00: the microphone is closed")
+    session.add("mic", paused)
+    assert line_of(state, EVENING) == f"20:14  {paused.summary}"
+    session.add("mic", SourceHealth(start, OK, "listening"))
+    assert line_of(state, EVENING) == "20:14  starting"
+    noise = np.random.default_rng(1).normal(0, 0.01, (40, FRAME_SAMPLES)).astype(np.float32)
+    session.add("mic", Frames(0, noise + 0.1, start + np.arange(40) * 50_000_000))
+    assert line_of(state, EVENING) == "20:14  -40 dB"
+    session.add("mic", replace(paused, stamp=start + 3_000_000_000))
+    assert line_of(state, EVENING) == f"20:14  {paused.summary}"
+    session.finish()
 
 
 class Terminal:

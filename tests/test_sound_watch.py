@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.stream import sound_watch
-from hearthlog.recorder.stream.sound_watch import FAINT, HUMS, STUCK, SoundWatch
+from hearthlog.recorder.stream.sound_watch import FAINT, HUMS, OFFSET, STUCK, SoundWatch
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 pytestmark = pytest.mark.fast
@@ -38,6 +39,20 @@ def test_one_value_for_ten_seconds_is_noticed_until_the_sound_moves_again(value)
     assert watch.problem() == STUCK
     listen(watch, noise(1, 0.01))
     assert watch.problem() == ""
+
+
+@pytest.mark.parametrize(
+    ("sound", "problem"),
+    [
+        (RNG.integers(-1, 2, 30 * SAMPLE_RATE), STUCK),
+        (np.rint(RNG.normal(0, 0.7, 30 * SAMPLE_RATE)), OFFSET),
+    ],
+)
+def test_a_microphone_with_an_offset_is_dead_only_if_it_gives_no_noise_but_its_own(sound, problem):
+    watch, infrasound = SoundWatch(), InfrasoundFilter()
+    frames = ((655 + sound) / 32768).astype(np.float32).reshape(-1, FRAME_SAMPLES)
+    watch.add_samples(frames, infrasound(frames))
+    assert watch.problem() == problem
 
 
 @pytest.mark.parametrize("frequency", [50, 60, 50.1])

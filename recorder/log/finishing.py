@@ -46,7 +46,7 @@ class LogFinisher:
         self._forget([process for process in self._processes if process.poll() is not None])
         self._left = [path for path in dict.fromkeys([*self._left, *active]) if path.exists()]
         command = [*_COMMAND, *map(str, self._left)]
-        with suppress(OSError):  # no memory for a process: the next one does it
+        with suppress(OSError, RuntimeError):  # no memory: the next one does it
             process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603
             self._processes.append(process)
             # Collects its status as soon as it ends, which the next log may do an hour later.

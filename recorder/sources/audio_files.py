@@ -2,8 +2,9 @@
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from threading import Event as Flag
 from typing import NamedTuple
@@ -137,7 +138,7 @@ class FileSource:
         """
         began = time.monotonic()
         next_frame, end, report = 0, self._start, 0
-        for item in _finite_runs(self._frames()):
+        for item in _finite_runs(takewhile(lambda _: not stop.is_set(), self._frames())):
             if isinstance(item, _Pause | _Hole):
                 until = item.until if isinstance(item, _Pause) else end + item.nanoseconds
                 lost = max(round((until - end) / FRAME_NANOSECONDS), 1)
@@ -162,7 +163,7 @@ class FileSource:
             end += len(item) * FRAME_NANOSECONDS
             self.frames += len(item)
             self._progress(min(self.frames * FRAME_NANOSECONDS / NANOSECONDS / self._seconds, 1.0))
-        if not self.frames:
+        if not self.frames and not stop.is_set():
             files = ", ".join(str(path) for path in self._paths)
             what = _NO_NUMBERS if self._hole_seconds else "shorter than one frame of 50 ms"
             raise SourceError("; ".join(self._faults) or f"{files}: {what}")
@@ -252,13 +253,17 @@ def _runs(block: Float32) -> list[Float32]:
     return np.split(block, np.flatnonzero(np.diff(is_hole)) + 1) if is_hole.any() else [block]
 
 
-def find_audio(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+def find_audio(
+    paths: Sequence[Path], check: Callable[[Path], object] = str
+) -> tuple[list[Path], list[str]]:
     """Replace folders by the audio files in them and in their folders.
 
     Parameters
     ----------
     paths : sequence of Path
         Files, which are taken as they are, and folders.
+    check : callable
+        Raises `SourceError` for a file of a folder that is to be left out.
 
     Returns
     -------
@@ -282,6 +287,7 @@ def find_audio(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
         for file in filter(lambda file: is_audio(file.name), files_below(path)):
             try:
                 check_channels(file, None)
+                check(file)
                 inside.append(file)
             except SourceError as error:
                 refused.append(f"left out: {error}")

@@ -151,8 +151,13 @@ class FileDecoder:
 
     def close(self) -> None:
         """End ffmpeg."""
-        self._process.kill()
-        self._process.communicate()
+        if self._process.returncode is None:
+            with suppress(ProcessLookupError, PermissionError):  # of a group that has ended
+                os.killpg(self._process.pid, signal.SIGKILL)
+        for pipe in (self._process.stdout, self._process.stderr):
+            if pipe is not None:
+                pipe.close()
+        self._process.wait()
 
     def __enter__(self) -> Self:
         return self
@@ -226,9 +231,10 @@ def _start_decoding(path: Path) -> subprocess.Popen[bytes]:
         env=os.environ | {"LC_ALL": "C"},
         start_new_session=True,  # Ctrl-C is for the recorder
     )
-    with suppress(ProcessLookupError):  # not between fork and exec: this process has threads
-        resource.prlimit(process.pid, resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
-        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (0, 0))
+    if hasattr(resource, "prlimit"):  # macOS has none
+        with suppress(ProcessLookupError):  # not between fork and exec: this process has threads
+            resource.prlimit(process.pid, resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
+            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (0, 0))
     return process
 
 

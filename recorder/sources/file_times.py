@@ -183,13 +183,16 @@ def check_pattern(pattern: str) -> None:
     ConfigurationError
         If it does not.
     """
-    used = set(re.findall("%(.)", pattern))
+    found = re.findall("%(.)", pattern)
+    used = set(found)
     unknown = sorted(used - _DIRECTIVES.keys())
     dated = used & {"Y", "y"} and ((used & {"m", "b", "B"} and "d" in used) or "j" in used)
     timed = "M" in used and ("H" in used or {"I", "p"} <= used)
     if unknown or pattern.replace("%%", "").endswith("%"):
         known = ", ".join(f"%{name}" for name in _DIRECTIVES)
         raise ConfigurationError(f"{pattern[:80]!r}: a pattern of names has {known}")
+    if again := [name for name in sorted(used - {"%"}) if found.count(name) > 1]:
+        raise ConfigurationError(f"{pattern[:80]!r}: a pattern of names has %{again[0]} once only")
     if not (dated and timed):
         raise ConfigurationError(
             f"{pattern[:80]!r}: a pattern of names says date and time, as %Y%m%d_%H%M%S"
@@ -215,6 +218,8 @@ def _by_pattern(path: Path, pattern: str) -> _Moment:
         moment = datetime.strptime(found.group(), pattern)  # noqa: DTZ007  the zone is added
     except ValueError as error:
         raise refusal from error
+    if reason := _implausible(path, moment):
+        raise SourceError(f"{path}: {found.group()!r} in its name {reason}")
     step = NANOSECONDS if "%S" in pattern else 60 * NANOSECONDS
     return _Moment(moment, 1_000_000 if "%f" in pattern else step)
 

@@ -11,7 +11,16 @@ from hearthlog.models.features.floor import decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.addresses import check_address, is_address, is_topic, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
-from hearthlog.recorder.events import ERROR, OK, WARNING, Event, Frames, Gap, SourceHealth
+from hearthlog.recorder.events import (
+    ERROR,
+    LISTENING,
+    OK,
+    WARNING,
+    Event,
+    Frames,
+    Gap,
+    SourceHealth,
+)
 from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
@@ -294,7 +303,7 @@ class MicrophoneSource:
             lost = self._unfit or f"{self._own.name or 'the default microphone'} is not there"
             self._health = (WARNING, f"{lost}; {self.device} is heard in its place")
         else:
-            self._health = (OK, "listening")
+            self._health = (OK, LISTENING)
 
     def _watch_clock(self) -> None:
         offset = self._clock.offset()

@@ -47,6 +47,9 @@ _MP3_BIT_RATES = (  # in kbit/s: of MPEG 2 and 2.5, and of MPEG 1
 )
 _OGG_PAGE = 65_307  # bytes, at most
 _OGG_END = 4  # flag of the last page
+_MOST_SAMPLES = 1 << 25  # of all channels in a block
+_MOST_CHUNKS = 10_000
+_MOST_FAILED_SYNCS = 10_000
 _STDERR = 2
 _MOST_COMPLAINTS = 10  # that are kept
 _REDIRECTED = RLock()
@@ -88,6 +91,21 @@ def open_audio(path: Path) -> Iterator[OpenAudio]:
         If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
         768 kHz.
     """
+    with _readable(path), _open(path) as audio:
+        yield audio
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Refuse a file where the system fails, such as for want of memory."""
+    try:
+        yield
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[OpenAudio]:
     _check_file(path)
     complaints: list[bytes] = []
     try:
@@ -163,7 +181,7 @@ def text_fields(path: Path) -> list[str]:
         If there is no such file, or nothing can be read of it.
     """
     _check_file(path)
-    with suppress(soundfile.LibsndfileError), _opened(path, []) as sound:
+    with _readable(path), suppress(soundfile.LibsndfileError), _opened(path, []) as sound:
         return list(sound.copy_metadata().values())
     return []
 
@@ -182,11 +200,8 @@ def _check_file(path: Path) -> None:
         raise SourceError(f"{path}: is a folder; name the audio files in it")
     if not path.is_file():
         raise SourceError(f"{path}: cannot be read as audio (Not a regular file)")
-    try:
-        with path.open("rb"):
-            pass
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+    with _readable(path), path.open("rb"):
+        pass
     if not path.stat().st_size:
         raise SourceError(f"{path}: holds no audio; the file is empty")
 
@@ -209,7 +224,21 @@ def _opened(path: Path, complaints: list[bytes]) -> soundfile.SoundFile:
 
 
 class _View(mmap.mmap):
-    """The bytes of a file, which can be changed without changing the file."""
+    """The bytes of a file, some of which are read as if they were others."""
+
+    change = 0, b""  # where, and what is read there
+
+    def read(self, n: int | None = None) -> bytes:
+        """Read on, as of a file."""
+        begin, data = self.tell(), super().read(n)
+        place, content = self.change
+        if begin >= place + len(content) or place >= begin + len(data):
+            return data
+        changed = bytearray(data)
+        for number, byte in enumerate(content, place - begin):
+            if 0 <= number < len(changed):
+                changed[number] = byte
+        return bytes(changed)
 
     def seek(self, pos: int, whence: int = os.SEEK_SET) -> None:
         """Go to a place, or the end if that lies beyond it, as libsndfile expects."""
@@ -223,15 +252,17 @@ def _mended_wav(path: Path) -> _View | None:
     A recorder that was switched off leaves it so. Nothing is written to the file.
     """
     with path.open("rb") as file:
-        view = _View(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        view = _View(file.fileno(), 0, access=mmap.ACCESS_READ)
     place = 12
-    while view[:4] in {b"RIFF", b"RF64"} and place + 8 < len(view):
+    for _ in range(_MOST_CHUNKS):
+        if view[:4] not in {b"RIFF", b"RF64"} or place + 8 >= len(view):
+            break
         name, size = view[place : place + 4], int.from_bytes(view[place + 4 : place + 8], "little")
         if name == b"data" and view[:4] == b"RF64" and view[12:16] == b"ds64":
-            view[20:36] = struct.pack("<QQ", len(view) - 8, len(view) - place - 8)
+            view.change = 20, struct.pack("<QQ", len(view) - 8, len(view) - place - 8)
             return view
         if name == b"data" and size == 0 and not _is_chunk(view, place + 8):
-            view[place + 4 : place + 8] = b"\xff" * 4
+            view.change = place + 4, b"\xff" * 4
             return view
         place += 8 + size + size % 2
     view.close()
@@ -248,14 +279,16 @@ def _by_libsndfile(
 ) -> OpenAudio:
     _check_rate(path, sound.samplerate)
     frames = None if isinstance(sound, _Unseekable) else sound.frames
-    place, end, is_broken = 0, 0.0, False
+    is_mp3 = sound.subtype.startswith("MPEG")  # its length may be an estimate
+    place, begin, end, is_broken = 0, 0, 0.0, False
 
     def blocks(first: int, last: float) -> Iterator[Float32]:
-        nonlocal place, end, is_broken
-        end = last
+        nonlocal place, begin, end, is_broken
+        begin, end = first, last
         if frames is not None and first:
-            place = sound.seek(min(first, frames))
-        size = int(sound.samplerate * BLOCK_SECONDS)
+            place, is_broken = _sought(sound, min(first, frames))
+        last = last if is_mp3 else min(last, sound.frames)
+        size = _block_frames(sound.samplerate, sound.channels)
         while not is_broken and (count := int(min(size, last - place))) > 0:
             block, is_broken = _read(path, sound, count, complaints)
             if not len(block):
@@ -270,14 +303,26 @@ def _by_libsndfile(
             return ""
         if hidden:
             return f"does not say how long it is; install ffmpeg, which reads {hidden:.0f} s more"
-        is_mp3 = sound.subtype.startswith("MPEG")  # its length may be an estimate
         missing = 0 if frames is None or is_mp3 else frames - place
         is_short = missing > _LEAST_SECONDS * sound.samplerate
         if is_broken or is_short or (is_mp3 and any(map(_BROKEN_MP3.search, complaints))):
-            return _damage(place / sound.samplerate)
+            return _damage(place / sound.samplerate, begin / sound.samplerate)
         return _cut(path, sound, place / sound.samplerate)
 
     return OpenAudio(sound.samplerate, sound.channels, frames, blocks, fault)
+
+
+def _sought(sound: soundfile.SoundFile, place: int) -> tuple[int, bool]:
+    """Seek in a file; return the place, and whether libsndfile cannot go there."""
+    try:
+        return sound.seek(place), False
+    except soundfile.LibsndfileError:
+        return 0, True
+
+
+def _block_frames(rate: int, channels: int) -> int:
+    """Return the samples of each channel that are read at once, however many channels there are."""
+    return max(min(int(rate * BLOCK_SECONDS), _MOST_SAMPLES // channels), 1)
 
 
 def _read(
@@ -301,7 +346,10 @@ def _cut(path: Path, sound: soundfile.SoundFile, seconds: float) -> str:
     return ""
 
 
-def _damage(seconds: float) -> str:
+def _damage(seconds: float, begin: float = 0.0) -> str:
+    """Say up to where a file can be read, of which the part from some time on was wanted."""
+    if not seconds and begin:
+        return f"is damaged or cut short before {begin:.2f} s"
     if not seconds:
         return "is damaged, and none of its sound can be read"
     return f"is damaged or cut short after {seconds:.2f} s"
@@ -314,6 +362,15 @@ def _hidden_seconds(path: Path, sound: soundfile.SoundFile) -> float:
     """
     if sound.format != "MP3":
         return 0.0
+    status = path.stat()
+    samples = _mp3_samples(path, status.st_mtime_ns, status.st_size)
+    hidden = (samples - sound.frames) / sound.samplerate
+    return hidden if hidden > 0.5 + 0.01 * sound.frames / sound.samplerate else 0.0
+
+
+@lru_cache(256)
+def _mp3_samples(path: Path, _time: int, _size: int) -> int:
+    """Count the samples of an MP3 file by its frames; 0 if a table at its beginning says them."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
         place = 0
         if view[:3] == b"ID3":
@@ -323,14 +380,14 @@ def _hidden_seconds(path: Path, sound: soundfile.SoundFile) -> float:
         place = view.find(b"\xff", place, place + _MP3_SEARCHED)
         head = view[place : place + 200]
         if place < 0 or any(table in head for table in (b"Xing", b"Info", b"VBRI")):
-            return 0.0
-        samples = 0
-        while place >= 0 and place + 4 <= len(view):
+            return 0
+        samples = failed = 0
+        while place >= 0 and place + 4 <= len(view) and failed < _MOST_FAILED_SYNCS:
             length, count = _mp3_frame(view[place : place + 4])
             samples += count
+            failed += not length
             place = place + length if length else view.find(b"\xff", place + 1, place + 65_536)
-    hidden = (samples - sound.frames) / sound.samplerate
-    return hidden if hidden > 0.5 + 0.01 * sound.frames / sound.samplerate else 0.0
+    return samples
 
 
 def _mp3_frame(head: bytes) -> tuple[int, int]:
@@ -363,7 +420,9 @@ def _is_cut(path: Path) -> bool:
             flags = view[place + 5 : place + 6] if place >= 0 else b""
             return not flags or not flags[0] & _OGG_END
         place = 8
-        while view[:4] == b"caff" and place + 12 <= len(view):
+        for _ in range(_MOST_CHUNKS):
+            if view[:4] != b"caff" or place + 12 > len(view):
+                break
             size = int.from_bytes(view[place + 4 : place + 12], signed=True)
             if size < 0:  # unknown
                 return False
@@ -423,7 +482,7 @@ def _by_ffmpeg(path: Path, decoder: FileDecoder) -> OpenAudio:
     def blocks(first: int, last: float) -> Iterator[Float32]:
         nonlocal place, end, reason
         end = last
-        size = int(decoder.rate * BLOCK_SECONDS)
+        size = _block_frames(decoder.rate, decoder.channels)
         while (count := int(min(size, last - place))) > 0:
             try:
                 data = decoder.read(count)

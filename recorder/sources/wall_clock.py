@@ -10,6 +10,7 @@ from hearthlog.schemas.times import NANOSECONDS
 # before the clock was looked at, a day for what a log says of the time to come.
 _FIRST = 60 * NANOSECONDS
 _LAST = ((1 << 31) - 86_400) * NANOSECONDS
+_LAST_OF_CALENDAR = 253_402_300_799  # seconds: the year 9999 ends
 
 
 class WallClock:
@@ -50,9 +51,8 @@ def check_times(first: int, last: int) -> None:
         If it cannot.
     """
     if first < 0 or last >= _LAST:
-        raise SourceError(
-            f"a log cannot have sound of {_day(first)}, only of 1970 to 2037; say --start"
-        )
+        day = _day(first if first < 0 else last)
+        raise SourceError(f"a log cannot have sound of {day}, only of 1970 to 2037; say --start")
 
 
 def _trouble(now: int) -> str:
@@ -60,4 +60,5 @@ def _trouble(now: int) -> str:
 
 
 def _day(nanoseconds: int) -> str:
-    return f"{datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC):%Y-%m-%d}"
+    seconds = min(nanoseconds // NANOSECONDS, _LAST_OF_CALENDAR)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d}"

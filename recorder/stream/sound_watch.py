@@ -18,7 +18,7 @@ _STUCK_FRAMES = round(10.0 / FRAME_SECONDS)
 _INFRASOUND_FRAMES = round(20.0 / FRAME_SECONDS)
 _INFRASOUND_SHARE = 0.8  # of them
 _INFRASOUND_POWER = 1e-5  # -50 dBFS
-_DEAD_POWER = (2 / 32768) ** 2  # of what is left beside an offset
+_DEAD_RANGE = 2 / 32768  # of the noise of a converter
 _DAY_MINUTES = 1440
 _FALL = 1000.0  # 30 dB
 _SECOND = round(1.0 / FRAME_SECONDS)
@@ -119,8 +119,8 @@ def is_offset_only(samples: Float32, filtered: Float32) -> Bool:
     """
     if filtered is samples:
         return np.zeros(len(samples), bool)
-    is_faint: Bool = np.square(filtered).mean(axis=1) < _DEAD_POWER
-    return is_faint & (filtered != samples).any(axis=1)
+    is_flat: Bool = np.ptp(samples, axis=1) <= _DEAD_RANGE
+    return is_flat & (filtered != samples).any(axis=1)
 
 
 class _Infrasound:

@@ -101,12 +101,15 @@ def _microphone(state: "RecorderState", name: str, *, named: bool) -> str:
     start = [f"{name}:"] if named else []
     if trouble := state.trouble.get(name):
         return " ".join([*start, trouble])
+    frames = state.sound.get(name)
+    if frames is None:
+        return " ".join([*start, "starting"])
     labels = state.labels.get(name)
     if labels is not None and len(labels.probabilities):
         probabilities = labels.probabilities[-_LAST_FRAMES:].mean(axis=0)
         most = int(probabilities.argmax())
         start.append(f"{in_words(labels.classes[most]).lower()} {probabilities[most]:.0%}")
-    samples = state.sound[name].samples[-_LAST_FRAMES:]
+    samples = frames.samples[-_LAST_FRAMES:]
     power = float(np.square(samples, dtype=np.float64).mean()) if samples.size else 0.0
     level = max(10.0 * np.log10(max(power, 1e-12)), _LOWEST)
     return "  ".join([" ".join(start), f"{level:.0f} dB"] if start else [f"{level:.0f} dB"])

@@ -272,14 +272,16 @@ def _open_files(
 ) -> tuple["FileSource", list[str], list[str]]:
     """Open audio files in the order of time; return doubts about it, and what was left out."""
     from hearthlog.recorder.sources.audio_files import FileSource, find_audio
-    from hearthlog.recorder.sources.file_times import arrange, check_pattern, doubts
+    from hearthlog.recorder.sources.file_times import arrange, check_pattern, doubts, file_time
     from hearthlog.recorder.timezone import time_zone
 
     if pattern is not None:
         check_pattern(pattern)
     begin = None if start is None else parse_time(start, "--start")
-    paths, refused = find_audio(files)
-    paths, times = arrange(paths, time_zone(settings.timezone), pattern or "", begin)
+    zone = time_zone(settings.timezone)
+    check = partial(file_time, zone=zone, pattern=pattern) if pattern else str
+    paths, refused = find_audio(files, check)
+    paths, times = arrange(paths, zone, pattern or "", begin)
     first = times[0]
     assert first is not None
     source = FileSource(

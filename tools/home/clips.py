@@ -258,13 +258,21 @@ def _decode(clip: Clip) -> Float32:
         place = list(_MADE_UP_SECONDS).index(clip.label)
         made = dry_sound(clip.label, clip.frames * FRAME_SAMPLES, generator(clip.seed, place))
         return _normalised(made)
+    faults: list[str] = []
+    blocks = [np.empty(0, np.float32)]
     try:
         end = clip.start + clip.frames * FRAME_SECONDS
-        blocks = list(read_audio(clip.path, clip.start, end))
+        blocks += read_audio(clip.path, clip.start, end, incomplete=faults.append)
     except SourceError as error:
-        raise SimulationError(f"{error}; take it out of the manifest") from error
+        faults.append(str(error))
     sound = np.zeros(clip.frames * FRAME_SAMPLES)
     read = np.concatenate(blocks)[: len(sound)]
+    if not faults and not len(read):
+        faults.append(f"{clip.path}: holds no audio at {clip.start:g} s")
+    if not faults and not np.isfinite(read).all():
+        faults.append(f"{clip.path}: samples of it are no numbers (NaN or infinity)")
+    if faults:
+        raise SimulationError(f"{faults[0]}; take it out of the manifest")
     sound[: len(read)] = read
     return _normalised(sound)
 
