@@ -3,8 +3,8 @@
 The floor falls with the tenth percentile of the last minute, as in minimum statistics (Martin,
 "Noise power spectral density estimation based on optimal smoothing and minimum statistics", 2001),
 and rises only while the sound is as steady as noise. So a fan becomes a part of the room, and ten
-minutes of a shower or of music do not. What is steady belongs to the room at once; the floor, which
-is subtracted from sound, follows it after a minute.
+minutes of a shower or of music do not. What is steady and no louder than a fridge belongs to the
+room at once; the floor, which is subtracted from sound, follows what is steady after a minute.
 """
 
 from typing import NamedTuple
@@ -21,6 +21,7 @@ _MEMORY_SECTIONS = 10_800  # 12 h; a relabelling looks back no further
 _SHARE = 0.1  # of the blocks of a minute that may be below the floor
 _STANDS_OUT = 10 ** (2 / 10)  # times the power of the floor: what is less is silence anyway
 _STEADY_DB = 0.42  # noise is below 0.4; real showers, taps, music and speech are above
+_LOUD = 10 ** (-35 / 10)  # power: fridges are below it, steady taps and alarm tones above
 NOMINAL = 1e-7  # power, -70 dBFS: differences below it are those of codecs
 
 
@@ -32,7 +33,7 @@ class Floors(NamedTuple):
     powers : np.ndarray [shape=(m, b)], float64
         Powers of the bands; the last is that of the whole frame.
     room : np.ndarray [shape=(m, b)], float64
-        The same with what is steady and sounds on: what is not above it is silence.
+        The same with what is steady, sounds on and is not loud: what is not above it is silence.
     converged : bool
         Whether frames before the first one of the stream would leave no trace in them, nor in those
         of the second before.
@@ -134,7 +135,7 @@ class FloorTracker:
         self._unsteady += 1
         if decibels(section[:, :-1]).std(axis=0).mean() < _STEADY_DB:
             self._floor, self._unsteady = section.mean(axis=0), 0
-            self._steady = self._floor
+            self._steady = self._floor if self._floor[-1] < _LOUD else None
         elif self._floor is None or self._unsteady >= _MEMORY_SECTIONS:
             self._floor, self._steady = low, None
         if low[-1] < self._floor[-1]:
