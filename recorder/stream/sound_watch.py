@@ -10,6 +10,8 @@ from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 
 _FULL_SCALE = 0.999
 _CLIPPED_SAMPLES = 4  # of a frame; the highest sample of a recording may be full scale
+_CLIPPED_ENERGY = 0.99 * _CLIPPED_SAMPLES * _FULL_SCALE**2  # in which rounding may lie
+_LOOKED_AT = 16  # samples of a frame: mostly enough to see that it is not one value
 _CLIPPED_FRAMES = round(1.0 / FRAME_SECONDS)  # of the last minute
 _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
@@ -72,10 +74,11 @@ class SoundWatch:
         """
         filtered = samples if filtered is None else filtered
         self._infrasound.add(samples, filtered)
-        clipped = (np.abs(samples) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
-        self._clipped = np.concatenate([self._clipped, clipped])[-_MINUTE:]
+        self._clipped = np.concatenate([self._clipped, _are_clipped(samples)])[-_MINUTE:]
         # Zeros are another matter: in a file they are silence, and a microphone's are reported.
-        moving = (np.ptp(samples, axis=1) > 0) | (samples[:, 0] == 0.0)
+        moving = (samples[:, :_LOOKED_AT] != samples[:, :1]).any(axis=1) | (samples[:, 0] == 0.0)
+        still = np.flatnonzero(~moving)
+        moving[still] = np.ptp(samples[still], axis=1) > 0
         moving = np.flatnonzero(moving & ~is_offset_only(samples, filtered))
         last = int(moving[-1]) if len(moving) else -1
         self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
@@ -121,6 +124,13 @@ def is_offset_only(samples: Float32, filtered: Float32) -> Bool:
         return np.zeros(len(samples), bool)
     is_flat: Bool = np.ptp(samples, axis=1) <= _DEAD_RANGE
     return is_flat & (filtered != samples).any(axis=1)
+
+
+def _are_clipped(samples: Float32) -> Bool:
+    clipped = np.vecdot(samples, samples) >= _CLIPPED_ENERGY
+    loud = np.flatnonzero(clipped)
+    clipped[loud] = (np.abs(samples[loud]) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
+    return clipped
 
 
 class _Infrasound:
