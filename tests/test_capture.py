@@ -155,6 +155,20 @@ def test_a_microphone_that_freezes_is_started_again(labmic, tmp_path):
     assert gap.reason == "the microphone went silent"
 
 
+@pytest.mark.parametrize("burst", [0.8, 2.0, 3.5])
+def test_a_sound_card_that_gives_its_sound_in_long_pieces_is_heard_without_a_loss(
+    labmic, tmp_path, burst
+):
+    labmic.configure(burst=burst)
+    with recording(labmic, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", 240, seconds=60)
+    assert process.returncode == 0, process.errors
+    frames, stamps, _ = features(tmp_path / "logs")
+    np.testing.assert_array_equal(np.diff(frames), 1)
+    assert np.abs(np.diff(stamps) - FRAME).max() < FRAME / 5
+    assert ("went silent" in process.errors) == (burst > 1)
+
+
 def test_a_recorder_that_is_killed_loses_a_second_and_the_next_start_says_so(labmic, tmp_path):
     logs = tmp_path / "logs"
     with recording(labmic, logs) as process:
