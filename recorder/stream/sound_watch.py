@@ -83,7 +83,9 @@ class SoundWatch:
         moving = np.flatnonzero(moving & ~_is_offset_only(samples, filtered))
         last = int(moving[-1]) if len(moving) else -1
         self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
-        self._level.add(np.square(samples).mean(axis=1))
+        with np.errstate(over="ignore"):  # floats of a file may be of any size
+            powers = np.square(samples).mean(axis=1)
+        self._level.add(np.minimum(powers, np.float32(1.0)))
         self._hum.add(samples)
 
     def add_floor(self, powers: Float64) -> None:
@@ -121,7 +123,8 @@ def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
 
 
 def _are_clipped(samples: Float32) -> Bool:
-    clipped = np.vecdot(samples, samples) >= _CLIPPED_ENERGY
+    with np.errstate(over="ignore"):
+        clipped = np.vecdot(samples, samples) >= _CLIPPED_ENERGY
     loud = np.flatnonzero(clipped)
     clipped[loud] = (np.abs(samples[loud]) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
     return clipped
