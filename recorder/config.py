@@ -99,7 +99,7 @@ class MicrophoneSettings(BaseModel):
         ge=1,
         le=64,
         description="The channel to hear of several, from 1 on; by default the first one, and of "
-        "files their mean.",
+        "files and addresses their mean, or the best one where that hides it.",
     )
     model: Path | None = Field(
         default=None, examples=_MODELS, description="Instead of the recorder's; none: no labels."

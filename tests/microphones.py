@@ -49,13 +49,21 @@ class LabMicrophone:
         self._control = folder / f"{device}.control"
         self.configure()
 
-    def configure(self, rate: int = _RATE, ppm: float = 0.0, data: np.ndarray | None = None):
+    def configure(
+        self,
+        rate: int = _RATE,
+        ppm: float = 0.0,
+        data: np.ndarray | None = None,
+        burst: float = 0.0,
+    ):
         """Set what the next process to open the microphone finds.
 
-        `data` is int16, mono, or has an axis of channels.
+        `data` is int16, mono, or has an axis of channels. Samples come in pieces of so many seconds
+        as `burst` says.
         """
         self._rate = rate * (1 + Fraction(str(ppm)) / 1_000_000)
         fields = f'type labmic rate {rate} ppm {float(ppm):.6f} ctl "{self._control}"'
+        fields += f" burst {max(round(burst * rate), 1)}"
         if data is not None:
             samples = self._folder / f"{self.device}.s16"
             _write_samples(samples, data)

@@ -18,11 +18,10 @@ RATE = 16_000
 _BLOCK = 800
 _SYSTEM_PYTHON = "/usr/bin/python3"
 _CAMERA = Path(__file__).with_name("rtsp_camera.py")
-_WAV = b"RIFF\xff\xff\xff\xffWAVEfmt " + struct.pack("<IHHIIHH", 16, 1, 1, RATE, 2 * RATE, 2, 16)
 
 
 class LiveServer:
-    """Serves a loop of int16 samples as WAV over HTTP, as it sounds.
+    """Serves a loop of int16 samples as WAV over HTTP, as it sounds: mono, or an axis of channels.
 
     Sample n sounds at CLOCK_MONOTONIC = `epoch` + n / 16000, for all who listen.
 
@@ -90,7 +89,11 @@ class LiveServer:
             to.wfile.write(page.encode())
             return
         to.end_headers()
-        to.wfile.write(_WAV + b"data\xff\xff\xff\xff")
+        channels = self.data[0].size
+        sizes = struct.pack(
+            "<IHHIIHH", 16, 1, channels, RATE, 2 * channels * RATE, 2 * channels, 16
+        )
+        to.wfile.write(b"RIFF\xff\xff\xff\xffWAVEfmt " + sizes + b"data\xff\xff\xff\xff")
         self._send_sound(to.wfile)
 
     def _send_sound(self, to):

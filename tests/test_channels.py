@@ -1,24 +1,25 @@
 """Several channels become one in which everything is heard; what is no number is a gap."""
 
-from array import array
 from threading import Event as Flag
 
 import numpy as np
 import pytest
 import soundfile
 from logs import features, read
+from streams import LiveServer
 from test_capture import recording, wait_for_frames
+from test_network import Address
 
 from hearthlog import classify, extract_features, load_model
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.errors import DeviceError, SourceError
+from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import WARNING, Frames, Gap, SourceHealth
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.channels import StreamMixer
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.recorder.sources.network_capture import _mixer
 
 RATE = 16_000
 START = 1_772_348_400_000_000_000
@@ -142,22 +143,67 @@ def test_a_channel_of_a_microphone_is_chosen_by_its_number(labmic, tmp_path):
     )
 
 
-def test_of_a_stream_in_the_network_too_the_best_channel_is_heard():
-    left = np.round(SOUND * 32767).astype(np.int16)
-    for other, channel, expected in (
-        (-left, None, left),
-        (left, None, left),
-        (np.round(noise(0.02) * 32767).astype(np.int16), 1, left),
-        (left // 2, 2, left // 2),
-    ):
-        mix = _mixer("http://camera", 2, channel)
-        interleaved = np.stack([left, other], axis=1).ravel()
-        blocks = np.split(interleaved, range(19_200, len(interleaved), 19_200))
-        mixed = b"".join(mix(array("h", block.tobytes())) for block in blocks)
-        np.testing.assert_array_equal(np.frombuffer(mixed, "<i2"), expected)
-    assert _mixer("http://camera", 1, 1) is None
-    with pytest.raises(DeviceError, match=r"http://camera has one channel, and `channel` asks"):
-        _mixer("http://camera", 1, 2)
+INT16 = np.round(SOUND * 32767).astype(np.int16)
+HISS = np.round(noise(0.02) * 32767).astype(np.int16)
+
+
+@pytest.mark.parametrize(
+    ("sounds", "takes_first", "number", "why"),
+    [
+        ([INT16, -INT16], False, 1, "their mean is much fainter"),
+        ([INT16, HISS], False, 1, "the others hide it"),
+        ([INT16, -INT16, INT16 // 2], True, 1, ""),
+        ([INT16, HISS], True, 1, ""),
+        ([HISS, INT16], True, 2, "the first one hides it"),
+        ([INT16 // 8, INT16], True, 2, "the first one is much fainter"),
+        ([INT16 // 2, INT16], True, 1, ""),
+    ],
+)
+@pytest.mark.parametrize("size", [9600, 19_200])
+def test_of_a_stream_too_the_best_channel_is_heard_and_told_once(
+    sounds, takes_first, number, why, size
+):
+    mixer, mixed, news = StreamMixer(takes_first=takes_first), [], []
+    for first in range(0, len(INT16), size):
+        block = np.stack([each[first : first + size] for each in sounds], axis=1)
+        mixed.append(mixer(block, RATE))
+        news, mixer.news = [*news, mixer.news], ""
+    best, late = sounds[number - 1], 2 * RATE
+    np.testing.assert_array_equal(np.concatenate(mixed)[late:], best[late:])
+    expected = [f"channel {number} of {len(sounds)} is heard alone: {why}"] if why else []
+    assert [each for each in news if each] == expected
+
+
+def test_channels_of_a_stream_that_do_not_hide_each_other_are_averaged():
+    mixer = StreamMixer(takes_first=False)
+    mixed = mixer(np.stack([INT16, INT16 // 2], axis=1), RATE)
+    mean = (INT16.astype(float) + INT16 // 2) / 2
+    assert np.abs(mixed - mean).max() <= 0.5
+    assert not mixer.news
+
+
+def test_a_sound_card_whose_first_channel_is_dead_is_heard_by_another_and_says_so(labmic, tmp_path):
+    dead, sound = np.zeros(RATE, np.int16), np.round(noise(0.1, 1) * 32767).astype(np.int16)
+    labmic.configure(data=np.stack([dead, sound, -sound, dead], axis=1))
+    with recording(labmic, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", 60)
+    told = "channel 2 of 4 is heard alone: the first one is much fainter"
+    assert process.errors.count(told) == 1
+    states = [status for m in read(tmp_path / "logs", "diagnostics") for status in m.status]
+    assert [state.message for state in states if state.level == WARNING] == [told]
+    assert features(tmp_path / "logs")[2][20:, 0].min() > 0.005
+
+
+def test_a_server_whose_channels_cancel_is_heard_and_says_which_it_is(tmp_path):
+    sound = np.round(noise(0.1, 3) * 32767).astype(np.int16)
+    server = LiveServer(np.stack([sound, -sound], axis=1))
+    try:
+        with recording(Address(server.address), tmp_path / "logs") as process:
+            wait_for_frames(tmp_path / "logs", 60)
+    finally:
+        server.close()
+    assert process.errors.count("channel 1 of 2 is heard alone: their mean is much fainter") == 1
+    assert features(tmp_path / "logs")[2][20:, 0].min() > 0.005
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -204,7 +250,7 @@ def test_holes_at_both_ends_are_gaps_and_a_file_of_nothing_else_is_refused(tmp_p
     path = written(tmp_path / "none.wav", noise(0.1) * np.nan)
     with pytest.raises(SourceError, match=r"none.wav: the samples are no numbers"):
         events_of(path)
-    with pytest.raises(SourceError, match=r"none.wav: samples of it are no numbers"):
+    with pytest.raises(SourceError, match=r"none.wav: the samples are no numbers"):
         clip_frames(LabelledClip(path, "speech", "a", "b", "c"))
     with pytest.raises(SourceError, match="the sound is no numbers"):
         extract_features(noise(0.1) * np.nan, RATE)

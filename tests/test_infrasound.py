@@ -119,6 +119,20 @@ def test_blocks_of_any_size_give_the_same_bits(scene, size):
     np.testing.assert_array_equal(filter_(frames), at_once)
 
 
+@pytest.mark.parametrize("level", [1.0, 0.05, 1e-3, 1e30])
+def test_frames_that_need_no_closer_look_are_those_in_which_nothing_stands_out(
+    scene, real_frames, monkeypatch, level
+):
+    edge = 3e-4 * np.sin(2 * np.pi * time_of(scene) / 7) * rumble(scene, 9, 4.0)  # the least power
+    faulty = [as_frames(scene + fault(scene)) for fault in FAULTS.values()]
+    frames = np.concatenate([*faulty, as_frames(scene + edge), real_frames]) * np.float32(level)
+    quick = InfrasoundFilter()(frames)
+    monkeypatch.setattr(
+        InfrasoundFilter, "_may_stand_out", lambda _, frames: np.ones(len(frames), bool)
+    )
+    np.testing.assert_array_equal(InfrasoundFilter()(frames), quick)
+
+
 def test_samples_of_16_bits_remain_such_and_are_left_alone_the_second_time(scene):
     frames = as_frames(scene + 0.01 + rumble(scene, 5))
     filtered = InfrasoundFilter()(frames)

@@ -5,7 +5,14 @@ import pytest
 
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.stream import sound_watch
-from hearthlog.recorder.stream.sound_watch import FAINT, HUMS, OFFSET, STUCK, SoundWatch
+from hearthlog.recorder.stream.sound_watch import (
+    CLIPS,
+    FAINT,
+    HUMS,
+    OFFSET,
+    STUCK,
+    SoundWatch,
+)
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 pytestmark = pytest.mark.fast
@@ -53,6 +60,28 @@ def test_a_microphone_with_an_offset_is_dead_only_if_it_gives_no_noise_but_its_o
     frames = ((655 + sound) / 32768).astype(np.float32).reshape(-1, FRAME_SAMPLES)
     watch.add_samples(frames, infrasound(frames))
     assert watch.problem() == problem
+
+
+@pytest.mark.parametrize(("clipped", "problem"), [(3, ""), (4, CLIPS)])
+@pytest.mark.parametrize("rest", [0.0, 0.05])
+def test_four_samples_of_a_frame_at_full_scale_are_clipped_however_faint_the_rest_is(
+    clipped, problem, rest
+):
+    watch = SoundWatch()
+    frames = noise(2, rest).reshape(-1, FRAME_SAMPLES)
+    frames[::2, :clipped] = -1.0
+    frames[1::2, -clipped:] = 1.0
+    listen(watch, frames)
+    assert watch.problem() == problem
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_sample_of_any_size_is_clipped_without_a_warning_of_numpy():
+    watch = SoundWatch()
+    frames = noise(2, 0.05).reshape(-1, FRAME_SAMPLES)
+    frames[:, ::100] = 3e38
+    listen(watch, InfrasoundFilter()(frames.astype(np.float32)))
+    assert watch.problem() == CLIPS
 
 
 @pytest.mark.parametrize("frequency", [50, 60, 50.1])

@@ -63,6 +63,31 @@ def test_a_recorder_that_starts_with_such_a_clock_follows_it_once_it_is_right(cl
     assert [line for line in said if "which a log cannot have; set it" in line]
 
 
+@pytest.mark.parametrize("step", [-86_400, 7])
+def test_a_clock_that_is_set_while_the_microphone_is_silent_is_told_of_in_the_gap(
+    clock, record, labmic, step
+):
+    recorder, logs = record
+    recorder.start()
+    wait_for_frames(logs, 20)
+    labmic.freeze()
+    clock[0] = step * SECONDS
+    until = time.monotonic() + 30
+    while "waiting for it" not in told(logs) and "went silent" not in told(logs):
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    labmic.restore()
+    wait_for_frames(logs, len(features(logs)[0]) + 40)
+    recorder.finish()
+    (gap,) = read(logs, "gap")
+    assert gap.reason == f"the microphone went silent; the clock was set by {step:+.3f} s"
+
+
+def told(logs):
+    """What was said of the microphone so far."""
+    return " ".join(status.message for m in read(logs, "diagnostics") for status in m.status)
+
+
 def test_a_clock_that_is_wrong_for_a_while_leaves_no_gap(clock, record):
     recorder, logs = record
     recorder.start()

@@ -17,11 +17,10 @@ from hearthlog.analyzer.doctor.topic_types import (
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.messages.gaps import LOG_DAMAGED, ON_PURPOSE
+from hearthlog.schemas.messages.gaps import CLOCK_SET, LOG_DAMAGED, ON_PURPOSE
 from hearthlog.schemas.messages.topics import ROSOUT
 
 STAMP = "header.stamp"
-_ANY_DURATION = ("the clock was set", LOG_DAMAGED)  # with which the reasons begin
 _SUM_TOLERANCE = 1e-4
 _LATE = {  # ns, with what stamps may be off
     LABEL: 1_010_000_000,
@@ -257,9 +256,10 @@ def check_gaps(findings: Findings, columns: Columns) -> None:
     """
     times, durations = columns.log_times, columns["duration"]
     lost, reasons = columns["frames_lost"], columns["reason"]
+    on_purpose = np.array([each.split("; ")[0] in ON_PURPOSE for each in reasons], bool)
     findings.rows(
         "gap",
-        ~np.isin(reasons, ON_PURPOSE),
+        ~on_purpose,
         times,
         lambda i: (
             f"{columns.topic}: {durations[i] / 1e9:.3f} s, {lost[i]} frames were not heard: "
@@ -267,7 +267,7 @@ def check_gaps(findings: Findings, columns: Columns) -> None:
         ),
         level="warning",
     )
-    free = np.array([reason.startswith(_ANY_DURATION) for reason in reasons], bool)
+    free = np.array([CLOCK_SET in each or each.startswith(LOG_DAMAGED) for each in reasons], bool)
     frames = durations.astype(np.float64) / FRAME_NANOSECONDS
     differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
     findings.rows(

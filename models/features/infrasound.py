@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from hearthlog.models.batch_invariant import rowwise_matmul
-from hearthlog.schemas.arrays import Bool, Float32, Float64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 _TERMS = 5  # of the polynomials: 12 Hz falls by 40 dB, 50 Hz by 1 dB
@@ -22,6 +22,9 @@ _WINDOW, _MOST = 20, 10  # frames: of a second, half; a thump is shorter
 _HELD = 200  # frames: ten seconds of speech or music may hide it
 _STEPS = 1 << 15  # to 1: samples of 16 bits remain such
 _TINY = 1e-20
+_LEAST_ENERGY = _LEAST_POWER * FRAME_SAMPLES
+_ROUNDING = 1e-3  # of the energy of a frame: more than float32 loses of it
+_MOST_GAIN = 1.1  # more than probes find of what the polynomials have of two frames
 
 
 class InfrasoundFilter:
@@ -59,31 +62,54 @@ class InfrasoundFilter:
         """
         if not len(frames):
             return frames
-        samples = frames.astype(np.float64)
-        coefficients = rowwise_matmul(samples, _curves())
-        rest = np.maximum(_power(samples) - _power(coefficients), _TINY)
-        below, waves = self._powers(coefficients)
+        places = np.flatnonzero(self._may_stand_out(frames))
+        below, waves, rest = self._powers(frames, places)
         wavy = self._wave(waves, rest)
         removed = self._offset(below, rest) | wavy
         self.is_active = bool(removed[-1])
         if not removed.any():
             return frames
+        coefficients = _coefficients(frames)
         coefficients[~wavy, 1:] = 0.0
         coefficients[~removed] = 0.0
         baseline = np.rint(_STEPS * rowwise_matmul(coefficients, _curves().T)) / _STEPS
         return frames - baseline.astype(np.float32)
 
-    def _powers(self, coefficients: Float64) -> tuple[Float64, Float64]:
-        """Return the power below 20 Hz around the start of each frame, and that without offsets."""
-        last = coefficients[:1] if self._last is None else self._last
-        self._last = coefficients[-1:].copy()
-        pairs = np.concatenate([np.concatenate([last, coefficients[:-1]]), coefficients], axis=1)
-        values = np.square(rowwise_matmul(pairs, _probes()))
-        powers = np.maximum(
-            np.maximum(values[:, 0::5], values[:, 1::5] + values[:, 2::5]),
-            values[:, 3::5] + values[:, 4::5],
-        )
-        return powers[:, 0], powers[:, 1]
+    def _may_stand_out(self, frames: Float32) -> Bool:
+        """Find the frames that need a closer look, by bounds that cost less than the powers."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            energy = np.vecdot(frames, frames)
+            coefficients = frames @ _rough_curves()
+            slow = np.vecdot(coefficients, coefficients) + _ROUNDING * energy
+            before = slow[:1] if self._last is None else np.square(self._last).sum(axis=1)
+            both = slow + np.concatenate([before, slow[:-1]])
+            rest = (1.0 - _ROUNDING) * energy - slow
+            is_clear = _MOST_GAIN * both < np.maximum(_STANDS_OUT * rest, _LEAST_ENERGY)
+        return ~is_clear
+
+    def _powers(self, frames: Float32, places: Indices) -> tuple[Float64, Float64, Float64]:
+        """Return the power below 20 Hz around the start of frames, that without offsets, the rest.
+
+        They are 0 where nothing stands out.
+        """
+        below, waves, rest = np.zeros((3, len(frames)))
+        pairs = np.empty((len(places), 2 * _TERMS))
+        if len(places):
+            samples = frames[places].astype(np.float64)
+            pairs[:, _TERMS:] = rowwise_matmul(samples, _curves())
+            pairs[:, :_TERMS] = _coefficients(frames[places - 1])
+            if places[0] == 0:
+                pairs[0, :_TERMS] = pairs[0, _TERMS:] if self._last is None else self._last[0]
+            values = np.square(rowwise_matmul(pairs, _probes()))
+            powers = np.maximum(
+                np.maximum(values[:, 0::5], values[:, 1::5] + values[:, 2::5]),
+                values[:, 3::5] + values[:, 4::5],
+            )
+            below[places], waves[places] = powers[:, 0], powers[:, 1]
+            slow = np.ascontiguousarray(pairs[:, _TERMS:])
+            rest[places] = np.maximum(_power(samples) - _power(slow), _TINY)
+        self._last = _coefficients(frames[-1:])
+        return below, waves, rest
 
 
 class _Persistence:
@@ -96,6 +122,9 @@ class _Persistence:
     def __call__(self, powers: Float64, rest: Float64) -> Bool:
         out = powers > np.maximum(_STANDS_OUT * rest, _LEAST_POWER)
         known = out if self._recent is None else np.concatenate([self._recent, out])
+        if not self._held and not known.any():
+            self._recent = known[-_WINDOW:].copy()
+            return out
         count = np.cumsum(np.concatenate([np.zeros(_WINDOW, np.intp), known]))
         begins = (count[_WINDOW:] - count[:-_WINDOW] >= _MOST)[len(known) - len(out) :]
         if self._recent is None:
@@ -112,6 +141,10 @@ class _Persistence:
         return lasting
 
 
+def _coefficients(frames: Float32) -> Float64:
+    return rowwise_matmul(frames.astype(np.float64), _curves())
+
+
 def _power(rows: Float64) -> Float64:
     return np.vecdot(rows, rows) / FRAME_SAMPLES
 
@@ -123,6 +156,11 @@ def _curves() -> Float64:
     powers = np.polynomial.legendre.legvander(place, _TERMS - 1)
     curves: Float64 = powers / np.linalg.norm(powers, axis=0)
     return curves
+
+
+@cache
+def _rough_curves() -> Float32:
+    return np.ascontiguousarray(_curves(), np.float32)
 
 
 @cache

@@ -193,7 +193,7 @@ class FileSource:
             )
             for block in blocks:
                 samples += len(block)
-                held = np.concatenate([held, block])
+                held = np.concatenate([held, block]) if len(held) else block
                 whole = len(held) - len(held) % size
                 for start in range(0, whole, size):
                     yield held[start : start + size].reshape(-1, FRAME_SAMPLES, *shape)

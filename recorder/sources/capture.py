@@ -4,7 +4,7 @@ PortAudio hangs inside the process when a device vanishes, so this process can b
 moment. It imports no more than PortAudio needs and computes nothing.
 
 It writes one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and
-the samples that it announces (int16, interleaved if it is an array of microphones).
+the samples that it announces (int16, interleaved if there are several channels).
 """
 
 import json
@@ -29,6 +29,8 @@ BLOCK = struct.Struct("<QIIdd")
 _PREFERRED_RATE = 16_000
 BLOCK_SECONDS = 0.6  # each wake-up costs more than the samples it brings
 LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
+LONG_LATENCY_SECONDS = 8.0  # for devices that give their sound in long pieces
+_MOST_CHANNELS = 8  # to choose one of; a sound server offers any number, and mixes them itself
 _QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
 
 
@@ -41,15 +43,15 @@ class CaptureFormat:
     rate: int
     stale_seconds: float = 3.0  # without a block, after which none will come
     lost_reason: str = ""  # why samples are in no block; empty: the recorder was too slow
-    channels: int | None = None  # of an array; None: of a single microphone
+    channels: int | None = None  # of the blocks; None: one, and samples have no axis of channels
 
 
 def main() -> None:
     """Capture from the device named by the first argument, until killed or without a parent.
 
     Without an argument, list the devices. The second one is the number of channels of an array, or
-    0, the third one the channel to hear, or 0. A fourth one: take no other device whose name
-    contains this one.
+    0, the third one the channel to hear, or 0, the fourth one the latency in seconds. A fifth one:
+    take no other device whose name contains this one.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
@@ -61,9 +63,9 @@ def main() -> None:
         if len(sys.argv) == 1:
             output.write(json.dumps([asdict(device) for device in devices]).encode())
         else:
-            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 4)
+            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 5)
             places, channel = (int(number) or None for number in sys.argv[2:4])
-            _capture(sounddevice, device, places, channel, output)
+            _capture(sounddevice, device, places, channel, float(sys.argv[4]), output)
     except SourceError as error:
         answer = {"error": str(error), "device": isinstance(error, DeviceError)}
         output.write(json.dumps(answer).encode() + b"\n")
@@ -73,8 +75,13 @@ def main() -> None:
     os._exit(0)
 
 
-def _capture(
-    sounddevice: ModuleType, device: Device, places: int | None, channel: int | None, output: Any
+def _capture(  # noqa: PLR0913, PLR0917
+    sounddevice: ModuleType,
+    device: Device,
+    places: int | None,
+    channel: int | None,
+    latency: float,
+    output: Any,
 ) -> None:
     blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(_QUEUE_BLOCKS)
     index = 0
@@ -92,10 +99,18 @@ def _capture(
         if not blocks.full():  # what is dropped here shows in the next index
             blocks.put_nowait((head, bytes(samples)))
 
-    wanted = range(channel - 1, channel) if channel else range(places or 1)
     _check_channels(device, places, channel)
-    stream, rate, channels = _open(sounddevice, device, wanted.stop, enqueue)
-    answer = CaptureFormat(device.name, device.identity, rate, channels=places)
+    wanted = range(channel - 1, channel) if channel else range(places or 1)
+    chooses = not channel and not places and 1 < device.channels <= _MOST_CHANNELS
+    counts = [device.channels] if chooses else []
+    stream, rate, channels = _open(
+        sounddevice, device, [*counts, wanted.stop, device.channels], latency, enqueue
+    )
+    if chooses and channels > 1:
+        wanted = range(channels)
+    several = len(wanted) if places or len(wanted) > 1 else None
+    stale = CaptureFormat.stale_seconds + latency - LATENCY_SECONDS
+    answer = CaptureFormat(device.name, device.identity, rate, stale, channels=several)
     output.write(json.dumps(asdict(answer)).encode() + b"\n")
     stream.start()
     parent = os.getppid()
@@ -109,12 +124,12 @@ def _capture(
 
 
 def _open(
-    sounddevice: ModuleType, device: Device, wanted: int, callback: Any
+    sounddevice: ModuleType, device: Device, counts: list[int], latency: float, callback: Any
 ) -> tuple[Any, int, int]:
-    """Open the device at 16 kHz and so many channels, or at its own rate, or all channels."""
+    """Open the device at 16 kHz, or at its own rate, with the first number of channels it takes."""
     reason = ""
     for rate in (_PREFERRED_RATE, int(device.default_rate)):
-        for channels in (wanted, device.channels):
+        for channels in dict.fromkeys(counts):
             try:
                 stream = sounddevice.RawInputStream(
                     samplerate=rate,
@@ -122,7 +137,7 @@ def _open(
                     device=device.index,
                     channels=channels,
                     dtype="int16",
-                    latency=LATENCY_SECONDS,
+                    latency=latency,
                     callback=callback,
                 )
             except sounddevice.PortAudioError as error:

@@ -10,9 +10,11 @@ from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.recorder.sources.sample_clock import SampleClock
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.messages.gaps import CLOCK_SET
 from hearthlog.schemas.times import NANOSECONDS
 
 _ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on an unknown clock
+STEP_SECONDS = 0.25  # of the time of day: less is a clock that is steered
 _LOSS_SECONDS = 0.010
 _STEADY_SECONDS = 0.002  # an ADC that has been this exact for so many blocks
 _STEADY_BLOCKS = 50  # is believed when it says that samples are missing
@@ -128,20 +130,22 @@ class Framer:
         self._lost_reason = lost_reason or "the recorder was too slow"
         self._clock = SampleClock(rate)
         self._expected = self._lost = self._steady = 0
+        step = (wall_offset - self._end_offset) / NANOSECONDS
+        if self._end is not None and abs(step) > STEP_SECONDS:
+            reason = f"{reason}; {clock_set_by(step)}"
         self._restart(0, reason)
         self._wall_offset = wall_offset
 
-    def step_clock(self, wall_offset: int, reason: str) -> None:
+    def step_clock(self, wall_offset: int) -> None:
         """Follow a change of the time of day; only the samples of the unfinished frame are lost.
 
         Parameters
         ----------
         wall_offset : int
             CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
-        reason : str
-            Why the clock changed.
         """
-        self._restart(self._expected + self._lost, reason)
+        step = (wall_offset - self._wall_offset) / NANOSECONDS
+        self._restart(self._expected + self._lost, clock_set_by(step))
         self._wall_offset = wall_offset
 
     def add(self, block: SampleBlock) -> list[Frames | Gap]:
@@ -220,6 +224,11 @@ class Framer:
         lost = max(round((time - self._end) / FRAME_NANOSECONDS), 1)
         self._next_frame += lost
         return Gap(self._end + self._end_offset, time + self._wall_offset, reason, lost)
+
+
+def clock_set_by(seconds: float) -> str:
+    """Say in the reason of a gap that the clock was set."""
+    return f"{CLOCK_SET} by {seconds:+.3f} s"
 
 
 def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:

@@ -2,7 +2,9 @@
 
 import math
 import time
+from collections import deque
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from threading import Event as Flag
 
 import numpy as np
@@ -22,13 +24,15 @@ from hearthlog.recorder.events import (
     SourceHealth,
 )
 from hearthlog.recorder.rest import Rest
+from hearthlog.recorder.sources.capture import LATENCY_SECONDS, LONG_LATENCY_SECONDS
+from hearthlog.recorder.sources.channels import StreamMixer
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
-from hearthlog.recorder.sources.framing import Framer
+from hearthlog.recorder.sources.framing import STEP_SECONDS, Framer, SampleBlock
 from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkProcess, check_ros
 from hearthlog.recorder.sources.return_watch import ReturnWatch
 from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
-from hearthlog.recorder.stream.sound_watch import is_offset_only
+from hearthlog.recorder.stream.sound_watch import DEAD_STEPS
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -36,8 +40,8 @@ _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _RETRY_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0)
 _HEALTH_SECONDS = 10.0
 _LOOK_SECONDS = 0.25
+_OVERFLOWS, _OVERFLOW_SECONDS = 5, 60.0  # so many in such a time want a longer buffer
 _SILENT_FRAMES = 200  # ten seconds
-_STEP_SECONDS = 0.25
 _FALLBACK_SECONDS = 10.0  # of patience with the device, before another one is heard
 
 
@@ -82,7 +86,8 @@ class MicrophoneSource:
     channels : int or None
         Of an array; None of a single microphone.
     channel : int or None
-        The one to hear of the device, from 1 on; by default the first one, as of its fallback.
+        The one to hear of the device, from 1 on; by default, as of its fallback, the first one, or
+        the best one if that has much less sound.
 
     Attributes
     ----------
@@ -109,12 +114,14 @@ class MicrophoneSource:
     ) -> None:
         self._own = _Device(device, channels, channel)
         self._fallback = _Device(fallback) if fallback else None
+        self._device_heard = self._own
         self._return: ReturnWatch | None = None  # as long as the fallback is heard
         self._lost_at = -math.inf  # when the device was lost
         self._unfit = ""  # why a device that is there cannot be heard
         self.device = self._own.name
         self._rest = rest
         self._capture: Capture | None = None
+        self._mixer: StreamMixer | None = None  # of several channels that are no array
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
@@ -185,7 +192,9 @@ class MicrophoneSource:
     ) -> Generator[Event, None, str]:
         """Yield the events of one run of the capture process; return why it ended."""
         form = capture.format
-        self._framer.begin(form.rate, self._wall_offset, reason, form.lost_reason, form.channels)
+        channels = form.channels if self._mixer is None else None
+        self._steps_clock()
+        self._framer.begin(form.rate, self._wall_offset, reason, form.lost_reason, channels)
         stale = form.stale_seconds
         last_block = time.monotonic() + max(_FIRST_BLOCK_SECONDS - stale, 0.0)
         while not stop.is_set():
@@ -197,20 +206,44 @@ class MicrophoneSource:
                 return "the capture process ended"
             for block in blocks:
                 last_block = self._last_block = block.arrival
-                self._overruns += block.overflowed
-                for event in self._framer.add(block):
-                    self._watch(event)
-                    yield event
+                yield from self._frames_of(block, form.rate)
             if time.monotonic() - last_block > stale and not blocks:
+                self._device_heard.was_silent()
                 return "the microphone went silent"
-            self._watch_clock()
+            if self._steps_clock():
+                self._framer.step_clock(self._wall_offset)
+            self._tell_channel()
             if blocks:  # its frames' time: now would be ahead of them
                 yield from self._report(self._framer.last_stamp)
-            if self._return is not None and self._return.is_there:
-                return "its device is there again"
-            if resting := self._resting():
-                return resting
+            if ending := self._reason_to_end():
+                return ending
         return "the recorder was stopped"
+
+    def _reason_to_end(self) -> str:
+        """Say why a run of the capture process is to end, if it is."""
+        if self._return is not None and self._return.is_there:
+            return "its device is there again"
+        if self._device_heard.needs_longer_buffer():
+            return "the sound card lost samples: it is opened again with a longer buffer"
+        return self._resting()
+
+    def _frames_of(self, block: SampleBlock, rate: int) -> Iterator[Event]:
+        """Yield the frames that a block completes, and the gap before them."""
+        self._overruns += block.overflowed
+        self._device_heard.add(block)
+        if self._mixer is not None:
+            block = replace(block, samples=self._mixer(block.samples, rate))
+        # Before it is resampled: noise of one step becomes more, as noise of a quiet room is.
+        is_flat = int(block.samples.max()) - int(block.samples.min()) <= DEAD_STEPS
+        for event in self._framer.add(block):
+            self._watch(event, is_flat=is_flat)
+            yield event
+
+    def _tell_channel(self) -> None:
+        """Report once which of several channels is heard: what is heard of it is all right."""
+        if self._mixer is not None and self._mixer.news and self._health[0] != ERROR:
+            self._health = (WARNING, self._mixer.news)
+            self._mixer.news = ""
 
     def _try_at_the_start(self, *, waits: bool) -> None:
         try:
@@ -232,12 +265,17 @@ class MicrophoneSource:
             exact=device.was_heard,
             channels=device.channels,
             channel=device.channel,
+            latency=device.latency,
         )
 
     def _hear(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
         device.is_heard(capture)
+        self._device_heard = device
         self.device = device.name
+        self._mixer = None
+        if device.channels is None and capture.format.channels is not None:
+            self._mixer = StreamMixer(takes_first=not is_address(device.wanted))
 
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
         pauses = iter(_RETRY_SECONDS)
@@ -283,14 +321,15 @@ class MicrophoneSource:
         self._return = ReturnWatch(lambda stop: self._open(self._own, stop))
         return True
 
-    def _watch(self, event: Frames | Gap) -> None:
+    def _watch(self, event: Frames | Gap, *, is_flat: bool) -> None:
         if isinstance(event, Gap):
             self._frames_lost += event.frames_lost
             self._infrasound.restart()
             return
         filtered = self._infrasound(event.samples)
         self._level.add(filtered)
-        is_dead = ~event.samples.any(axis=1) | is_offset_only(event.samples, filtered)
+        has_offset = (filtered != event.samples).any(axis=1)
+        is_dead = ~event.samples.any(axis=1) | (is_flat & has_offset)
         sounding = np.flatnonzero(~is_dead)
         zeros = len(event.samples) - 1 - sounding[-1] if len(sounding) else len(event.samples)
         self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)
@@ -305,14 +344,16 @@ class MicrophoneSource:
         else:
             self._health = (OK, LISTENING)
 
-    def _watch_clock(self) -> None:
+    def _steps_clock(self) -> bool:
+        """Look at the time of day; return whether it was set."""
         offset = self._clock.offset()
-        step = (offset - self._wall_offset) / NANOSECONDS
-        if abs(step) > _STEP_SECONDS:
-            self._wall_offset = offset
-            self._framer.step_clock(offset, f"the clock was set by {step:+.3f} s")
+        if abs(offset - self._wall_offset) <= STEP_SECONDS * NANOSECONDS:
+            return False
+        self._wall_offset = offset
+        return True
 
     def _now(self) -> int:
+        self._steps_clock()
         return time.monotonic_ns() + self._wall_offset
 
     def _report(self, stamp: int) -> Iterator[SourceHealth]:
@@ -367,7 +408,35 @@ class _Device:
         self.channels = channels
         self.channel = channel
         self.was_heard = False
+        self.latency = LATENCY_SECONDS
+        self._last = self._longest_pause = 0.0  # arrival of a block of this run, between two
+        self._overflows: deque[float] = deque(maxlen=_OVERFLOWS)  # their arrival
 
     def is_heard(self, capture: Capture) -> None:
         heard = capture.format
         self.name, self.wanted, self.was_heard = heard.device, heard.identity, True
+        self._last = self._longest_pause = 0.0
+        self._overflows.clear()
+
+    def add(self, block: SampleBlock) -> None:
+        if self._last:
+            self._longest_pause = max(self._longest_pause, block.arrival - self._last)
+        self._last = block.arrival
+        if block.overflowed:
+            self._overflows.append(block.arrival)
+
+    def was_silent(self) -> None:
+        """Note that no more sound came: without any at all a longer buffer may be needed."""
+        if not self._last:
+            self.latency = LONG_LATENCY_SECONDS
+        elif self._longest_pause < LATENCY_SECONDS:
+            self.latency = LATENCY_SECONDS
+
+    def needs_longer_buffer(self) -> bool:
+        """Ask for a longer buffer if the sound comes in pieces that are longer than it is."""
+        often = len(self._overflows) == _OVERFLOWS
+        often = often and self._overflows[-1] - self._overflows[0] < _OVERFLOW_SECONDS
+        if not often or self.latency == LONG_LATENCY_SECONDS:
+            return False
+        self.latency = LONG_LATENCY_SECONDS
+        return True

@@ -31,7 +31,6 @@ _SETTLE_SECONDS = 3.0  # in which a server has sent what it kept for its listene
 _PIPE_BYTES = 1 << 18  # 8 s of sound
 _SAMPLE_BYTES = 2
 _SAID_BYTES = 4000
-_DECIDED_SAMPLES = 10 * SAMPLE_RATE  # after which the channel to hear is chosen again
 
 
 def main() -> None:
@@ -56,8 +55,7 @@ class _Sound:
         self._address = address
         self._channel = channel
         self._held = b""
-        self._channels = 0  # of the sound; 0 before its header
-        self._mix: Any = None  # of several channels to one
+        self._there = 0  # channels of the sound; 0 before its header
         self._process = start_ffmpeg(address)
         assert self._process.stdout is not None
         assert self._process.stderr is not None
@@ -68,6 +66,11 @@ class _Sound:
         self._said = b""
         self._has_sounded = False
         self._parent = os.getppid()
+
+    @property
+    def channels(self) -> int:
+        """How many the samples have, once some were read."""
+        return self._there if self._channel is None else 1
 
     def read(self) -> bytes:
         """Wait for samples and return them; raise DeviceError if no more will come.
@@ -92,20 +95,28 @@ class _Sound:
                 raise DeviceError(f"{name} has sent no sound for {_PATIENCE_SECONDS:.0f} s")
 
     def _take(self) -> bytes:
-        """Return the samples that have come, as int16 of one channel."""
-        if not self._channels:
+        """Return the samples that have come, as int16."""
+        if not self._there:
             if len(self._held) < AU_HEADER.size:
                 return b""
             _, place, _, _, _, channels = AU_HEADER.unpack_from(self._held)
             if len(self._held) < place:
                 return b""
-            self._held, self._channels = self._held[place:], channels
-            self._mix = _mixer(public_name(self._address), channels, self._channel)
-        size = _SAMPLE_BYTES * self._channels
+            self._held, self._there = self._held[place:], channels
+            if self._channel is not None and self._channel > channels:
+                from hearthlog.recorder.sources.channels import (  # noqa: PLC0415  no numpy else
+                    missing_channel,
+                )
+
+                name = public_name(self._address)
+                raise DeviceError(f"{name} {missing_channel(channels, self._channel)}")
+        size = _SAMPLE_BYTES * self._there
         end = len(self._held) // size * size
         samples, self._held = array("h", self._held[:end]), self._held[end:]
         samples.byteswap()
-        return samples.tobytes() if self._mix is None else self._mix(samples)
+        if self._channel is not None:
+            samples = samples[self._channel - 1 :: self._there]
+        return samples.tobytes()
 
     def _listen(self) -> None:
         with suppress(BlockingIOError):
@@ -120,52 +131,22 @@ class _Sound:
         return explain(self._address, self._said.decode(errors="replace"))
 
 
-def _mixer(name: str, channels: int, channel: int | None) -> Any:
-    """Return what makes one channel of several; None if there is only one."""
-    if channels == 1 and channel in {None, 1}:
-        return None
-    import numpy as np  # noqa: PLC0415  most sounds have one channel, and need no numpy
-
-    from hearthlog.recorder.sources.channels import ChannelMixer, missing_channel  # noqa: PLC0415
-
-    if channel is not None and channel > channels:
-        raise DeviceError(f"{name} {missing_channel(channels, channel)}")
-    mixer = ChannelMixer(channel)
-    recent = np.empty((0, channels), np.float32)
-    count = 0
-
-    def mix(samples: "array[int]") -> bytes:
-        nonlocal recent, count
-        values = np.frombuffer(samples, np.int16).reshape(-1, channels).astype(np.float32)
-        block = values / np.float32(32768)
-        if channel is None:
-            count += len(block)
-            recent = np.concatenate([recent, block])
-            if count < _DECIDED_SAMPLES:
-                mixer.decide(block)
-            if len(recent) >= _DECIDED_SAMPLES:
-                mixer.decide(recent[:_DECIDED_SAMPLES])
-                recent = recent[_DECIDED_SAMPLES:]
-        return np.clip(np.rint(mixer.mix(block) * 32768), -32768, 32767).astype("<i2").tobytes()
-
-    return mix
-
-
 def _capture(sound: _Sound, address: str, output: Any) -> None:
     pace = Pace(sound.began)
     samples, arrival = _first_live(sound, pace)
     name = public_name(address)
-    answer = CaptureFormat(name, address, SAMPLE_RATE, _STALE_SECONDS)
+    several = sound.channels if sound.channels > 1 else None
+    answer = CaptureFormat(name, address, SAMPLE_RATE, _STALE_SECONDS, channels=several)
     output.write(json.dumps(asdict(answer)).encode() + b"\n")
-    index = 0
+    index, size = 0, _SAMPLE_BYTES * sound.channels
     while True:
-        count = len(samples) // _SAMPLE_BYTES
+        count = len(samples) // size
         output.write(BLOCK.pack(index, count, 0, math.inf, arrival))
         output.write(samples)
         index += count
         samples = sound.read()
         arrival = sound.arrival
-        pace.add(len(samples) // _SAMPLE_BYTES, arrival)
+        pace.add(len(samples) // size, arrival)
         trouble = pace.trouble()
         if trouble:
             raise DeviceError(f"{name} {trouble}")
@@ -178,11 +159,12 @@ def _first_live(sound: _Sound, pace: Pace) -> tuple[bytes, float]:
     while sound.arrival < settled:
         samples = sound.read()
         settled = min(settled, sound.arrival + _SETTLE_SECONDS)
-        pace.add(len(samples) // _SAMPLE_BYTES, sound.arrival)
+        size = _SAMPLE_BYTES * sound.channels
+        pace.add(len(samples) // size, sound.arrival)
         most = math.ceil((sound.arrival - sound.began) * SAMPLE_RATE)
-        held = (held + samples)[-most * _SAMPLE_BYTES :]
+        held = (held + samples)[-most * size :]
     older, now = pace.settle()
-    return held[len(held) - (pace.count - older) * _SAMPLE_BYTES :], now
+    return held[len(held) - (pace.count - older) * size :], now
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import numpy as np
 from hearthlog.recorder.addresses import is_topic
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.modules import module_command
-from hearthlog.recorder.sources.capture import BLOCK, CaptureFormat
+from hearthlog.recorder.sources.capture import BLOCK, LATENCY_SECONDS, CaptureFormat
 from hearthlog.recorder.sources.devices import Device
 from hearthlog.recorder.sources.framing import SampleBlock
 
@@ -177,7 +177,9 @@ class CaptureProcess(_Process):
     channels : int or None
         Of an array; None of a single microphone.
     channel : int or None
-        The one to hear, from 1 on; by default the first one.
+        The one to hear, from 1 on; by default the blocks have all of up to eight.
+    latency : float
+        Seconds that PortAudio holds while nobody reads.
 
     Attributes
     ----------
@@ -201,8 +203,10 @@ class CaptureProcess(_Process):
         exact: bool = False,
         channels: int | None = None,
         channel: int | None = None,
+        latency: float = LATENCY_SECONDS,
     ) -> None:
-        asked = [device, str(channels or 0), str(channel or 0), *(["exact"] if exact else [])]
+        asked = [device, str(channels or 0), str(channel or 0), str(latency)]
+        asked += ["exact"] if exact else []
         process = subprocess.Popen(  # noqa: S603  our own module
             [*_CAPTURE, *asked],
             stdout=subprocess.PIPE,
@@ -222,7 +226,7 @@ class NetworkProcess(_Process):
     stop : threading.Event
         Ends the wait for its first answer when it is set.
     channel : int or None
-        The one to hear, from 1 on; by default their mean, of a topic the first one.
+        The one to hear, from 1 on; by default the blocks have all, of a topic the first one.
 
     Attributes
     ----------

@@ -10,6 +10,8 @@ from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 
 _FULL_SCALE = 0.999
 _CLIPPED_SAMPLES = 4  # of a frame; the highest sample of a recording may be full scale
+_CLIPPED_ENERGY = 0.99 * _CLIPPED_SAMPLES * _FULL_SCALE**2  # in which rounding may lie
+_LOOKED_AT = 16  # samples of a frame: mostly enough to see that it is not one value
 _CLIPPED_FRAMES = round(1.0 / FRAME_SECONDS)  # of the last minute
 _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
@@ -18,7 +20,8 @@ _STUCK_FRAMES = round(10.0 / FRAME_SECONDS)
 _INFRASOUND_FRAMES = round(20.0 / FRAME_SECONDS)
 _INFRASOUND_SHARE = 0.8  # of them
 _INFRASOUND_POWER = 1e-5  # -50 dBFS
-_DEAD_RANGE = 2 / 32768  # of the noise of a converter
+DEAD_STEPS = 2  # of 16 bits, between which the noise of a converter alone lies
+_DEAD_RANGE = DEAD_STEPS / 32768
 _DAY_MINUTES = 1440
 _FALL = 1000.0  # 30 dB
 _SECOND = round(1.0 / FRAME_SECONDS)
@@ -72,14 +75,17 @@ class SoundWatch:
         """
         filtered = samples if filtered is None else filtered
         self._infrasound.add(samples, filtered)
-        clipped = (np.abs(samples) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
-        self._clipped = np.concatenate([self._clipped, clipped])[-_MINUTE:]
+        self._clipped = np.concatenate([self._clipped, _are_clipped(samples)])[-_MINUTE:]
         # Zeros are another matter: in a file they are silence, and a microphone's are reported.
-        moving = (np.ptp(samples, axis=1) > 0) | (samples[:, 0] == 0.0)
-        moving = np.flatnonzero(moving & ~is_offset_only(samples, filtered))
+        moving = (samples[:, :_LOOKED_AT] != samples[:, :1]).any(axis=1) | (samples[:, 0] == 0.0)
+        still = np.flatnonzero(~moving)
+        moving[still] = np.ptp(samples[still], axis=1) > 0
+        moving = np.flatnonzero(moving & ~_is_offset_only(samples, filtered))
         last = int(moving[-1]) if len(moving) else -1
         self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
-        self._level.add(np.square(samples).mean(axis=1))
+        with np.errstate(over="ignore"):  # floats of a file may be of any size
+            powers = np.square(samples).mean(axis=1)
+        self._level.add(np.minimum(powers, np.float32(1.0)))
         self._hum.add(samples)
 
     def add_floor(self, powers: Float64) -> None:
@@ -108,19 +114,20 @@ class SoundWatch:
         return FAINT if self._level.has_fallen else ""
 
 
-def is_offset_only(samples: Float32, filtered: Float32) -> Bool:
-    """Tell in which frames there is no more than an offset: a dead microphone.
-
-    Parameters
-    ----------
-    samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-    filtered : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        The same by `InfrasoundFilter`.
-    """
+def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
+    """Find the frames in which there is no more than an offset: a dead microphone."""
     if filtered is samples:
         return np.zeros(len(samples), bool)
     is_flat: Bool = np.ptp(samples, axis=1) <= _DEAD_RANGE
     return is_flat & (filtered != samples).any(axis=1)
+
+
+def _are_clipped(samples: Float32) -> Bool:
+    with np.errstate(over="ignore"):
+        clipped = np.vecdot(samples, samples) >= _CLIPPED_ENERGY
+    loud = np.flatnonzero(clipped)
+    clipped[loud] = (np.abs(samples[loud]) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
+    return clipped
 
 
 class _Infrasound:

@@ -9,6 +9,7 @@ from hearthlog.schemas.messages.message_types import (
 )
 
 LOG_DAMAGED = "the log was damaged"  # the reason of a gap that `recover` writes
+CLOCK_SET = "the clock was set"  # in the reason: the gap may have any length, also less than none
 QUIET_HOURS, PAUSED = ON_PURPOSE = "quiet hours", "paused"  # nobody was to be listened to
 
 

@@ -10,7 +10,9 @@
  *
  *   pcm_type.labmic { lib "/path/to/libasound_module_pcm_labmic.so" }
  *   pcm.labmic { type labmic  rate 16000  ctl "/path/to/control"  data "/path/to/samples.s16"
- *                channels 4 }
+ *                channels 4  burst 32000 }
+ *
+ * Samples come in pieces of `burst` at once; by default as they are taken.
  *
  * The control file says "unplug" (the device is gone: -ENODEV) or "freeze" (it is there and
  * delivers nothing); absent or empty means normal. The environment variable LABMIC_PPM goes before
@@ -37,6 +39,7 @@ enum condition { NORMAL, UNPLUGGED, FROZEN };
 struct settings {
     long rate;
     long channels; /* of the data */
+    long burst;
     double ppm;
     const char *control;
     const char *data;
@@ -49,6 +52,7 @@ typedef struct {
     int16_t *data;
     long data_length; /* samples of a channel */
     long channels;    /* of the data */
+    long burst;
     uint64_t first; /* index of the sample at position 0 of this start */
     int running;
 } labmic_t;
@@ -138,6 +142,8 @@ static snd_pcm_sframes_t mic_pointer(snd_pcm_ioplug_t *io)
     if (!mic->running)
         return 0;
     uint64_t taken = condition == FROZEN ? io->hw_ptr : index_now(mic) - mic->first;
+    if (condition != FROZEN)
+        taken -= taken % mic->burst;
     if (taken - io->appl_ptr >= io->buffer_size)
         return -EPIPE;
     return taken % io->buffer_size;
@@ -232,6 +238,8 @@ static int read_settings(snd_config_t *configuration, struct settings *settings)
             error = snd_config_get_integer(node, &settings->rate);
         else if (!strcmp(id, "channels"))
             error = snd_config_get_integer(node, &settings->channels);
+        else if (!strcmp(id, "burst"))
+            error = snd_config_get_integer(node, &settings->burst);
         else if (!strcmp(id, "ppm"))
             error = snd_config_get_ireal(node, &settings->ppm);
         else if (!strcmp(id, "ctl"))
@@ -245,7 +253,7 @@ static int read_settings(snd_config_t *configuration, struct settings *settings)
             return error;
         }
     }
-    if (settings->channels < 1)
+    if (settings->channels < 1 || settings->burst < 1)
         return -EINVAL;
     if (getenv("LABMIC_PPM"))
         settings->ppm = atof(getenv("LABMIC_PPM"));
@@ -297,6 +305,7 @@ static labmic_t *new_mic(const struct settings *settings)
         return NULL;
     mic->ppm = settings->ppm;
     mic->channels = settings->channels;
+    mic->burst = settings->burst;
     mic->control = settings->control ? strdup(settings->control) : NULL;
     mic->io.version = SND_PCM_IOPLUG_VERSION;
     mic->io.name = "labmic";
@@ -311,7 +320,7 @@ static labmic_t *new_mic(const struct settings *settings)
 SND_PCM_PLUGIN_DEFINE_FUNC(labmic)
 {
     (void)root;
-    struct settings settings = {.rate = 16000, .channels = 1};
+    struct settings settings = {.rate = 16000, .channels = 1, .burst = 1};
     int error = read_settings(conf, &settings);
     if (error < 0)
         return error;
