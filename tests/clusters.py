@@ -2,13 +2,14 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
+from distributed import Client
 
 DASK = str(Path(sys.executable).with_name("dask"))
 LONG = 60.0
@@ -31,15 +32,20 @@ def running(command, paths=(), stderr=subprocess.DEVNULL, **options):
         "TERM": "xterm",
         "COLUMNS": "100",
     }
+    # In a group of its own, which is killed at once: of what comes and goes no list is complete.
     with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=stderr, env=environment, **options
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=stderr,
+        env=environment,
+        start_new_session=True,
+        **options,
     ) as process:
         try:
             yield process
         finally:
             if process.poll() is None:
-                for each in [*psutil.Process(process.pid).children(recursive=True), process]:
-                    each.kill()
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 # Without these a port of Dask's web server, and of a worker, is open to the network.
@@ -56,6 +62,22 @@ def scheduler_in(folder):
         yield json.loads(about.read_text())["address"], process
 
 
+@contextmanager
 def worker_of(address, *options, threads=1):
+    """Start a worker; one with a nanny is ready once that has heard of it.
+
+    A nanny whose worker dies before gives up, and nothing replaces the worker.
+    """
     command = [DASK, "worker", address, "--nthreads", str(threads)]
-    return running([*command, *PRIVATE, *options])
+    with running([*command, *PRIVATE, *options]) as process:
+        if "--no-nanny" not in options:
+            _await_nanny(address, process.pid)
+        yield process
+
+
+def _await_nanny(address, pid):
+    def state(dask_worker):
+        return os.getpid(), dask_worker.status.name
+
+    with Client(address, set_as_default=False) as client:
+        until(lambda: (pid, "running") in client.run(state, nanny=True).values())

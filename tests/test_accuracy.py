@@ -2,6 +2,7 @@
 
 import re
 from datetime import date, timedelta
+from itertools import pairwise
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -16,6 +17,7 @@ from spliced import run
 from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, read_checked_minutes
 from hearthlog.analyzer.accuracy.count_range import FEWEST, beta_quantile, checked_rates, strata_of
 from hearthlog.analyzer.accuracy.events import MINUTE, events_of, television_minutes
+from hearthlog.analyzer.gate.reference import reference
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
@@ -94,7 +96,81 @@ def test_what_outlasts_a_checked_minute_is_right_or_missed_by_the_part_in_it_alo
 def test_a_mark_that_says_nothing_is_known_says_nothing(tmp_path):
     logs = write_day(tmp_path, DAY, [(at("10:00:05"), 2, "coughing", 0.9)])
     check(logs, at("10:00"), [(5, 7, "unknown")])
-    assert checked(tmp_path).check("coughing") == (1, 1, 1, 0, 0)
+    assert checked(tmp_path).check("coughing") == (0, 0, 0, 0, 0)
+
+
+def _runs(labels, name, pause):
+    """Return first and last second of the runs of a label with at most so much between them."""
+    seconds = np.flatnonzero(labels == name)
+    parts = np.split(seconds, np.flatnonzero(np.diff(seconds) > pause + 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+
+
+def _begun(minutes, events, others, untold):
+    """Count the events that begin in minutes, and those with a part in it that others have too."""
+    begun = hit = 0
+    for begin, inside in minutes.items():
+        for first, last in events:
+            end = min(last, begin + 59)
+            if first in inside and not untold[first : end + 1].all():
+                begun += 1
+                hit += any(max(first, a) <= min(end, b) for a, b in others)
+    return begun, hit
+
+
+def test_counts_are_those_of_a_truth_that_is_counted_second_by_second(tmp_path):
+    rng = np.random.default_rng(4)
+    names, day = ("coughing", "speech", "music"), 6 * HOUR
+    truth, labelled = (np.full(day, "silence", object) for _ in range(2))
+    for begin in range(10, day - 60, 45):
+        for labels in (truth, labelled):
+            length, late = rng.choice([1, 4, 30]), int(rng.integers(0, 6))
+            labels[begin + late : begin + late + length] = rng.choice(names)
+    edges = [0, *(np.flatnonzero(labelled[1:] != labelled[:-1]) + 1).tolist(), day]
+    events = [(a, b - a, labelled[a], 0.9) for a, b in pairwise(edges) if labelled[a] != "silence"]
+    logs = write_day(tmp_path, DAY, events, hours=range(6))
+
+    known, untold, minutes = labelled.copy(), np.zeros(day, bool), {}
+    drawn = [*(60 * rng.choice(np.arange(30), 12, replace=False)), HOUR - 30, 3 * HOUR - 20]
+    for made, begin in enumerate(map(int, drawn), 1):
+        minutes[begin] = np.arange(begin, begin + 60)
+        known[minutes[begin]] = truth[minutes[begin]]
+        for log, part in enumerate(np.split(minutes[begin], [HOUR - begin % HOUR])):
+            if len(part):  # a minute may be cut where a log ends
+                a, b = (START + int(edge) * NANOSECONDS for edge in (part[0], part[-1] + 1))
+                wrong = [second for second in part if truth[second] != labelled[second]]
+                doubt = set(part[:7]) if made % 3 == 0 else set()
+                untold[sorted(doubt)] = True
+                marks = [
+                    Mark("mic", START + s * NANOSECONDS, START + (s + 1) * NANOSECONDS, label)
+                    for s in map(int, sorted({*wrong, *doubt}))
+                    for label in ["unknown" if s in doubt else truth[s]]
+                ]
+                seen = ReviewedSpan("mic", a, b, "Ann", made, chosen=RANDOM)
+                write_marks(logs[begin // HOUR + log], marks, reviewed=[seen])
+    known[untold] = labelled[untold]
+
+    for name in names:
+        said, true = (_runs(labels, name, 10) for labels in (labelled, known))
+        found, right = _begun(minutes, said, true, untold)
+        there, told = _begun(minutes, true, said, untold)
+        assert checked(tmp_path).check(name)[:4] == (found, right, there, there - told)
+        assert min(right, found - right, there - told) > 0, "something to count"
+    assert len(checked(tmp_path)) == len(drawn)
+    sounds = [s for i, log in enumerate(logs) for s in reference(log, logs[i + 1 :])]
+    parts = [part for m in minutes.values() for part in np.split(m, [HOUR - int(m[0]) % HOUR])]
+    true = np.where(untold, "unknown", known)
+    for name in ("silence", *names):
+        amount = sum(len(_runs(true[part], name, 0)) for part in parts)
+        assert sum(sound.random and sound.label == name for sound in sounds) == amount
+
+
+def test_a_span_that_nobody_can_tell_was_neither_right_nor_wrong(tmp_path):
+    logs = write_day(tmp_path, DAY, [(at("10:00:05"), 50, "coughing", 0.9)])
+    check(logs, at("10:00"), [(5, 55, "unknown")], chosen=QUEUE)
+    assert "asked for" not in "".join(Accuracy(find_home_logs([tmp_path])).lines())
+    check(logs, at("11:00"), [(5, 15, "speech")], chosen=QUEUE)
+    assert "of 1 span that" in "".join(Accuracy(find_home_logs([tmp_path])).lines())
 
 
 def test_a_damaged_layer_is_a_loss_and_the_other_minutes_count(tmp_path):

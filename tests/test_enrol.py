@@ -17,7 +17,10 @@ from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.training.home_data import home_recordings
+from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
@@ -184,6 +187,20 @@ def test_a_home_is_learned_from_with_its_enrolled_sounds(logs, cough):
     write_marks(find_logs(logs)[0], [Mark("mic", first, first + 2 * NANOSECONDS, "speech")])
     enrol_file(logs, "coughing", cough)
     assert {recording.label for recording in home_recordings(logs)} == {"speech", "coughing"}
+
+
+def test_two_recordings_enrolled_on_one_day_make_a_class_and_one_of_them_twice_does_not(
+    household, home
+):
+    base = load_model(starter_file(GENERAL))
+    first, second = sorted((household / "crying").glob("*.flac"))[:2]
+    for path in (first, first):
+        enrol_file(home, "crying", path)
+    assert home_lessons([home], base).segments.classes == base.classes
+    enrol_file(home, "crying", second)
+    lessons = home_lessons([home], base)
+    assert lessons.segments.classes == (*base.classes, "crying")
+    assert lessons.segments.amounts["crying"].sources == 2
 
 
 def test_a_home_may_have_nothing_but_enrolled_sounds(hearthlog, cough, home):

@@ -526,6 +526,38 @@ def test_a_new_class_may_take_what_marks_say_was_wrong_and_not_what_a_person_lef
     assert len(reasons) == (not harmless)
 
 
+def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refused():
+    def reasons(known, column=(0, 0, 0, 20), each=" a day"):
+        table = np.diag([1200.0, 100.0, 100.0, 0.0])
+        table[:, 3] = column
+        changes = Changes(["silence", "speech", "music", "hum"], table, each)
+        nothing = Right()
+        home = 60.0, 1440.0, changes, np.zeros((4, 4)), nothing, nothing, [], nothing
+        return damages(Evidence(*home, {"hum"}, known), "one")
+
+    marks = {("hum", "silence", "hum"): 9, ("hum", "speech", "hum"): 9}
+    assert reasons(marks | {("music", "music", "music"): 12, ("music", "music", "hum"): 4}) == []
+    (said,) = reasons(marks | {("music", "music", "music"): 8, ("music", "music", "hum"): 4})
+    assert said.startswith("hum takes 4 of 12 sounds of other classes that one had right: hear its")
+    assert reasons(marks | {("music", "speech", "hum"): 40}) == [], "which were wrong before, too"
+    many = {("music", "music", "music"): 40, ("speech", "speech", "hum"): 3}
+    (said,) = reasons(marks | many)
+    assert said.startswith("hum takes 3 of 3 sounds of talking that one had right")
+    (said,) = reasons(marks | {("silence", "silence", "hum"): 3})
+    assert said.startswith("hum takes 3 of 3 silences that one had right")
+
+    (said,) = reasons(marks, (30, 0, 9, 0))
+    assert said.startswith("30 min a day of hum is silence for one: if that is the sound of the")
+    stays = {("silence", "silence", "silence"): 9}
+    assert reasons(marks | stays, (30, 0, 9, 0)) == [], "a faint sound that a person marked"
+    assert reasons(stays, (30, 0, 9, 0)) != [], "no mark says that silence was wrong"
+    assert reasons({}, (9, 0, 1, 0)) == [], "hardly anything"
+    assert reasons(marks, (100, 500, 100, 0)) == [], "a television for hours"
+    (said,) = reasons(marks, (100, 900, 600, 0))
+    assert said.startswith("hum is 26 h 40 min a day, more than half of the time")
+    assert reasons(marks, (100, 900, 600, 0), each="") == [], "half an hour is no day"
+
+
 @pytest.mark.usefixtures("place")
 def test_what_a_new_class_takes_over_is_judged_by_marks_that_were_learned_from(lived):
     """Another name for talking: right where marks say so, wrong where they say talking."""

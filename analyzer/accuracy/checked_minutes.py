@@ -23,8 +23,8 @@ from hearthlog.analyzer.accuracy.events import (
 )
 from hearthlog.analyzer.accuracy.reviewed_labels import ReviewedLabels, read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.spans import Spans, cut
-from hearthlog.analyzer.marks.marks import RANDOM, ReviewedSpan
+from hearthlog.analyzer.logs.spans import Spans, cut, without
+from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Bool, Int64
 
@@ -229,15 +229,19 @@ def _events(minute: ReviewedLabels, name: str) -> list[int]:
     """Count the events that begin in a minute: labelled, right, true and missed ones.
 
     Of what outlasts the minute only the part in it was looked at, and says whether it is right.
+    Where nobody could tell what sounds, no event is counted.
     """
     labelled, true = events_of(minute.labels, name), events_of(minute.true, name)
-    own, others = _begun(labelled, minute.span), _begun(true, minute.span)
+    own, others = _begun(labelled, minute), _begun(true, minute)
     right = overlapping(own, cut(true, minute.span.start, minute.span.end))
     found = overlapping(others, cut(labelled, minute.span.start, minute.span.end))
     return [len(own.starts), int(right.sum()), len(others.starts), int((~found).sum())]
 
 
-def _begun(events: Spans, minute: ReviewedSpan) -> Spans:
+def _begun(events: Spans, minute: ReviewedLabels) -> Spans:
     """Return the events that begin in a minute, and end with it at the latest."""
-    first, last = np.searchsorted(events.starts, [minute.start, minute.end])
-    return Spans(events.starts[first:last], np.minimum(events.ends[first:last], minute.end))
+    span = minute.span
+    first, last = np.searchsorted(events.starts, [span.start, span.end])
+    begun = Spans(events.starts[first:last], np.minimum(events.ends[first:last], span.end))
+    told = overlapping(begun, without(begun, minute.untold))
+    return Spans(begun.starts[told], begun.ends[told])

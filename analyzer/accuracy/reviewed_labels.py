@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelled_by import model_of
 from hearthlog.analyzer.logs.labelling import Labelling, overlaid, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.logs.spans import Spans, cut, overlay
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, overlay
 from hearthlog.analyzer.marks.marks import (
     CHOICES,
     RANDOM,
@@ -43,12 +43,15 @@ class ReviewedLabels(NamedTuple):
         The same, overlaid with the marks.
     model : str
         SHA-256 of the model that labelled; empty if unknown.
+    untold : Spans
+        What a person could not tell: the labels there are neither right nor wrong.
     """
 
     span: ReviewedSpan
     labels: Labelling
     true: Labelling
     model: str
+    untold: Spans = NONE
 
 
 def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
@@ -61,10 +64,15 @@ def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
     Returns
     -------
     unchanged, number : int
-        Spans that marks change in less than half, and all.
+        Spans that marks change in less than half, and all but those that nobody could tell.
     """
-    spans = [one for one in reviewed if one.span.chosen != RANDOM]
+    spans = [one for one in reviewed if one.span.chosen != RANDOM and not _is_untold(one)]
     return sum(2 * _changed(one) < one.span.end - one.span.start for one in spans), len(spans)
+
+
+def _is_untold(reviewed: ReviewedLabels) -> bool:
+    start, end = reviewed.span.start, reviewed.span.end
+    return 2 * cut(reviewed.untold, start, end).length >= end - start
 
 
 def _changed(reviewed: ReviewedLabels) -> int:
@@ -97,33 +105,72 @@ def read_reviewed_labels(  # noqa: PLR0913, PLR0917
     chosen : collection of str, optional
         How spans were chosen; others are left out, which takes less time.
     """
+    found: list[tuple[Path, ReviewedSpan]] = []
     for layer in logs.between(start, end, REVIEW_LAYER):
+        log = log_of_layer(layer.path)
         try:
-            yield from _reviewed_labels(logs, log_of_layer(layer.path), labelling, chosen)
+            spans = [span for span in read_reviewed(log) if span.chosen in chosen]
+        except LogError as error:
+            _lose(losses, error)
+            continue
+        found += [(log, span) for span in spans if span.corrects == labelling]
+    of_log: dict[Path, list[ReviewedSpan]] = {}
+    for log, span in _joined_parts(found):
+        of_log.setdefault(log, []).append(span)
+    for log, spans in of_log.items():
+        try:
+            yield from _reviewed_labels(logs, log, spans, labelling)
         except (DataError, LogError) as error:
-            if str(error) not in losses:
-                losses.append(str(error))
+            _lose(losses, error)
+
+
+def _lose(losses: list[str], error: Exception) -> None:
+    if str(error) not in losses:
+        losses.append(str(error))
+
+
+def _joined_parts(found: list[tuple[Path, ReviewedSpan]]) -> list[tuple[Path, ReviewedSpan]]:
+    """Join spans that were cut where one log ends and the next begins."""
+    whole: list[tuple[Path, ReviewedSpan]] = []
+    open_: dict[ReviewedSpan, tuple[int, Path]] = {}  # by the span that would go on: place, log
+    for log, span in found:
+        place, before = open_.pop(span._replace(end=0), (len(whole), log))
+        if place < len(whole) and before != log and _is_one(whole[place][1], span):
+            first, earlier = whole[place]
+            whole[place] = first, earlier._replace(end=span.end)
+        else:
+            place = len(whole)
+            whole.append((log, span))
+        open_[span._replace(start=span.end, end=0)] = place, log
+    return whole
+
+
+def _is_one(before: ReviewedSpan, after: ReviewedSpan) -> bool:
+    """Tell two parts of a drawn minute from two minutes, both of which were drawn."""
+    return before.chosen != RANDOM or after.end - before.start <= MINUTE
 
 
 def _reviewed_labels(
-    logs: HomeLogs, log: Path, labelling: str, chosen: Collection[str]
+    logs: HomeLogs, log: Path, spans: list[ReviewedSpan], labelling: str
 ) -> Iterator[ReviewedLabels]:
-    reviewed = (span for span in read_reviewed(log) if span.chosen in chosen)
-    spans = [span for span in reviewed if span.corrects == labelling]
-    if not spans:
-        return
     near = _logs_around(logs, spans[0].start, max(span.end for span in spans))
     sources = find_labellings(*near)
     name = labelling if labelling == LIVE else relabelling(labelling)
     models = {name: model_of(log, name) for name in {span.microphone for span in spans}}
-    marks = [mark for path in near for mark in _marks(path) if class_name(mark.label) != UNKNOWN]
+    marks = [mark for path in near for mark in _marks(path)]
     for span in spans:
         with suppress(LogError):  # nothing is labelled there
             around = span.start - _AROUND, span.end + _AROUND
             labels = unified(sources.read(span.microphone, name, *around).labelling)
-            own = labelling_of_marks(mark for mark in marks if mark.microphone == span.microphone)
+            own = [mark for mark in marks if mark.microphone == span.microphone]
+            told = labelling_of_marks(one for one in own if class_name(one.label) != UNKNOWN)
+            rest = labelling_of_marks(one for one in own if class_name(one.label) == UNKNOWN)
             yield ReviewedLabels(
-                span, labels, overlaid(labels, own), models[span.microphone].model_sha256
+                span,
+                labels,
+                overlaid(labels, told),
+                models[span.microphone].model_sha256,
+                joined(rest.starts, rest.ends),
             )
 
 

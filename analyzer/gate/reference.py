@@ -94,14 +94,27 @@ def left_alone(log: Path) -> list[Sound]:
                 marked = {(mark.start, mark.end) for mark in marks}
                 sounds += [
                     sound._replace(random=False)
-                    for sound in _true(labellings, span, marks)
+                    for sound in _parts(labellings, span, marks)
                     if (sound.start, sound.end) not in marked
                 ]
     return [sound for sound in sounds if sound.end - sound.start >= _SHORTEST]
 
 
 def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
-    """Yield what is true of a reviewed span: the labelling, and the marks over it."""
+    """Yield what is true of a reviewed span: the labelling, and the marks over it.
+
+    What touches and has one label is one sound, however it was marked.
+    """
+    parts: dict[str, list[Sound]] = {}
+    for part in _parts(labellings, span, marks):
+        parts.setdefault(class_name(part.label), []).append(part)
+    for same in parts.values():
+        spans = spans_of([(part.start, part.end) for part in same])
+        for start, end in zip(*(edge.tolist() for edge in spans), strict=True):
+            yield same[0]._replace(start=start, end=end)
+
+
+def _parts(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
     known = partial(Sound, random=True, microphone=span.microphone)
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:

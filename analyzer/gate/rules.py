@@ -1,6 +1,7 @@
 """What counts as damage to a home."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -20,6 +21,8 @@ _MANY = 0.05  # of the time: a class that has become many times as much
 _TIMES = 4.0
 _CHANGED = 0.20  # of the time that is not silence
 _CHANGED_MINUTES = 10.0
+_SILENCE_OF_NEW = 0.5  # of the time of a new class
+_ROOM = 0.5  # of the time: a new class that is more is the room
 _MARKS_ALONE = 3  # that say a class was wrong, where no sound of that class is known
 
 
@@ -52,6 +55,7 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
     better = clearly_better(right.plus(evidence.quiet))
     if not (better and right.sounds and right.gained >= right.lost):  # silence alone is too little
         reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
+        reasons += _swallowed(evidence, champion)
     return reasons
 
 
@@ -149,6 +153,62 @@ def _is_correction(evidence: Evidence, name: str, new: str) -> bool:
     lost = sum(n for after, n in own if after == new)
     enough = 1 if own else _MARKS_ALONE
     return wrong >= enough and lost <= (1.0 - _KEPT) * sum(n for _, n in own)
+
+
+def _swallowed(evidence: Evidence, champion: str) -> Iterator[str]:
+    """See whether a new class takes what a person left as it was, mostly silence, or all day."""
+    changes = evidence.changes
+    for new in sorted(evidence.taught):
+        name, column = class_words(new), changes.minutes[:, changes.classes.index(new)]
+        for what, whole, taken in _taken(evidence, new):
+            if taken >= _MARKS_ALONE and taken > (1.0 - _KEPT) * whole:
+                yield (
+                    f"{name} takes {taken} of {whole} {what} that {champion} had right: hear its "
+                    "marks, delete wrong ones, and mark what sounds like it as what it is"
+                )
+                break
+        if changes.each and column.sum() > _ROOM * changes.minutes.sum():
+            yield (
+                f"{name} is {changes.words(column.sum())}, more than half of the time: if that is "
+                "the sound of the room, delete its marks"
+            )
+        elif _takes_silence(evidence, new):
+            silence = float(column[changes.classes.index(SILENCE)])
+            yield (
+                f"{changes.words(silence)} of {name} is silence for {champion}: if that is the "
+                "sound of the room, delete its marks, else review some silence that is none"
+            )
+
+
+def _takes_silence(evidence: Evidence, new: str) -> bool:
+    """See whether a new class is mostly silence, and no silence that was left is known to stay."""
+    changes = evidence.changes
+    if SILENCE not in changes.classes:
+        return False
+    column = changes.minutes[:, changes.classes.index(new)]
+    silence = column[changes.classes.index(SILENCE)]
+    much = silence > _SILENCE_OF_NEW * column.sum() and silence >= _MUCH * changes.minutes.sum()
+    known = any(true == before == SILENCE for true, before, _ in evidence.known)
+    return bool(much) and not (known and _is_correction(evidence, SILENCE, new))
+
+
+def _taken(evidence: Evidence, new: str) -> Iterator[tuple[str, int, int]]:
+    """Count what the first model had right, and what of it is a new class, of all and by class."""
+    right = {
+        name: Counter(
+            {
+                after: number
+                for (true, before, after), number in evidence.known.items()
+                if true == before == name
+            }
+        )
+        for name in sorted({true for true, _, _ in evidence.known} - {new})
+    }
+    sounds = [counts for name, counts in right.items() if name != SILENCE]
+    yield "sounds of other classes", sum(c.total() for c in sounds), sum(c[new] for c in sounds)
+    for name, counts in right.items():
+        what = "silences" if name == SILENCE else f"sounds of {class_words(name)}"
+        yield what, counts.total(), counts[new]
 
 
 def _out_of_proportion(evidence: Evidence) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
+import hashlib
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -18,6 +19,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.files import CUT
 from hearthlog.schemas.times import NANOSECONDS
 
 HOME_WEIGHT = 3.0  # of a segment of the home; others have 1
@@ -62,8 +64,8 @@ def marked_recordings(
     """Cut marks out of the sound of a home.
 
     A mark shorter than a second is extended to one; one of silence is left out instead, for other
-    sounds are in the same second. All marks of a UTC day are of one group. An enrolled sound is
-    without a room, unless it is silence.
+    sounds are in the same second. All marks of a UTC day are of one group, and so is an enrolled
+    recording. An enrolled sound is without a room, unless it is silence.
 
     Parameters
     ----------
@@ -199,10 +201,9 @@ def recording_of(
     """
     stamps = sound.stamps[frames]
     span = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
-    day = np.datetime64(int(stamps[0]) // NANOSECONDS, "s").astype("datetime64[D]")
     return Recording(
         label,
-        f"{HOME} {day}",
+        _group(sound, span[0]),
         HOME,
         "",
         sound.values[frames],
@@ -212,3 +213,11 @@ def recording_of(
         span=span,
         sighting=sighting_of(sound.microphone, sound.directions.begun_in(*span)),
     )
+
+
+def _group(sound: HomeSound, start: int) -> str:
+    """Name the source of a recording: its day, or what was enrolled, the same sound only once."""
+    if sound.enrolled and not sound.log.stem.endswith(CUT):
+        return f"{HOME} {hashlib.sha256(sound.values.tobytes()).hexdigest()}"
+    day = np.datetime64(start // NANOSECONDS, "s").astype("datetime64[D]")
+    return f"{HOME} {day}"
