@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import sys
-import zlib
 from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
@@ -29,14 +28,18 @@ from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
-from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, UINT32, UINT64
+from hearthlog.schemas.mcap.formats import HEAD, UINT32
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.salvage.whole_records import index_attachment
+from hearthlog.schemas.salvage.whole_records import (
+    AttachmentHead,
+    attachment_head,
+    encode_attachment,
+)
 from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -235,21 +238,22 @@ class _Log:
         self, file: LogFile, place: RecordLocation, seen: set[Hashable], names: dict[str, int]
     ) -> None:
         """Copy an attachment that is larger than is read at once."""
-        index = _index_of_large(file, place)
+        head = _head_of_large(file, place)
+        index = head.index_record
+        data = RecordLocation(place.opcode, place.offset + head.first, index.data_size)
         digest = hashlib.sha256()
-        data = place.offset + _data_end(index) - index.data_size
-        for piece in _pieces(file, RecordLocation(place.opcode, data, index.data_size)):
+        for piece in _pieces(file, data):
             digest.update(piece)
         key = index.name, index.media_type, digest.digest()
         if key in seen:
             return
         seen.add(key)
         name = unused_name(index.name, names)
-        if name == index.name:
+        if name == index.name and not head.escaped:
             self._writer.copy_attachment(_pieces(file, place), index)
         else:
-            renamed = replace(index, name=name)
-            self._writer.copy_attachment(_renamed(file, place, index, name), renamed)
+            index = replace(index, name=name)
+            self._writer.copy_attachment(encode_attachment(index, _pieces(file, data)), index)
 
     def _channel(self, described: Described) -> int:
         key = identity(*described)
@@ -307,40 +311,19 @@ def _profile(logs: Sequence[Path]) -> str:
     return profiles.pop() if len(profiles) == 1 else ""
 
 
-def _index_of_large(file: LogFile, place: RecordLocation) -> AttachmentIndex:
-    """Read what an index says of an attachment; check that the attachment is where it should be."""
+def _head_of_large(file: LogFile, place: RecordLocation) -> AttachmentHead:
+    """Read what stands before the data of an attachment, which must be where the index says."""
     _, offset, length = place
     head = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
     if offset + length > file.size or file.read(offset, HEAD.size) != head:
         raise file.damaged(offset, "here should be an attachment")
     try:
-        index = index_attachment(file.read(offset, _PIECE))
-    except (McapError, UnicodeDecodeError) as error:
+        head = attachment_head(file.read(offset, _PIECE))
+    except McapError as error:
         raise file.damaged(offset, error) from error
-    if _data_end(index) + UINT32.size > length:
+    if head.end + UINT32.size > length:
         raise file.damaged(offset, "an attachment is longer than its record")
-    return index
-
-
-def _data_end(index: AttachmentIndex) -> int:
-    """Return the byte of an attachment's record before which its data end."""
-    texts = len(index.name.encode()) + UINT32.size + len(index.media_type.encode())
-    return HEAD.size + ATTACHMENT.size + texts + UINT64.size + index.data_size
-
-
-def _renamed(
-    file: LogFile, place: RecordLocation, index: AttachmentIndex, name: str
-) -> Iterator[bytes]:
-    """Read an attachment of any size with another name, and the checksum that it has then."""
-    first, end = HEAD.size + ATTACHMENT.size + len(index.name.encode()), _data_end(index)
-    start = ATTACHMENT.pack(index.log_time, index.create_time, len(name.encode())) + name.encode()
-    yield HEAD.pack(Opcode.ATTACHMENT, len(start) + end - first + UINT32.size)
-    yield start
-    crc = zlib.crc32(start)
-    for piece in _pieces(file, RecordLocation(place.opcode, place.offset + first, end - first)):
-        crc = zlib.crc32(piece, crc)
-        yield piece
-    yield UINT32.pack(crc)
+    return head
 
 
 def _pieces(file: LogFile, place: RecordLocation) -> Iterator[bytes]:

@@ -515,7 +515,7 @@ class _Batch(NamedTuple):
         content = self.buffer[end - int(self.sizes[number]) : end].data
         try:
             return _index_records(self.file, content)
-        except (McapError, UnicodeDecodeError) as error:
+        except McapError as error:
             raise self.file.damaged(int(self.chunks["offset"][number]), error) from error
 
     def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:

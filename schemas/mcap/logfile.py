@@ -40,11 +40,11 @@ from hearthlog.schemas.mcap.formats import (
 )
 from hearthlog.schemas.mcap.large_chunks import ContentStream
 from hearthlog.schemas.mcap.record_walk import read_records, walk_records
-from hearthlog.schemas.mcap.records import LIMIT, TOO_LARGE, parse, read_footer
+from hearthlog.schemas.mcap.records import LIMIT, TOO_LARGE, parse_escaped, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
-_NO_UTF8 = "U+FFFD stands for what is not UTF-8 in names of topics, types or records"
+_NO_UTF8 = "bytes that are not UTF-8 stand as \\xNN in names of topics, types or records"
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
 _CHANNEL_END = HEAD.size + UINT16.size
 _ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
@@ -226,11 +226,10 @@ class LogFile:
         McapError
             If it is too short for what it claims to hold.
         """
-        try:
-            return parse(opcode, content)
-        except UnicodeDecodeError:
+        record, escaped = parse_escaped(opcode, content)
+        if escaped:
             warnings.warn(HearthlogWarning(_NO_UTF8, self.path, each=True), stacklevel=2)
-            return parse(opcode, content, lenient=True)
+        return record
 
     def with_channels(
         self, chunks: NDArray[np.void], channels: AbstractSet[int]
@@ -339,7 +338,7 @@ class LogFile:
                 else:
                     self._add(self.parse(location.opcode, content))
             crc = zlib.crc32(self.read(end, HEAD.size + FOOTER.size), crc)
-        except (McapError, UnicodeDecodeError, struct.error):
+        except (McapError, struct.error):
             return False
         if footer.summary_crc not in {0, crc}:
             return False

@@ -26,6 +26,7 @@ _MESSAGE_LIMIT = 100 << 20  # bytes
 _DEFINITION_LIMIT = 256 << 10  # bytes of text
 _LAYOUTS_KEPT = 256
 _TYPES_KEPT = 256
+_NO_NAME = re.compile(r"[^A-Za-z0-9_/]")
 _LINE_END = re.compile(r"\r+\n?")
 # Between the files of a type stand 80 signs; some writers have fewer or more, or blanks there.
 _SEPARATOR = re.compile(r"^[ \t]*={3,}[ \t]*$\n?", re.MULTILINE)
@@ -172,7 +173,7 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         for key, fields in theirs.items()
         if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
     }
-    return MessageType(name if name in ours else normalize_msgtype(name), ours | theirs, growth)
+    return MessageType(name if name in ours else _usual_name(name), ours | theirs, growth)
 
 
 def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
@@ -203,7 +204,7 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
         raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
     if len(text) > _DEFINITION_LIMIT:
         raise LogError(f"the definition of {name} is too long")
-    name = normalize_msgtype(name)  # which is how its definition is named
+    name = _usual_name(name)  # which is how its definition is named
     if not text.strip():
         if name not in ours:
             raise LogError(f"the log does not define {name}")
@@ -214,6 +215,11 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
     except (TypesysError, RecursionError, ValueError, KeyError) as error:
         raise LogError(f"the definition of {name} cannot be read") from error
     return types
+
+
+def _usual_name(name: str) -> str:
+    """Write the name of a type as rosbags reads it; a definition can be read whatever its name."""
+    return normalize_msgtype(_NO_NAME.sub("_", name))
 
 
 def _with_usual_lines(text: str) -> str:
