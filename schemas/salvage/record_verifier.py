@@ -29,8 +29,14 @@ from hearthlog.schemas.mcap.formats import (
     UINT32,
     UINT64,
 )
-from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
-from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse_escaped
+from hearthlog.schemas.mcap.large_chunks import ContentStream, TooLargeError, read_parts, stated_size
+from hearthlog.schemas.mcap.records import (
+    LIMIT,
+    ChunkHead,
+    begun_chunk_head,
+    decompress,
+    parse_escaped,
+)
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
@@ -46,6 +52,7 @@ from hearthlog.schemas.storage.byte_ranges import LocalFile
 _VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # have lengths inside
 _LARGE = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT}  # may be larger than `LIMIT`
 _ATTACHMENT_HEAD = 1 << 16  # bytes in which names and times of a large attachment end
+_CHUNK_HEAD = 128  # bytes in which the head of a chunk ends, and that of its data
 _PIECE = 1 << 20  # bytes
 _UNKNOWN_CHAIN = 16  # records of unknown kinds in a row
 _LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format may add
@@ -295,7 +302,7 @@ class RecordVerifier:
         if max(size, stored) > LIMIT:
             if not exact or outer > self.end:
                 raise McapError("the head of a chunk is damaged")
-            return WholeRecord(offset, outer, self._large_chunk(offset))
+            return WholeRecord(offset, outer, self._large_chunk(offset, outer))
         compression = head[name : first - UINT64.size]
         claim = ChunkHead(start, end, size, 0, compression, slice(None))
         # One of two lengths may be wrong. Decompressors overlook what follows their data, so the
@@ -329,9 +336,12 @@ class RecordVerifier:
         proved = bool(crc) or agrees
         return WholeRecord(offset, behind, whole, wrong, escaped=tuple(escaped), proved=proved)
 
-    def _large_chunk(self, offset: int) -> LargeChunk:
+    def _large_chunk(self, offset: int, end: int) -> LargeChunk:
         """Go through a chunk that is too large for the memory."""
-        stream = ContentStream(self.read, offset)
+        try:
+            stream = ContentStream(self.read, offset)
+        except TooLargeError as error:
+            return self._unopened_chunk(offset, end, str(error))
         entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         definitions: list[Definition] = []
         unread: Counter[int] = Counter()
@@ -361,6 +371,24 @@ class RecordVerifier:
         first = offset + HEAD.size
         data = first + head.data.start, first + head.data.stop
         return LargeChunk(stored, data, definitions, leading, unread)
+
+    def _unopened_chunk(self, offset: int, end: int, why: str) -> LargeChunk:
+        """Describe a chunk that is too large to be opened, by its head and the indexes behind it."""
+        head = begun_chunk_head(self.read(offset + HEAD.size, _CHUNK_HEAD))
+        first = offset + HEAD.size
+        data = first + head.data.start, first + head.data.stop
+        stated = stated_size(head.compression, self.read(data[0], _CHUNK_HEAD))
+        if stated not in {None, head.size} or max(head.start, head.end) > LAST_TIME:
+            raise McapError("the head of a chunk is damaged")
+        entries: dict[int, bytes] = {}
+        with suppress(McapError):
+            while True:
+                channel, rows, end = self.message_index(end)
+                entries[channel] = entries.get(channel, b"") + rows.tobytes()
+        span = head.start, head.end
+        stored = StoredChunk(head.compression, b"", head.size, head.crc, *span, entries)
+        counts = {channel: len(rows) // INDEX_ENTRIES.itemsize for channel, rows in entries.items()}
+        return LargeChunk(stored, data, [], 0, counts, why)
 
     def _large_message(self, offset: int, end: int) -> LargeChunk:
         """Make a chunk of a message outside of chunks that is too large to be read."""

@@ -382,6 +382,12 @@ class Salvage:
         for record in chunk.definitions:
             if not self.definitions.add(record):
                 self.definitions.doubt(record)
+        if chunk.unopened:
+            why = f"{chunk.unopened}, and is copied unopened,"
+            self._damages.add(Damage(whole.offset, whole.end, why, sound=True))
+            known = {n: e for n, e in chunk.stored.entries.items() if self.definitions.defines(n)}
+            yield chunk._replace(stored=chunk.stored._replace(entries=known))
+            return
         late: Counter[int] = Counter()
         unknown = 0
         for number in chunk.stored.entries:

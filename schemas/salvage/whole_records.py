@@ -42,6 +42,7 @@ class LargeChunk(NamedTuple):
     definitions: list[Definition]
     leading: int  # how many of them stand before the first message
     unread: Mapping[int, int]  # by channel: messages that are themselves too large
+    unopened: str = ""  # why nothing of it was looked at
 
 
 class LargeAttachment(NamedTuple):
