@@ -20,7 +20,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hearthlog.analyzer.export.file_names import unused_name
 from hearthlog.analyzer.export.repeats import without_repeats
-from hearthlog.analyzer.logs.selection import Described, Selection, identity
+from hearthlog.analyzer.logs.selection import Damages, Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
@@ -136,7 +136,6 @@ def write_log(
         If a log is damaged, if there is no message, or if there are more channels than a log can
         have.
     """
-    selection.verify()  # the copies get checksums of their own
     batches = selection.messages(progress, once=True)
     first = next(batches, None)
     log = _Log(stream, selection)
@@ -157,11 +156,15 @@ def _count_repeated(selection: Selection) -> int:
     """Count the messages in chunks that a log holds twice."""
     count = 0
     for path in selection.logs:
-        with LogFile(path) as file:
+        with LogFile(path, partial=True) as file:
             chunks = file.chunks[repeated_chunks(file, file.chunks)]
-            for batch in read_in_batches(file, chunks, selection.topics):
+            for batch in read_in_batches(file, chunks, selection.topics, _pass_over):
                 count += sum(len(m.between(selection.start, selection.end)) for m in batch)
     return count
+
+
+def _pass_over(_: Path, __: LogError) -> None:
+    """Leave out a chunk of which a warning tells already."""
 
 
 class _Log:
@@ -216,7 +219,7 @@ class _Log:
         seen: set[Hashable] = set()
         names: dict[str, int] = {}
         for path in logs:
-            with LogFile(path) as file:
+            with LogFile(path, partial=True) as file:
                 for place in sorted(set(file.record_locations), key=lambda place: place[1:]):
                     if place.opcode == Opcode.ATTACHMENT and place.length > LIMIT:
                         self._copy_large_attachment(file, place, seen, names)
@@ -306,7 +309,7 @@ def is_for_rosbag2(channels: Sequence[Described]) -> bool:
 def _profile(logs: Sequence[Path]) -> str:
     profiles = set()
     for path in logs:
-        with LogFile(path) as file:
+        with LogFile(path, partial=True) as file:
             profiles.add("" if file.header is None else file.header.profile)
     return profiles.pop() if len(profiles) == 1 else ""
 
@@ -314,8 +317,8 @@ def _profile(logs: Sequence[Path]) -> str:
 def _head_of_large(file: LogFile, place: RecordLocation) -> AttachmentHead:
     """Read what stands before the data of an attachment, which must be where the index says."""
     _, offset, length = place
-    head = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
-    if offset + length > file.size or file.read(offset, HEAD.size) != head:
+    begin = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
+    if offset + length > file.size or file.read(offset, HEAD.size) != begin:
         raise file.damaged(offset, "here should be an attachment")
     try:
         head = attachment_head(file.read(offset, _PIECE))
@@ -383,7 +386,9 @@ def _without_first(parts: Sequence[RawMessages], count: int) -> list[RawMessages
 def _earlier(
     logs: Sequence[Path], topics: Collection[str], selection: Selection
 ) -> Iterator[list[RawMessages]]:
-    return map(without_repeats, iterate_messages(logs, topics, end=selection.start, once=True))
+    damages = Damages()
+    earlier = iterate_messages(logs, topics, end=selection.start, on_damage=damages.add, once=True)
+    return map(without_repeats, earlier)
 
 
 def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
@@ -397,7 +402,9 @@ def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
             break
         logs.append(path)
         wanted: dict[str, dict[Hashable, float]] = {}
-        for batch in iterate_messages([path], missing, end=selection.start, once=True):
+        for batch in iterate_messages(
+            [path], missing, end=selection.start, on_damage=_pass_over, once=True
+        ):
             for messages in batch:
                 publisher, topic = _publisher(messages), messages.channel.topic
                 counts[publisher] += len(messages)

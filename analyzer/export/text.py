@@ -38,7 +38,7 @@ def in_order(
     for piece in pieces:
         texts += lines(piece)
         times.append(piece.columns.log_times)
-    order = np.argsort(np.concatenate(times or [[]]), kind="stable")
+    order = np.argsort(np.concatenate(times) if times else np.empty(0), kind="stable")
     return [texts[i] for i in order.tolist()]
 
 

@@ -149,7 +149,7 @@ def _decompressing(compression: bytes, source: io.BufferedReader) -> Any:
 
 
 def stated_size(compression: bytes, data: bytes) -> int | None:
-    """Return how large compressed data say that they are, by their first bytes; None if they do not.
+    """Return how large compressed data claim to be, by their first bytes; None if they do not.
 
     Parameters
     ----------

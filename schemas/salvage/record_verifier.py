@@ -29,7 +29,12 @@ from hearthlog.schemas.mcap.formats import (
     UINT32,
     UINT64,
 )
-from hearthlog.schemas.mcap.large_chunks import ContentStream, TooLargeError, read_parts, stated_size
+from hearthlog.schemas.mcap.large_chunks import (
+    ContentStream,
+    TooLargeError,
+    read_parts,
+    stated_size,
+)
 from hearthlog.schemas.mcap.records import (
     LIMIT,
     ChunkHead,
@@ -373,7 +378,7 @@ class RecordVerifier:
         return LargeChunk(stored, data, definitions, leading, unread)
 
     def _unopened_chunk(self, offset: int, end: int, why: str) -> LargeChunk:
-        """Describe a chunk that is too large to be opened, by its head and the indexes behind it."""
+        """Describe a chunk that is not opened, by its head and the indexes behind it."""
         head = begun_chunk_head(self.read(offset + HEAD.size, _CHUNK_HEAD))
         first = offset + HEAD.size
         data = first + head.data.start, first + head.data.stop

@@ -239,9 +239,7 @@ class SalvagedCopy:
             times = chunk.times(number)
             self._count(number, len(times), int(times.min()), int(times.max()))
 
-    def _record_of(
-        self, piece: WholeAttachment | LargeAttachment
-    ) -> Iterable[bytes | memoryview]:
+    def _record_of(self, piece: WholeAttachment | LargeAttachment) -> Iterable[bytes | memoryview]:
         if isinstance(piece, WholeAttachment):
             return [piece.record]
         if piece.escaped:

@@ -142,9 +142,7 @@ def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChu
     return chunk._replace(stored=stored, late=counts)
 
 
-def with_definitions(
-    chunk: WholeChunk, content: bytes, starts: Int64
-) -> tuple[WholeChunk, bytes]:
+def with_definitions(chunk: WholeChunk, content: bytes, starts: Int64) -> tuple[WholeChunk, bytes]:
     """Write the definitions of a chunk into it anew; return its content, too.
 
     Parameters
