@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -46,6 +47,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _PIECE = 1 << 20  # bytes
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters
+_BRACKETS = 2000  # of all profiles, which have four each in JSON
 _FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
 _DEPTH = 10  # of ROS 2's default profile
 _CHUNK_SPAN = 10 * NANOSECONDS  # as a recorder's
@@ -506,8 +508,15 @@ def bag_metadata(channel: Channel) -> dict[str, str]:
 
 def _profiles(channel: Channel) -> list[Any]:
     """Read the offered quality of service of a channel; empty if it is invalid."""
-    text = channel.metadata.get("offered_qos_profiles", "")
+    return list(_parsed_profiles(channel.metadata.get("offered_qos_profiles", "")))
+
+
+@lru_cache(256)
+def _parsed_profiles(text: str) -> list[Any]:
+    brackets = sum(map(text.count, "[{"))
+    if len(text) >= _PROFILES_LIMIT or brackets > _BRACKETS or "&" in text:
+        return []  # what nests deeply, or has aliases, would take for ever
     try:
-        return list(dump_qos_v9(parse_qos(text if len(text) < _PROFILES_LIMIT else "")))
+        return list(dump_qos_v9(parse_qos(text)))
     except (ReaderError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
         return []

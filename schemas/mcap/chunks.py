@@ -139,7 +139,7 @@ def _messages(file: LogFile, batch: "_Batch", topics: TopicChoice | None) -> lis
         text = "messages of channels that nothing in the file defines are left out"
         warnings.warn(HearthlogWarning(text, file.path, each=True), stacklevel=2)
         indices = {number: found for number, found in indices.items() if number not in unknown}
-    for identity in _other_channels(file, topics):
+    for identity in [*_other_channels(file, topics), *file.doubtful]:
         indices.pop(identity, None)
     read = [batch.messages(identity, parts) for identity, parts in indices.items()]
     return [messages for messages in read if len(messages)]
@@ -473,10 +473,8 @@ def _add_definitions(
     """Add the schemas and channels to a file that are at some places of a chunk."""
     for start, end in places:
         record = file.parse(content[start], bytes(content[start + HEAD.size : end]))
-        if isinstance(record, records.Schema):
-            file.schemas.setdefault(record.id, record)
-        elif isinstance(record, records.Channel):
-            file.channels.setdefault(record.id, record)
+        if isinstance(record, records.Schema | records.Channel):
+            file.define(record)
 
 
 def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.void]]:
@@ -487,6 +485,8 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
             starts.append(start)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             _add_definitions(file, content, [(start, end)])
+        elif opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE:
+            raise McapError("the records of a chunk are damaged")
     made = index_messages(content, np.frombuffer(starts, np.int64))
     return {channel: np.frombuffer(rows, formats.INDEX_ENTRIES) for channel, rows in made.items()}
 

@@ -7,7 +7,7 @@ import zlib
 from array import array
 from collections import Counter
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -142,6 +142,7 @@ class LogFile:
         self._sets: dict[frozenset[int], int] = {}
         self._lost = _Lost()
         self.undefined: set[int] = set()  # channels that no chunk defines
+        self.doubtful: set[int] = set()  # channels that are defined in two ways
         self.streams: list[ContentStream] = []  # of large chunks that are being read
         self.again: Counter[int] = Counter()  # bytes decompressed once more, by large chunk
         self.lock = threading.Lock()  # of both
@@ -576,16 +577,29 @@ class LogFile:
     def _add(self, record: McapRecord | None) -> None:
         if isinstance(record, records.Header):
             self.header = record
-        elif isinstance(record, records.Schema):
-            self.schemas.setdefault(record.id, record)
-        elif isinstance(record, records.Channel):
-            self.channels.setdefault(record.id, record)
+        elif isinstance(record, records.Schema | records.Channel):
+            self.define(record)
         elif isinstance(record, records.Statistics):
             self.statistics = record
         elif isinstance(record, records.AttachmentIndex | records.MetadataIndex):
             is_metadata = isinstance(record, records.MetadataIndex)
             opcode = Opcode.METADATA if is_metadata else Opcode.ATTACHMENT
             self.record_locations.append(RecordLocation(opcode, record.offset, record.length))
+
+    def define(self, record: records.Schema | records.Channel) -> None:
+        """Add a schema or a channel; one that contradicts an earlier one makes that doubtful."""
+        if isinstance(record, records.Schema):
+            if self.schemas.setdefault(record.id, record) != record:
+                self._doubt({n for n, c in self.channels.items() if c.schema_id == record.id})
+            return
+        first = self.channels.setdefault(record.id, record)
+        if first is not record and replace(first, metadata={}) != replace(record, metadata={}):
+            self._doubt({record.id})
+
+    def _doubt(self, channels: set[int]) -> None:
+        self.doubtful |= channels
+        text = "messages of channels that the file defines in two ways are left out"
+        warnings.warn(HearthlogWarning(text, self.path, each=True), stacklevel=2)
 
     def _forget(self) -> None:
         self.header = None
