@@ -339,8 +339,8 @@ def _alike(
 ) -> NDArray[np.bool_]:
     """Find the payloads that have the fault of the first one, as what it depends on tells."""
     alike = np.ones(len(payloads), bool)
-    raw = payloads.view(np.uint8).reshape(len(payloads), -1) if payloads.dtype.itemsize else None
-    for place, word in words.items() if raw is not None else ():
+    raw = payloads.view(np.uint8).reshape(len(payloads), payloads.dtype.itemsize)
+    for place, word in words.items():
         alike &= (raw[:, place : place + len(word)] == np.frombuffer(word, np.uint8)).all(axis=1)
     if isinstance(error, EndlessTextError):
         alike &= ~error.layout.fits(payloads.view(error.layout.dtype))
