@@ -419,6 +419,46 @@ def test_a_quality_of_service_without_end_is_none(tmp_path, hearthlog, monkeypat
     assert given == []
 
 
+def test_statistics_that_lie_are_not_printed(tmp_path, hearthlog):
+    path = numbers(tmp_path / "x.mcap", enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    place = data.rindex(struct.pack("<BQ", 11, 56)) + HEAD.size
+    for count in (2**40, 7):
+        struct.pack_into("<Q", data, place, count)
+        struct.pack_into("<Q", data, place + 48, count)
+        path.write_bytes(data)
+        about = json.loads(hearthlog("info", path, "--json").stdout)
+        assert about["topics"]["/i"]["messages"] == 30
+
+
+def test_a_chunk_that_the_index_lists_twice_is_read_once(tmp_path, hearthlog):
+    path = numbers(tmp_path / "x.mcap", enable_crcs=False)
+    data = path.read_bytes()
+    (summary,) = struct.unpack_from("<Q", data, len(data) - FOOTER_SIZE + HEAD.size)
+    with path.open("rb") as stream:
+        first = make_reader(stream).get_summary().chunk_indexes[0]
+    place = data.index(struct.pack("<QQQ", *_times_and_place(first)), summary) - HEAD.size
+    length = HEAD.size + struct.unpack_from("<Q", data, place + 1)[0]
+    again = data[place : place + length]
+    footer = struct.pack("<BQQQI", 2, 20, summary, 0, 0) + MAGIC
+    path.write_bytes(data[:place] + again * 3 + data[place + length : -FOOTER_SIZE] + footer)
+    done = hearthlog("cat", path)
+    assert (done.returncode, printed(done)) == (3, list(range(30)))
+
+
+def _times_and_place(index):
+    return index.message_start_time, index.message_end_time, index.chunk_start_offset
+
+
+def test_a_thousand_topics_and_more_are_listed(tmp_path, hearthlog):
+    parts = [defined(n, f"/t{n}") + message(n, int32(n), T0 + n) for n in range(1, 1500)]
+    path = unindexed(tmp_path / "x.mcap", *parts)
+    lines = hearthlog("info", path).stdout.splitlines()
+    head = next(number for number, line in enumerate(lines) if line.startswith("topic "))
+    assert len(lines) == head + 1 + 1499
+    assert len({line.index("std_msgs") for line in lines[head + 1 :]}) == 1
+
+
 def test_a_topic_with_an_endless_name_is_one_line(tmp_path, hearthlog):
     path = unindexed(tmp_path / "x.mcap", defined(1, "/" + "a" * 70_000), message(1, int32(1), T0))
     done = hearthlog("cat", path, "--topics", "/none")

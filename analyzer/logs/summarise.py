@@ -104,6 +104,8 @@ def _is_counted(file: LogFile) -> bool:
         return False
     counts = file.statistics.channel_message_counts
     is_whole = sum(counts.values()) == file.statistics.message_count
+    indexed = (file.chunks["index_length"] > 0).any()
+    is_whole &= bool(not indexed or file.lists_all_messages())
     return is_whole and counts.keys() <= file.channels.keys()
 
 

@@ -378,7 +378,7 @@ def read_definitions(file: LogFile, on_damage: OnDamage | None = None) -> None:
     LogError
         If the log cannot be read, or one of these chunks is damaged.
     """
-    chunks = not_empty(file.chunks)
+    chunks = not_empty(file.chunks[file.chunks["index_length"] >= 0])  # a run defines nothing
     for number, channels in enumerate(chunks["channels"].tolist()):
         identities = file.channel_sets[channels]
         if not identities or not identities <= file.channels.keys():

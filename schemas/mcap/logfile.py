@@ -385,11 +385,11 @@ class LogFile:
         if not len(self.chunks) and (self.statistics is None or self.statistics.message_count):
             self._forget()
             return False
-        if not self._lists_all_messages():
+        if not self.lists_all_messages():
             self._walk_between(footer.summary_start)
         return True
 
-    def _lists_all_messages(self) -> bool:
+    def lists_all_messages(self) -> bool:
         """Return whether the message indexes of all chunks have as many entries as are counted."""
         if self.statistics is None:
             return False

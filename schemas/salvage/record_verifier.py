@@ -383,6 +383,8 @@ class RecordVerifier:
         first = offset + HEAD.size
         data = first + head.data.start, first + head.data.stop
         stated = stated_size(head.compression, self.read(data[0], _CHUNK_HEAD))
+        if not head.compression:
+            stated = data[1] - data[0]
         if stated not in {None, head.size} or max(head.start, head.end) > LAST_TIME:
             raise McapError("the head of a chunk is damaged")
         entries: dict[int, bytes] = {}
