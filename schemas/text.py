@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+_LONGEST = 100  # characters of a name in a list
+
 
 def printable(text: object) -> str:
     """Return a text on one line, with spaces in the place of what would steer a terminal.
@@ -41,7 +43,7 @@ def abridged(names: Sequence[str], most: int = 20) -> str:
         How many are listed.
     """
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    return ", ".join(shortened(name, _LONGEST) for name in names[:most]) + more
 
 
 def listed(names: Sequence[str], last: str = "or") -> str:

@@ -695,15 +695,9 @@ def test_an_index_that_leads_to_one_message_again_and_again_is_refused(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("claim", "what"),
-    [
-        ({"uncompressed_size": 0}, "chunks are larger than their index claims"),
-        ({"uncompressed_size": 0, "message_index_length": 200_000}, "chunks overlap"),
-    ],
+    "claim", [{"uncompressed_size": 0}, {"uncompressed_size": 0, "message_index_length": 200_000}]
 )
-def test_what_an_index_claims_of_chunks_does_not_make_us_read_all_of_them_at_once(
-    claim, what, tmp_path
-):
+def test_an_index_that_lists_a_chunk_more_than_once_is_not_used(claim, tmp_path):
     path = tmp_path / "a.mcap"
     record = struct.pack("<BQHIQQ", 5, 22 + (40 << 20), 1, 0, 7, 7) + bytes(40 << 20)
     data = zstandard.compress(record) + bytes(300_000)
@@ -718,5 +712,5 @@ def test_what_an_index_claims_of_chunks_does_not_make_us_read_all_of_them_at_onc
         index = ChunkIndex.read(ReadDataStream(io.BytesIO(writer._chunk_indexes[9:])))
         writer._chunk_indexes = encode_record(replace(index, **claim)) * 4
         writer.finish()
-    with pytest.raises(LogError, match=what):
-        read_columns([path])
+    with pytest.warns(HearthlogWarning, match="its index is damaged"), LogFile(path) as file:
+        assert len(file.chunks) == len(set(file.chunks["offset"].tolist())) == 4

@@ -149,12 +149,12 @@ def test_a_topic_whose_name_is_in_another_encoding_is_read(tmp_path, hearthlog):
     path = bag.close()
     path.write_bytes(path.read_bytes().replace(b"K_se", "Käse".encode("latin-1")))
     warning = (
-        f"hearthlog: {path}: U+FFFD stands for what is not UTF-8 in names of topics, types or "
+        f"hearthlog: {path}: bytes that are not UTF-8 stand as \\xNN in names of topics, types or "
         "records\n"
     )
     for verb in ("cat", "info"):
         done = hearthlog(verb, path)
-        assert (done.returncode, done.stderr, "/K\ufffdse" in done.stdout) == (3, warning, True)
+        assert (done.returncode, done.stderr, "/K\\xe4se" in done.stdout) == (3, warning, True)
 
 
 def test_python_reads_what_the_command_reads(damaged):
@@ -563,5 +563,5 @@ def test_a_chunk_that_claims_to_be_large_and_is_not_is_damaged(tmp_path, hearthl
     chunk += struct.pack("<Q", len(content)) + content
     path.write_bytes(head + record(6, chunk) + record(15, bytes(4)) + record(2, bytes(20)) + MAGIC)
     done = hearthlog("cat", path)
-    assert (done.returncode, "damaged at byte" in done.stderr) == (1, True)
+    assert (done.returncode, "damaged at byte" in done.stderr) == (3, True)
     assert hearthlog("recover", path, "--output", tmp_path / "copy.mcap").returncode == 3

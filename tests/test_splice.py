@@ -465,14 +465,22 @@ def test_a_log_is_named_mcap(recorded, refused, tmp_path):
         assert message == f"--output {tmp_path / 'x.bag'}: a log is named *.mcap"
 
 
-def test_a_damaged_log_leaves_no_output(recorded, refused, tmp_path):
-    data = bytearray(find_logs(recorded)[0].read_bytes())
+@pytest.mark.parametrize("verb", ["merge", "cut"])
+def test_what_stands_outside_of_a_damaged_chunk_is_copied(recorded, hearthlog, tmp_path, verb):
+    whole = find_logs(recorded)[0]
+    data = bytearray(whole.read_bytes())
     data[len(data) // 2] ^= 0xFF
-    damaged = tmp_path / "damaged.mcap"
+    damaged, saved, copy = (tmp_path / f"{name}.mcap" for name in ("damaged", "saved", "copy"))
     damaged.write_bytes(data)
-    message = refused("merge", damaged, "-o", tmp_path / "x.mcap")
-    assert message.startswith(f"{damaged}: damaged at byte ")
-    assert list(tmp_path.iterdir()) == [damaged]
+    done = hearthlog(verb, damaged, "-o", copy)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert done.stderr.startswith(f"hearthlog: {damaged}: damaged at byte ")
+    hearthlog("recover", damaged, "-o", saved)
+    kept = raw_messages(copy)
+    assert len(raw_messages(whole)) > len(kept) > 0
+    assert [m for m in raw_messages(saved) if not m[0].endswith("/gap")] == [
+        m for m in kept if not m[0].endswith("/gap")
+    ]
 
 
 def test_a_full_disk_leaves_no_output(recorded, refused, tmp_path):

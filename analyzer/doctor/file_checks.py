@@ -2,11 +2,13 @@
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from hearthlog.analyzer.doctor.findings import DISTRUST, RECOVER, REINDEX, Findings
@@ -37,6 +39,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
+_MOST_WRONG = 20_000  # faults of a channel that are unlike, before the rest is passed over
 _KEPT = {METADATA, ROSBAG2, CONTENTS, *ATTACHMENTS}
 
 
@@ -247,6 +250,7 @@ class ForeignMessages:
     def __init__(self, data: DataSection, findings: Findings) -> None:
         self._data = data
         self._findings = findings
+        self._wrong: Counter[int] = Counter()  # faults that are unlike, by channel
 
     def add(self, batch: MessageBatch) -> None:
         """Decode the next messages of the file, and report what cannot be decoded.
@@ -258,6 +262,8 @@ class ForeignMessages:
         """
         definitions = self._data.definitions
         for raw in batch.by_channel(definitions.channels, definitions.schemas):
+            if self._wrong[raw.channel.id] > _MOST_WRONG:
+                continue
             if raw.channel.message_encoding != ENCODING:
                 continue
             if raw.schema is None or raw.schema.encoding not in ROS_ENCODINGS:
@@ -272,9 +278,18 @@ class ForeignMessages:
     def _report(self, raw: RawMessages, error: LogError) -> None:
         """Report the messages that are not of their type, or else texts that are not UTF-8."""
         wrong = faults(raw)
-        for row, fault in wrong.items():
-            what, time = f"cannot be read: {raw.channel.topic}: {fault}", int(raw.log_times[row])
-            self._findings.error("cdr", what, time=time)
+        topic = raw.channel.topic
+        rows = np.zeros(len(raw), bool)
+        rows[list(wrong)] = True
+
+        def what(row: int) -> str:
+            return f"cannot be read: {topic}: {wrong[row]}"
+
+        self._findings.rows("cdr", rows, raw.log_times, what, advice="")
+        self._wrong[raw.channel.id] += len(set(map(id, wrong.values())))
+        if self._wrong[raw.channel.id] > _MOST_WRONG:
+            text = f"messages of {topic} cannot be read, each for another reason"
+            self._findings.error("unchecked", f"{text}: the rest of them is not checked")
         if not wrong:
             advice = "readers put U+FFFD in the place of what cannot be read"
             self._findings.warning("text", str(error), advice, time=int(raw.log_times[0]))

@@ -103,13 +103,15 @@ class Findings:
         """
         self._add(Finding(self.path, "warning", rule, what, advice, offset, time))
 
-    def rows(
+    def rows(  # noqa: PLR0913
         self,
         rule: str,
         wrong: NDArray[np.bool_],
         times: NDArray[np.int64],
         what: Callable[[int], str],
         level: Level = "error",
+        *,
+        advice: str = DISTRUST,
     ) -> None:
         """Add the rows of a column that break a rule.
 
@@ -126,9 +128,11 @@ class Findings:
             first five of them.
         level : str
             `error` or `warning`.
+        advice : str
+            What to do about an error.
         """
         places = np.flatnonzero(wrong)
-        advice = DISTRUST if level == "error" else ""
+        advice = advice if level == "error" else ""
         for row in places[:_SHOWN].tolist():
             time = int(times[row])
             with np.errstate(over="ignore"):  # of numbers that are any

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.export.exporter import Table
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 
@@ -21,6 +22,7 @@ _TYPES = {
     "int32": pa.int32(), "uint32": pa.uint32(), "int64": pa.int64(), "uint64": pa.uint64(),
     "float32": pa.float32(), "float64": pa.float64(), TIME: _MOMENT, DURATION: pa.duration("ns"),
 }  # fmt: skip
+_BYTES = {"byte", "char", "uint8"}  # arrays of them are binary
 _HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
 
 
@@ -55,14 +57,25 @@ def column_name(path: str) -> str:
 
 
 def type_of(field: Field) -> pa.DataType:
-    """Return the Arrow type of a field; stamps are timestamp[ns, UTC], durations duration[ns]."""
-    if field.elements:
+    """Return the Arrow type of a field; stamps are timestamp[ns, UTC], durations duration[ns].
+
+    Arrays are lists, and arrays of bytes, as those of images, binary.
+    """
+    if _is_binary(field):
+        return pa.binary(field.size or -1)
+    if field.type:
+        element = _TYPES[field.type]
+    elif field.elements:
         element = pa.struct([(path, type_of(part)) for path, part in field.elements.items()])
     else:
-        element = _TYPES[field.type]
+        element = pa.null()
     if field.size is None:
         return element
     return pa.list_(element, field.size or -1)
+
+
+def _is_binary(field: Field) -> bool:
+    return field.size is not None and field.type in _BYTES
 
 
 def batch_of(pieces: Sequence[TypedColumns], table: Table, schema: pa.Schema) -> pa.RecordBatch:
@@ -133,21 +146,43 @@ def array_of(values: NDArray[Any], field: Field) -> pa.Array:
         Of length n and of the type that `type_of` returns.
     """
     kind = type_of(field)
-    if field.elements or (field.size is not None and field.type == "string"):
+    if not field.type:
+        return pa.array([_with_bytes(value, field) for value in values.tolist()], kind)
+    if field.size is not None and field.type == "string":
         return pa.array(values.tolist(), kind)
-    if field.size is None and field.type in {TIME, DURATION}:
-        return pa.array(values).cast(kind)
     if field.size is None:
-        return pa.array(values, kind)
-    if not len(values):
-        return pa.array([], kind)
+        is_time = field.type in {TIME, DURATION}
+        return pa.array(values).cast(kind) if is_time else pa.array(values, kind)
+    return _array_of_arrays(values, field, kind) if len(values) else pa.array([], kind)
+
+
+def _array_of_arrays(values: NDArray[Any], field: Field, kind: pa.DataType) -> pa.Array:
+    """Turn a column of arrays of numbers into an Arrow array."""
     if values.dtype == object:
         ends = np.cumsum([len(row) for row in values])
         flat = np.concatenate(list(values))
     else:
         ends = np.arange(1, len(values) + 1) * values.shape[1]
         flat = values.reshape(-1)
+    if _is_binary(field):
+        data = pa.py_buffer(np.ascontiguousarray(flat, np.uint8))
+        starts = [] if field.size else [_offsets(ends).buffers()[1]]
+        return pa.Array.from_buffers(kind, len(values), [None, *starts, data])
     if field.size:
         return pa.FixedSizeListArray.from_arrays(pa.array(flat, kind.value_type), type=kind)
-    offsets = pa.array(np.concatenate([[0], ends]), pa.int32())
-    return pa.ListArray.from_arrays(offsets, pa.array(flat, kind.value_type))
+    return pa.ListArray.from_arrays(_offsets(ends), pa.array(flat, kind.value_type))
+
+
+def _offsets(ends: Int64) -> pa.Array:
+    """Return where each row of a list begins, and the end of the last."""
+    return pa.array(np.concatenate([[0], ends]), pa.int32())
+
+
+def _with_bytes(value: Any, field: Field) -> Any:
+    """Make bytes of the arrays of bytes in messages, and nulls of messages without fields."""
+    if isinstance(value, dict):
+        parts = {path: _with_bytes(part, field.elements[path]) for path, part in value.items()}
+        return parts or None
+    if _is_binary(field):
+        return bytes(value)
+    return [_with_bytes(part, field) for part in value] if not field.type else value

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import BinaryIO
 
 from hearthlog.analyzer.export.exporter import Table, table_exporter
-from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.selection import Damages, Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.logs.columns import Columns, iterate_columns
 from hearthlog.schemas.messages import message_types
@@ -73,9 +73,9 @@ class LabelTrack:
 
 def _first_frame(topic: str, selection: Selection) -> int | None:
     features = topic_of(topic.split("/")[1] if topic.startswith("/") else "", "features")
-    batches = iterate_columns(
-        selection.logs, {features}, selection.start, selection.end, {"header.stamp"}
-    )
+    span = selection.start, selection.end
+    stamps = {"header.stamp"}
+    batches = iterate_columns(selection.logs, {features}, *span, stamps, on_damage=Damages().add)
     first = next(batches, None)
     return None if first is None else int(first[0]["header.stamp"].min())
 

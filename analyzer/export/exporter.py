@@ -302,7 +302,6 @@ def write_tables(
     Parameters
     ----------
     selection : Selection
-        Its checksums are compared first.
     files : OutputFiles
         What is written to.
     progress : callable
@@ -317,7 +316,6 @@ def write_tables(
     LogError
         If a log is damaged, if there is no message, or if the format has no place for any.
     """
-    selection.verify()
     writing = _Writing(files, opened, type_)
     selection = selection.decodable()
     again: Collection[str] = writing.read(selection, progress)

@@ -4,10 +4,10 @@ import hashlib
 import json
 import math
 import sys
-import zlib
 from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -15,13 +15,13 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hearthlog.analyzer.export.file_names import unused_name
 from hearthlog.analyzer.export.repeats import without_repeats
-from hearthlog.analyzer.logs.selection import Described, Selection, identity
+from hearthlog.analyzer.logs.selection import Damages, Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
@@ -29,20 +29,25 @@ from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
-from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, UINT32, UINT64
+from hearthlog.schemas.mcap.formats import HEAD, UINT32
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.salvage.whole_records import index_attachment
+from hearthlog.schemas.salvage.whole_records import (
+    AttachmentHead,
+    attachment_head,
+    encode_attachment,
+)
 from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import NANOSECONDS
 
 _PIECE = 1 << 20  # bytes
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters
+_BRACKETS = 2000  # of all profiles, which have four each in JSON
 _FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
 _DEPTH = 10  # of ROS 2's default profile
 _CHUNK_SPAN = 10 * NANOSECONDS  # as a recorder's
@@ -133,7 +138,6 @@ def write_log(
         If a log is damaged, if there is no message, or if there are more channels than a log can
         have.
     """
-    selection.verify()  # the copies get checksums of their own
     batches = selection.messages(progress, once=True)
     first = next(batches, None)
     log = _Log(stream, selection)
@@ -154,11 +158,15 @@ def _count_repeated(selection: Selection) -> int:
     """Count the messages in chunks that a log holds twice."""
     count = 0
     for path in selection.logs:
-        with LogFile(path) as file:
+        with LogFile(path, partial=True) as file:
             chunks = file.chunks[repeated_chunks(file, file.chunks)]
-            for batch in read_in_batches(file, chunks, selection.topics):
+            for batch in read_in_batches(file, chunks, selection.topics, _pass_over):
                 count += sum(len(m.between(selection.start, selection.end)) for m in batch)
     return count
+
+
+def _pass_over(_: Path, __: LogError) -> None:
+    """Leave out a chunk of which a warning tells already."""
 
 
 class _Log:
@@ -213,7 +221,7 @@ class _Log:
         seen: set[Hashable] = set()
         names: dict[str, int] = {}
         for path in logs:
-            with LogFile(path) as file:
+            with LogFile(path, partial=True) as file:
                 for place in sorted(set(file.record_locations), key=lambda place: place[1:]):
                     if place.opcode == Opcode.ATTACHMENT and place.length > LIMIT:
                         self._copy_large_attachment(file, place, seen, names)
@@ -235,21 +243,22 @@ class _Log:
         self, file: LogFile, place: RecordLocation, seen: set[Hashable], names: dict[str, int]
     ) -> None:
         """Copy an attachment that is larger than is read at once."""
-        index = _index_of_large(file, place)
+        head = _head_of_large(file, place)
+        index = head.index_record
+        data = RecordLocation(place.opcode, place.offset + head.first, index.data_size)
         digest = hashlib.sha256()
-        data = place.offset + _data_end(index) - index.data_size
-        for piece in _pieces(file, RecordLocation(place.opcode, data, index.data_size)):
+        for piece in _pieces(file, data):
             digest.update(piece)
         key = index.name, index.media_type, digest.digest()
         if key in seen:
             return
         seen.add(key)
         name = unused_name(index.name, names)
-        if name == index.name:
+        if name == index.name and not head.escaped:
             self._writer.copy_attachment(_pieces(file, place), index)
         else:
-            renamed = replace(index, name=name)
-            self._writer.copy_attachment(_renamed(file, place, index, name), renamed)
+            index = replace(index, name=name)
+            self._writer.copy_attachment(encode_attachment(index, _pieces(file, data)), index)
 
     def _channel(self, described: Described) -> int:
         key = identity(*described)
@@ -302,45 +311,24 @@ def is_for_rosbag2(channels: Sequence[Described]) -> bool:
 def _profile(logs: Sequence[Path]) -> str:
     profiles = set()
     for path in logs:
-        with LogFile(path) as file:
+        with LogFile(path, partial=True) as file:
             profiles.add("" if file.header is None else file.header.profile)
     return profiles.pop() if len(profiles) == 1 else ""
 
 
-def _index_of_large(file: LogFile, place: RecordLocation) -> AttachmentIndex:
-    """Read what an index says of an attachment; check that the attachment is where it should be."""
+def _head_of_large(file: LogFile, place: RecordLocation) -> AttachmentHead:
+    """Read what stands before the data of an attachment, which must be where the index says."""
     _, offset, length = place
-    head = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
-    if offset + length > file.size or file.read(offset, HEAD.size) != head:
+    begin = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
+    if offset + length > file.size or file.read(offset, HEAD.size) != begin:
         raise file.damaged(offset, "here should be an attachment")
     try:
-        index = index_attachment(file.read(offset, _PIECE))
-    except (McapError, UnicodeDecodeError) as error:
+        head = attachment_head(file.read(offset, _PIECE))
+    except McapError as error:
         raise file.damaged(offset, error) from error
-    if _data_end(index) + UINT32.size > length:
+    if head.end + UINT32.size > length:
         raise file.damaged(offset, "an attachment is longer than its record")
-    return index
-
-
-def _data_end(index: AttachmentIndex) -> int:
-    """Return the byte of an attachment's record before which its data end."""
-    texts = len(index.name.encode()) + UINT32.size + len(index.media_type.encode())
-    return HEAD.size + ATTACHMENT.size + texts + UINT64.size + index.data_size
-
-
-def _renamed(
-    file: LogFile, place: RecordLocation, index: AttachmentIndex, name: str
-) -> Iterator[bytes]:
-    """Read an attachment of any size with another name, and the checksum that it has then."""
-    first, end = HEAD.size + ATTACHMENT.size + len(index.name.encode()), _data_end(index)
-    start = ATTACHMENT.pack(index.log_time, index.create_time, len(name.encode())) + name.encode()
-    yield HEAD.pack(Opcode.ATTACHMENT, len(start) + end - first + UINT32.size)
-    yield start
-    crc = zlib.crc32(start)
-    for piece in _pieces(file, RecordLocation(place.opcode, place.offset + first, end - first)):
-        crc = zlib.crc32(piece, crc)
-        yield piece
-    yield UINT32.pack(crc)
+    return head
 
 
 def _pieces(file: LogFile, place: RecordLocation) -> Iterator[bytes]:
@@ -400,7 +388,9 @@ def _without_first(parts: Sequence[RawMessages], count: int) -> list[RawMessages
 def _earlier(
     logs: Sequence[Path], topics: Collection[str], selection: Selection
 ) -> Iterator[list[RawMessages]]:
-    return map(without_repeats, iterate_messages(logs, topics, end=selection.start, once=True))
+    damages = Damages()
+    earlier = iterate_messages(logs, topics, end=selection.start, on_damage=damages.add, once=True)
+    return map(without_repeats, earlier)
 
 
 def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
@@ -414,7 +404,9 @@ def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
             break
         logs.append(path)
         wanted: dict[str, dict[Hashable, float]] = {}
-        for batch in iterate_messages([path], missing, end=selection.start, once=True):
+        for batch in iterate_messages(
+            [path], missing, end=selection.start, on_damage=_pass_over, once=True
+        ):
             for messages in batch:
                 publisher, topic = _publisher(messages), messages.channel.topic
                 counts[publisher] += len(messages)
@@ -516,8 +508,15 @@ def bag_metadata(channel: Channel) -> dict[str, str]:
 
 def _profiles(channel: Channel) -> list[Any]:
     """Read the offered quality of service of a channel; empty if it is invalid."""
-    text = channel.metadata.get("offered_qos_profiles", "")
+    return list(_parsed_profiles(channel.metadata.get("offered_qos_profiles", "")))
+
+
+@lru_cache(256)
+def _parsed_profiles(text: str) -> list[Any]:
+    brackets = sum(map(text.count, "[{"))
+    if len(text) >= _PROFILES_LIMIT or brackets > _BRACKETS or "&" in text:
+        return []  # what nests deeply, or has aliases, would take for ever
     try:
-        return list(dump_qos_v9(parse_qos(text if len(text) < _PROFILES_LIMIT else "")))
+        return list(dump_qos_v9(parse_qos(text)))
     except (ReaderError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
         return []

@@ -42,7 +42,6 @@ _LITTLE_ENDIAN = b"\x00\x01"
 
 def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
     """Write a bag; the sequence numbers of headers, which ROS 2 does not have, are 0."""
-    selection.verify()
     selection = selection.decodable()
     with Writer(files.path) as writer:
         bag = _Bag(writer)

@@ -29,7 +29,7 @@ def in_order(
     Parameters
     ----------
     pieces : iterable of TypedColumns
-        At least one.
+        None where no message could be decoded.
     lines : callable
         Makes a line of every message of a piece, in their order: `json_lines` or `text_lines`.
     """
@@ -38,7 +38,7 @@ def in_order(
     for piece in pieces:
         texts += lines(piece)
         times.append(piece.columns.log_times)
-    order = np.argsort(np.concatenate(times), kind="stable")
+    order = np.argsort(np.concatenate(times) if times else np.empty(0), kind="stable")
     return [texts[i] for i in order.tolist()]
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import chain
 from pathlib import Path
+from threading import Lock
 from typing import TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
 from hearthlog.schemas.mcap.formats import MESSAGE_HEAD
-from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.logfile import RECOVER, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.progress import Progress, ignore_progress
@@ -29,7 +30,32 @@ from hearthlog.schemas.text import abridged
 _LAST = (1 << 63) - 1  # log time
 _NAMED = 5  # topics of which none can be decoded
 Result = TypeVar("Result")
+_CHUNKS_NAMED = 3  # damaged ones of a log
 Described = tuple[Channel, Schema | None]
+
+
+class Damages:
+    """Warns of damaged chunks that are left out: of the first few of each log, then of the rest."""
+
+    def __init__(self) -> None:
+        self._told: dict[Path, set[str]] = {}
+        self._lock = Lock()
+
+    def add(self, path: Path, error: LogError) -> None:
+        """Add a chunk; is called from threads that read."""
+        text = str(error)
+        with self._lock:
+            told = self._told.setdefault(path, set())
+            is_new = text not in told
+            told.add(text)
+        if is_new and len(told) <= _CHUNKS_NAMED:
+            _warn(path, error)
+
+    def warn_of_more(self) -> None:
+        """Count those of which there was no warning."""
+        for path, told in self._told.items():
+            if (more := len(told) - _CHUNKS_NAMED) > 0:
+                _warn(path, LogError(f"{more:,} more chunks are damaged and left out{RECOVER}"))
 
 
 @dataclass(frozen=True)
@@ -73,8 +99,8 @@ class Selection:
         Yields
         ------
         list of RawMessages
-            As `iterate_messages` yields them; what is damaged is left out, with a warning for each
-            log.
+            As `iterate_messages` yields them; chunks that are damaged are left out, as `Damages`
+            warns.
 
         Raises
         ------
@@ -82,18 +108,13 @@ class Selection:
             If a log cannot be read any more.
         """
         first, last = self.span
-        damaged: set[Path] = set()
-
-        def leave_out(path: Path, error: LogError) -> None:
-            if path not in damaged:
-                damaged.add(path)
-                _warn(path, error)
-
+        damages = Damages()
         chosen = self.topics, self.start, self.end
-        for batch in iterate_messages(self.logs, *chosen, on_damage=leave_out, once=once):
+        for batch in iterate_messages(self.logs, *chosen, on_damage=damages.add, once=once):
             yield batch
             now = max(int(messages.log_times[-1]) for messages in batch)
             progress((now - first) / max(last - first, 1))
+        damages.warn_of_more()
 
     def verify(self) -> None:
         """Compare all chunks with their checksums, before a first message is read.
@@ -224,7 +245,7 @@ def select(
     silent: list[Path] = []
 
     def span_of(path: Path) -> tuple[int, int] | None:
-        span = time_span(path)
+        span = time_span(path, partial=True)
         if span is None:
             silent.append(path)
         return span
@@ -271,7 +292,7 @@ def _warn(path: Path, error: LogError) -> None:
 
 
 def _is_cut(path: Path) -> bool:
-    with LogFile(path) as file:
+    with LogFile(path, partial=True) as file:
         return not file.complete
 
 
@@ -280,9 +301,11 @@ class _Content:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with LogFile(path) as file:
+        damages = Damages()
+        with LogFile(path, partial=True) as file:
             self.complete = file.complete
-            read_definitions(file)
+            read_definitions(file, damages.add)
+            damages.warn_of_more()
             self.channels = [(c, file.schemas.get(c.schema_id)) for c in file.channels.values()]
             self.metadata = read_provenance(file)
 

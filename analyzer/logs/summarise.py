@@ -8,6 +8,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from hearthlog.analyzer.logs.selection import Damages
 from hearthlog.analyzer.logs.summary import Summary, TopicSummary
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
@@ -49,7 +50,7 @@ def summarise(paths: Iterable[Path]) -> Summary:
 
 
 def _summarise(path: Path) -> Summary:
-    with LogFile(path) as file:
+    with LogFile(path, partial=True) as file:
         summary = _without_messages(file)
         ours = [has_contents(*channel, is_compatible) for channel in _channels(file)]
         if _is_counted(file) and not any(ours):
@@ -103,6 +104,8 @@ def _is_counted(file: LogFile) -> bool:
         return False
     counts = file.statistics.channel_message_counts
     is_whole = sum(counts.values()) == file.statistics.message_count
+    indexed = (file.chunks["index_length"] > 0).any()
+    is_whole &= bool(not indexed or file.lists_all_messages())
     return is_whole and counts.keys() <= file.channels.keys()
 
 
@@ -131,13 +134,15 @@ def _read(file: LogFile, summary: Summary) -> Contents:
     for channel in _channels(file):
         _topic(summary, *channel)
     contents = Contents()
-    for batch in read_in_batches(file, file.chunks):
+    damages = Damages()
+    for batch in read_in_batches(file, file.chunks, on_damage=damages.add):
         for raw in batch:
             _topic(summary, raw.channel, raw.schema)
         try:
             contents.add(batch, is_compatible)
         except LogError as error:
             raise LogError(f"{file.path}: {error}") from error
+    damages.warn_of_more()
     return contents
 
 

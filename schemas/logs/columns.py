@@ -16,7 +16,7 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
 from hearthlog.schemas.mcap.chunk_table import LAST_TIME
-from hearthlog.schemas.mcap.chunks import TopicChoice
+from hearthlog.schemas.mcap.chunks import OnDamage, TopicChoice
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
 from hearthlog.schemas.mcap.statistics import topic_counts
 from hearthlog.schemas.messages.cdr_codec import (
@@ -115,12 +115,14 @@ class Columns:
         )
 
 
-def read_columns(
+def read_columns(  # noqa: PLR0913
     logs: Iterable[Path],
     topics: TopicChoice | None = None,
     start: int | None = None,
     end: int | None = None,
     fields: Collection[str] | None = None,
+    *,
+    on_damage: OnDamage | None = None,
 ) -> dict[str, Columns]:
     """Read topics of some logs as one series each.
 
@@ -133,6 +135,9 @@ def read_columns(
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
+    on_damage : callable, optional
+        Told of a log, and of a chunk of it that is damaged and left out. By default the error is
+        raised.
 
     Returns
     -------
@@ -150,19 +155,21 @@ def read_columns(
     whole = start is None and end is None
     expected = sum(map_logs(topic_counts, logs), Counter()) if whole else Counter()
     builders: dict[str, _ColumnBuilder] = {}
-    for batch in iterate_columns(logs, topics, start, end, fields):
+    for batch in iterate_columns(logs, topics, start, end, fields, on_damage=on_damage):
         for columns in batch:
             builder = _ColumnBuilder(expected[columns.topic])
             builders.setdefault(columns.topic, builder).add(columns)
     return {topic: builders.pop(topic).columns() for topic in list(builders)}
 
 
-def iterate_columns(
+def iterate_columns(  # noqa: PLR0913
     logs: Iterable[Path],
     topics: TopicChoice | None = None,
     start: int | None = None,
     end: int | None = None,
     fields: Collection[str] | None = None,
+    *,
+    on_damage: OnDamage | None = None,
 ) -> Iterator[list[Columns]]:
     """Read topics of some logs piece by piece.
 
@@ -175,6 +182,8 @@ def iterate_columns(
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
+    on_damage : callable, optional
+        As of `read_columns`.
 
     Yields
     ------
@@ -188,7 +197,8 @@ def iterate_columns(
     LogError
         If a log cannot be read or is damaged.
     """
-    pieces = iterate_pieces(logs, topics, start, end, partial(decode_readable, fields=fields))
+    function = partial(decode_readable, fields=fields)
+    pieces = iterate_pieces(logs, topics, start, end, function, on_damage=on_damage)
     return map(_joined, pieces)
 
 

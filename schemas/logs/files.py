@@ -3,7 +3,7 @@
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import count, islice
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.mcap.formats import OTHER_SUFFIXES, not_mcap
+from hearthlog.schemas.mcap.formats import COMPRESSED_SUFFIXES, OTHER_SUFFIXES, not_mcap
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 from hearthlog.schemas.storage.new_files import readers_of
@@ -21,6 +21,7 @@ from hearthlog.schemas.storage.regular_file import (
     may_be_regular,
     open_regular,
 )
+from hearthlog.schemas.text import abridged
 from hearthlog.schemas.times import NANOSECONDS
 
 SUFFIX = ".mcap"
@@ -293,8 +294,9 @@ def _find_local(path: Path) -> list[Path]:
     check_allowed(path)
     if path.is_dir():
         denied: list[str] = []
+        compressed: list[str] = []
         logs: list[str] = []
-        for entry in walk_logs(path, denied):
+        for entry in walk_logs(path, denied, compressed):
             allowed = os.access(entry.path, os.R_OK) or not is_denied(entry.path)
             (logs if allowed else denied).append(entry.path)
         if denied and not logs:
@@ -304,12 +306,20 @@ def _find_local(path: Path) -> list[Path]:
             warnings.warn(HearthlogWarning(text, path), stacklevel=3)
         if not logs:
             raise LogError(f"{path}: no log (*{SUFFIX}) in this folder{_others_in(path)}")
+        _warn_of_compressed(path, compressed)
         return sorted(map(Path, logs))
     if not path.exists():
         raise LogError(f"{path}: no such log")
     if not may_be_regular(path):
         raise LogError(f"{path}: cannot be read (Not a regular file)")
     return [path]
+
+
+def _warn_of_compressed(folder: Path, names: Sequence[str]) -> None:
+    """Name logs that are compressed as a whole, and left out."""
+    if names:
+        text = f"compressed as a whole, and left out: {abridged(sorted(names), 5)}; unpack first"
+        warnings.warn(HearthlogWarning(text, folder, each=True), stacklevel=4)
 
 
 def _others_in(folder: Path) -> str:
@@ -321,7 +331,9 @@ def _others_in(folder: Path) -> str:
     return ""
 
 
-def walk_logs(folder: Path, denied: list[str] | None = None) -> Iterator["os.DirEntry[str]"]:
+def walk_logs(
+    folder: Path, denied: list[str] | None = None, compressed: list[str] | None = None
+) -> Iterator["os.DirEntry[str]"]:
     """List the logs in a folder of this machine, in any order.
 
     Parameters
@@ -330,6 +342,8 @@ def walk_logs(folder: Path, denied: list[str] | None = None) -> Iterator["os.Dir
         Links to other folders in it are not followed; folders that cannot be read are left out.
     denied : list of str, optional
         Is appended to: folders that this user may not read.
+    compressed : list of str, optional
+        Is appended to: names of files that are compressed as a whole.
 
     Yields
     ------
@@ -341,6 +355,8 @@ def walk_logs(folder: Path, denied: list[str] | None = None) -> Iterator["os.Dir
         inside = look_into(path := waiting.pop())
         waiting += [entry.path for entry in inside.folders]
         yield from inside.logs
+        if compressed is not None:
+            compressed += inside.compressed
         if denied is not None and not inside.is_all and is_denied(path):
             denied.append(path)
 
@@ -352,6 +368,8 @@ class Inside(NamedTuple):
     ----------
     folders, logs : list of os.DirEntry
         As `walk_logs` finds them.
+    compressed : list of str
+        Names of logs that are compressed as a whole.
     is_all : bool
         Whether there is more or less only after a change of this folder. What a link leads to may
         change elsewhere.
@@ -359,6 +377,7 @@ class Inside(NamedTuple):
 
     folders: list["os.DirEntry[str]"]
     logs: list["os.DirEntry[str]"]
+    compressed: list[str]
     is_all: bool
 
 
@@ -372,6 +391,7 @@ def look_into(folder: str) -> Inside:
     """
     folders: list[os.DirEntry[str]] = []
     named: list[os.DirEntry[str]] = []
+    compressed: list[str] = []
     try:
         with os.scandir(folder) as entries:
             for entry in entries:
@@ -379,10 +399,13 @@ def look_into(folder: str) -> Inside:
                     folders.append(entry)
                 elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)):
                     named.append(entry)
+                elif entry.name.endswith(COMPRESSED_SUFFIXES):
+                    compressed.append(entry.name)
         is_all = not any(entry.is_symlink() for entry in named)
     except OSError:  # as Path.rglob does
         is_all = False
-    return Inside(folders, [entry for entry in named if _may_be_log(entry)], is_all)
+    logs = [entry for entry in named if _may_be_log(entry)]
+    return Inside(folders, logs, compressed, is_all)
 
 
 def _may_be_log(entry: "os.DirEntry[str]") -> bool:
@@ -398,4 +421,6 @@ def _find_stored(path: Any) -> list[Path]:
     logs = [name for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX))]
     if not logs:
         raise LogError(f"{path}: no log (*{SUFFIX}) under this name")
+    compressed = [name for name in names if name.endswith(COMPRESSED_SUFFIXES)]
+    _warn_of_compressed(path, [name.rpartition("/")[2] for name in compressed])
     return [path.with_segments(path.fs.unstrip_protocol(name)) for name in sorted(logs)]

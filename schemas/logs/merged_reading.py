@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, Protocol, Self, TypeVar
@@ -10,13 +9,14 @@ from typing import NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.chunk_table import by_start, not_empty
+from hearthlog.schemas.mcap.chunk_table import not_empty
 from hearthlog.schemas.mcap.chunks import (
+    OnDamage,
     TopicChoice,
     in_parts,
     is_chosen,
     read_chunks,
+    read_sound,
     repeated_chunks,
 )
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -116,7 +116,7 @@ class _Query(NamedTuple):
     start: int
     end: int
     every: int = 1
-    on_damage: Callable[[Path, LogError], None] | None = None
+    on_damage: OnDamage | None = None
     once: bool = False  # whether chunks that repeat another one are left out
 
     def chunks(self, file: LogFile) -> NDArray[np.void]:
@@ -125,24 +125,11 @@ class _Query(NamedTuple):
         if self.once:
             chunks = chunks[~repeated_chunks(file, chunks)]
         chosen = self._of_topics(file, chunks)
-        parts = self._in_parts(file, chosen)
+        parts = in_parts(file, chosen, self.on_damage)
         return chosen if parts is chosen else self._of_topics(file, self._in_span(parts))
 
     def _in_span(self, chunks: NDArray[np.void]) -> NDArray[np.void]:
         return chunks[(chunks["end"] >= self.start) & (chunks["start"] < self.end)]
-
-    def _in_parts(self, file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
-        """Divide large chunks into parts; those that are damaged are left out if they may be."""
-        try:
-            return in_parts(file, chunks)
-        except LogError as error:
-            if self.on_damage is None:
-                raise
-            if len(chunks) == 1:
-                self.on_damage(file.path, error)
-                return chunks[:0]
-        each = [self._in_parts(file, chunks[i : i + 1]) for i in range(len(chunks))]
-        return by_start(np.concatenate(each))
 
     def _of_topics(self, file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
         if self.topics is None:
@@ -162,14 +149,7 @@ class _Query(NamedTuple):
     def _messages(self, file: LogFile, chunks: NDArray[np.void]) -> list[RawMessages]:
         if self.on_damage is None:
             return read_chunks(file, chunks, self.topics)
-        try:
-            return read_chunks(file, chunks, self.topics)
-        except LogError as error:
-            if len(chunks) == 1:
-                self.on_damage(file.path, error)
-                return []
-        each = (self._messages(file, chunks[i : i + 1]) for i in range(len(chunks)))
-        return list(chain.from_iterable(each))
+        return read_sound(file, chunks, self.topics, self.on_damage)
 
 
 class _Batch(NamedTuple):
@@ -186,7 +166,7 @@ def iterate_messages(  # noqa: PLR0913
     start: int | None = None,
     end: int | None = None,
     *,
-    on_damage: Callable[[Path, LogError], None] | None = None,
+    on_damage: OnDamage | None = None,
     once: bool = False,
 ) -> Iterator[list[RawMessages]]:
     """Read the messages of some logs, still encoded.
@@ -227,6 +207,7 @@ def iterate_pieces(  # noqa: PLR0913
     function: Callable[[list[RawMessages]], list[Piece]],
     *,
     every: int = 1,
+    on_damage: OnDamage | None = None,
 ) -> Iterator[list[Piece]]:
     """Apply a function to the messages of each span of time, in the threads that read them.
 
@@ -241,6 +222,8 @@ def iterate_pieces(  # noqa: PLR0913
         Told the messages of one span of time; returns pieces that can be cut by log time.
     every : int
         Of so many chunks of a log one is read, for a sample; 1 for all.
+    on_damage : callable, optional
+        As of `iterate_messages`.
 
     Yields
     ------
@@ -252,7 +235,8 @@ def iterate_pieces(  # noqa: PLR0913
     LogError
         If a log cannot be read, is not an MCAP file, or is damaged; also what `function` raises.
     """
-    return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
+    query = _query(topics, start, end)._replace(every=every, on_damage=on_damage)
+    return _iterate(logs, query, function)
 
 
 def _query(topics: TopicChoice | None, start: int | None, end: int | None) -> _Query:
@@ -291,7 +275,7 @@ class _Queue:
         self._open: list[_Log] = []
         self._finished: list[LogFile] = []
         self._files: set[LogFile] = set()
-        self._walked = _WalkedLogs()
+        self._walked = _WalkedLogs(partial=query.on_damage is not None)
         try:
             self._closed = [
                 (first, path)
@@ -355,7 +339,8 @@ class _Queue:
 class _WalkedLogs:
     """A few unfinished logs that were walked through for their spans, so that once is enough."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, partial: bool) -> None:
+        self._partial = partial
         self._logs: dict[Path, LogFile] = {}
         self._rows = 0
 
@@ -364,7 +349,7 @@ class _WalkedLogs:
         stated = stated_span(path)
         if stated is not None:
             return stated[0]
-        log = LogFile(path)
+        log = LogFile(path, partial=self._partial)
         rows = len(log.chunks) + sum(map(len, log.channel_sets))
         is_full = len(self._logs) == _WALKED or self._rows + rows > _WALKED_ROWS
         if log.complete or is_full or path in self._logs:
@@ -378,7 +363,7 @@ class _WalkedLogs:
         """Open a log, with what was written to it since it was walked through."""
         log = self._logs.pop(path, None)
         if log is None:
-            return LogFile(path)
+            return LogFile(path, partial=self._partial)
         try:
             log.scan_new()
         except BaseException:

@@ -5,8 +5,9 @@ import warnings
 from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
-from itertools import pairwise
+from itertools import chain, pairwise
 from operator import attrgetter
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -23,19 +24,23 @@ from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, LATE, by_start
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
 from hearthlog.schemas.mcap.large_chunks import ContentStream, Part, TooLargeError, read_parts
-from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.logfile import RECOVER, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
+from hearthlog.schemas.times import millisecond_text
 
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
 _STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
 _AGAIN = 16  # times the bytes of a large chunk that are decompressed once more, for their order
+_INDEXES = "message indexes that do not belong to their chunks are not used"
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
 BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
 TopicChoice = Collection[str] | Callable[[str], bool]  # names, or what tells whether one is chosen
+
+OnDamage = Callable[[Path, LogError], None]  # told a log, and what of it is left out
 
 Entries = tuple[Int64, NDArray[np.void]]  # which chunk, and the entry of its index, in each row
 
@@ -76,12 +81,65 @@ def read_chunks(
     return read
 
 
+def read_sound(
+    file: LogFile, chunks: NDArray[np.void], topics: TopicChoice | None, on_damage: OnDamage
+) -> list[RawMessages]:
+    """Read messages as `read_chunks` does, without the chunks that cannot be read.
+
+    The log must be `partial`: then channels that nothing defines are left out, too.
+
+    Parameters
+    ----------
+    file, chunks, topics
+        As of `read_chunks`.
+    on_damage : callable
+        Told each chunk that is left out.
+    """
+    try:
+        return read_chunks(file, chunks, topics)
+    except LogError as error:
+        if len(chunks) > 1:
+            each = (read_sound(file, row, topics, on_damage) for row in _rows(chunks))
+            return list(chain.from_iterable(each))
+        damage = error
+    without = chunks[chunks["index_length"] > 0]  # perhaps its message indexes alone are wrong
+    without["index_length"] = 0
+    try:
+        read = read_chunks(file, without, topics) if len(without) else None
+    except LogError:
+        read = None
+    if read is None:
+        on_damage(file.path, _left_out(chunks[0], damage))
+        return []
+    warnings.warn(HearthlogWarning(_INDEXES, file.path, each=True), stacklevel=2)
+    return read
+
+
+def _rows(chunks: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
+    return (chunks[number : number + 1] for number in range(len(chunks)))
+
+
+def _left_out(chunk: np.void, error: LogError) -> LogError:
+    """Say what is lost with a chunk that cannot be read."""
+    text = str(error)
+    hint = RECOVER if text.endswith(RECOVER) else ""
+    end = int(chunk["offset"] + chunk["length"])
+    where = f" up to byte {end}" if chunk["part"] < 0 else ""
+    first, last = (millisecond_text(int(chunk[name])) for name in ("start", "end"))
+    return LogError(f"{text.removesuffix(hint)}: left out{where}, {first} to {last}{hint}")
+
+
 def _messages(file: LogFile, batch: "_Batch", topics: TopicChoice | None) -> list[RawMessages]:
     """Find the messages of some topics in chunks that were read."""
     indices = batch.indices(_other_channels(file, topics))
-    if not indices.keys() <= file.channels.keys():
+    if not indices.keys() - file.undefined <= file.channels.keys():
         _define(file, indices.keys())
-    for identity in _other_channels(file, topics):
+    if file.partial and (unknown := indices.keys() - file.channels.keys()):
+        file.undefined |= unknown
+        text = "messages of channels that nothing in the file defines are left out"
+        warnings.warn(HearthlogWarning(text, file.path, each=True), stacklevel=2)
+        indices = {number: found for number, found in indices.items() if number not in unknown}
+    for identity in [*_other_channels(file, topics), *file.doubtful]:
         indices.pop(identity, None)
     read = [batch.messages(identity, parts) for identity, parts in indices.items()]
     return [messages for messages in read if len(messages)]
@@ -91,6 +149,7 @@ def read_in_batches(
     file: LogFile,
     chunks: NDArray[np.void],
     topics: TopicChoice | None = None,
+    on_damage: OnDamage | None = None,
 ) -> Iterator[list[RawMessages]]:
     """Read chunks as `read_chunks` does, a few megabytes at a time.
 
@@ -103,6 +162,8 @@ def read_in_batches(
     topics : collection of str or callable, optional
         Topics to read, or what tells whether one is read: all of them if None; none if empty, which
         only adds definitions.
+    on_damage : callable, optional
+        Told each chunk that cannot be read and is left out; by default the error is raised.
 
     Yields
     ------
@@ -115,13 +176,18 @@ def read_in_batches(
         If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
         is of a channel that no sound chunk defines.
     """
-    chunks = in_parts(file, chunks)
+    chunks = in_parts(file, chunks, on_damage)
     batches = np.cumsum(chunks["size"] + chunks["length"]) // BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
-        yield read_chunks(file, batch, topics)
+        if on_damage is None:
+            yield read_chunks(file, batch, topics)
+        else:
+            yield read_sound(file, batch, topics, on_damage)
 
 
-def in_parts(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
+def in_parts(
+    file: LogFile, chunks: NDArray[np.void], on_damage: OnDamage | None = None
+) -> NDArray[np.void]:
     """Divide chunks that are larger than `LIMIT` into parts, and compare them with their checksums.
 
     Parameters
@@ -129,6 +195,8 @@ def in_parts(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
     file : LogFile
         Log of the chunks. Channels and schemas that the divided ones define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+    on_damage : callable, optional
+        Told each large chunk that cannot be read and is left out; by default the error is raised.
 
     Returns
     -------
@@ -144,8 +212,15 @@ def in_parts(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.void]:
     large &= (chunks["size"] > LIMIT) | (chunks["length"] > LIMIT)
     if not large.any():
         return chunks
-    divided = [_parts(file, int(offset)) for offset in chunks["offset"][large].tolist()]
-    return by_start(np.concatenate([chunks[~large], *divided]))
+    divided = [chunks[~large]]
+    for chunk in chunks[large]:
+        try:
+            divided.append(_parts(file, int(chunk["offset"])))
+        except LogError as error:
+            if on_damage is None:
+                raise
+            on_damage(file.path, _left_out(chunk, error))
+    return by_start(np.concatenate(divided))
 
 
 def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
@@ -288,24 +363,27 @@ def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_
     return repeated
 
 
-def read_definitions(file: LogFile) -> None:
+def read_definitions(file: LogFile, on_damage: OnDamage | None = None) -> None:
     """Add to a log the schemas and channels that only its chunks define.
 
     Parameters
     ----------
     file : LogFile
         Its `schemas` and `channels` are added to.
+    on_damage : callable, optional
+        Told each chunk that cannot be read and is passed over; by default the error is raised.
 
     Raises
     ------
     LogError
         If the log cannot be read, or one of these chunks is damaged.
     """
-    chunks = not_empty(file.chunks)
+    chunks = not_empty(file.chunks[file.chunks["index_length"] >= 0])  # a run defines nothing
     for number, channels in enumerate(chunks["channels"].tolist()):
         identities = file.channel_sets[channels]
         if not identities or not identities <= file.channels.keys():
-            read_chunks(file, chunks[number : number + 1], topics=())
+            for _ in read_in_batches(file, chunks[number : number + 1], (), on_damage):
+                pass
 
 
 def _other_channels(file: LogFile, topics: TopicChoice | None) -> list[int]:
@@ -395,10 +473,8 @@ def _add_definitions(
     """Add the schemas and channels to a file that are at some places of a chunk."""
     for start, end in places:
         record = file.parse(content[start], bytes(content[start + HEAD.size : end]))
-        if isinstance(record, records.Schema):
-            file.schemas.setdefault(record.id, record)
-        elif isinstance(record, records.Channel):
-            file.channels.setdefault(record.id, record)
+        if isinstance(record, records.Schema | records.Channel):
+            file.define(record)
 
 
 def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.void]]:
@@ -409,6 +485,8 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
             starts.append(start)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             _add_definitions(file, content, [(start, end)])
+        elif opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE:
+            raise McapError("the records of a chunk are damaged")
     made = index_messages(content, np.frombuffer(starts, np.int64))
     return {channel: np.frombuffer(rows, formats.INDEX_ENTRIES) for channel, rows in made.items()}
 
@@ -426,7 +504,7 @@ def _define(file: LogFile, identities: AbstractSet[int]) -> None:
             damage = damage or error
         if identities <= file.channels.keys():
             return
-    if damage is not None:
+    if damage is not None and not file.partial:
         raise damage
 
 
@@ -515,7 +593,7 @@ class _Batch(NamedTuple):
         content = self.buffer[end - int(self.sizes[number]) : end].data
         try:
             return _index_records(self.file, content)
-        except (McapError, UnicodeDecodeError) as error:
+        except McapError as error:
             raise self.file.damaged(int(self.chunks["offset"][number]), error) from error
 
     def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:

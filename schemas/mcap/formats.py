@@ -65,7 +65,9 @@ _OTHERS = {  # formats that are taken for MCAP, by how they begin, and what make
     b"SQLite format 3\0": "is a bag in SQLite, no MCAP: `ros2 bag convert` makes MCAP of it",
     b"#ROSBAG": "is a bag of ROS 1, no MCAP: `rosbags-convert` makes a bag of ROS 2 of it",
 }
-OTHER_SUFFIXES = (*(".zst", ".zstd", ".lz4", ".gz", ".bz2", ".xz"), ".db3", ".bag")
+_COMPRESSED = (".zst", ".zstd", ".lz4", ".gz", ".bz2", ".xz")
+COMPRESSED_SUFFIXES = tuple(f".mcap{suffix}" for suffix in _COMPRESSED)
+OTHER_SUFFIXES = (*_COMPRESSED, ".db3", ".bag")
 
 
 def not_mcap(start: bytes) -> str:

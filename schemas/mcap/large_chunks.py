@@ -27,6 +27,17 @@ class TooLargeError(McapError):
     """A chunk claims more than is worth the time."""
 
 
+def most_content(length: Any) -> Any:
+    """Return how large the content of a chunk may be that is opened.
+
+    Parameters
+    ----------
+    length : int or np.ndarray
+        Bytes of the chunk's record.
+    """
+    return _CLAIMED + _RATIO * length
+
+
 class ContentStream:
     """The records of a chunk, decompressed piece by piece.
 
@@ -58,8 +69,10 @@ class ContentStream:
         stored = self.head.data.stop - self.head.data.start
         if HEAD.unpack_from(begin)[0] != Opcode.CHUNK:
             raise McapError("here should be a chunk")
-        if self.head.size > _CLAIMED + _RATIO * stored:
-            raise TooLargeError("a chunk is larger than hearthlog reads")
+        most = most_content(HEAD.size + self.head.data.stop)
+        if self.head.size > most:
+            what = f"a chunk of {self.head.size >> 20:,} MiB is larger than hearthlog reads"
+            raise TooLargeError(f"{what} ({most >> 20:,} MiB of so few bytes)")
         self._crc = 0
         source = _Stored(read, offset + HEAD.size + self.head.data.start, stored)
         self._stream = _decompressing(self.head.compression, io.BufferedReader(source, _PIECE))
@@ -133,6 +146,34 @@ def _decompressing(compression: bytes, source: io.BufferedReader) -> Any:
     if compression:
         raise McapError(f"a chunk has unknown compression {compression!r}")
     return source
+
+
+def stated_size(compression: bytes, data: bytes) -> int | None:
+    """Return how large compressed data claim to be, by their first bytes; None if they do not.
+
+    Parameters
+    ----------
+    compression : bytes
+        `zstd`, `lz4`, or empty.
+    data : bytes
+        The first 32 bytes of the data, or more.
+
+    Raises
+    ------
+    McapError
+        If no such data begin there.
+    """
+    try:
+        if compression == b"zstd":
+            size = zstandard.frame_content_size(data)
+            return None if size < 0 else size
+        if compression == b"lz4":
+            import lz4.frame  # noqa: PLC0415  only others write such files
+
+            return int(lz4.frame.get_frame_info(data)["content_size"]) or None
+    except (zstandard.ZstdError, RuntimeError) as error:
+        raise McapError(f"a chunk cannot be decompressed ({error})") from error
+    return None
 
 
 class Part(NamedTuple):

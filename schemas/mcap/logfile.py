@@ -7,6 +7,7 @@ import zlib
 from array import array
 from collections import Counter
 from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -18,6 +19,7 @@ from mcap.records import McapRecord
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
 from hearthlog.schemas.mcap.chunk_table import (
     CHUNKS,
     LAST_TIME,
@@ -25,6 +27,7 @@ from hearthlog.schemas.mcap.chunk_table import (
     ChunkRow,
     RecordLocation,
     by_start,
+    not_empty,
     read_chunk_index,
     read_chunk_row,
 )
@@ -40,14 +43,43 @@ from hearthlog.schemas.mcap.formats import (
 )
 from hearthlog.schemas.mcap.large_chunks import ContentStream
 from hearthlog.schemas.mcap.record_walk import read_records, walk_records
-from hearthlog.schemas.mcap.records import LIMIT, TOO_LARGE, parse, read_footer
+from hearthlog.schemas.mcap.records import (
+    LIMIT,
+    TOO_LARGE,
+    begun_chunk_head,
+    parse_escaped,
+    read_footer,
+)
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
-_NO_UTF8 = "U+FFFD stands for what is not UTF-8 in names of topics, types or records"
+_NO_UTF8 = "bytes that are not UTF-8 stand as \\xNN in names of topics, types or records"
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
+RECOVER = "; `hearthlog recover` saves the rest"
 _CHANNEL_END = HEAD.size + UINT16.size
+_PLACES = 1000  # where a damaged record is followed by a chunk, at most
+_LENGTH = "a record has another length than it claims"
+_SEARCHED = 1 << 20  # bytes that are searched at once
 _ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
+
+
+@dataclass
+class _Lost:
+    """What is left out of a file because its records are damaged."""
+
+    first: int = 0  # byte of the file
+    why: str = ""
+    places: int = 0
+    size: int = 0  # bytes
+    _end: int = -1  # of the last place
+
+    def add(self, start: int, end: int, why: str) -> None:
+        """Add some bytes; those that follow the last ones are of one place with them."""
+        if not self.places:
+            self.first, self.why = start, why
+        self.places += start != self._end
+        self.size += end - start
+        self._end = end
 
 
 class LogFile:
@@ -60,6 +92,9 @@ class LogFile:
         finished since its name was found is opened by its final name.
     indexed : bool
         Whether to look for the chunks at once; without that, `scan_new` finds them.
+    partial : bool
+        Whether damaged records are left out, with a warning that counts their bytes; by default
+        they are an error.
 
     Attributes
     ----------
@@ -90,8 +125,9 @@ class LogFile:
         If it cannot be read, is not an MCAP file, or is damaged.
     """
 
-    def __init__(self, path: Path, *, indexed: bool = True) -> None:
+    def __init__(self, path: Path, *, indexed: bool = True, partial: bool = False) -> None:
         self.path, self._file = open_log(path)
+        self.partial = partial
         self.complete = False
         self.ended = False
         self.late = False
@@ -104,6 +140,9 @@ class LogFile:
         self.chunks = np.empty(0, CHUNKS)
         self._end = len(MAGIC)  # of the records that were scanned
         self._sets: dict[frozenset[int], int] = {}
+        self._lost = _Lost()
+        self.undefined: set[int] = set()  # channels that no chunk defines
+        self.doubtful: set[int] = set()  # channels that are defined in two ways
         self.streams: list[ContentStream] = []  # of large chunks that are being read
         self.again: Counter[int] = Counter()  # bytes decompressed once more, by large chunk
         self.lock = threading.Lock()  # of both
@@ -226,11 +265,10 @@ class LogFile:
         McapError
             If it is too short for what it claims to hold.
         """
-        try:
-            return parse(opcode, content)
-        except UnicodeDecodeError:
+        record, escaped = parse_escaped(opcode, content)
+        if escaped:
             warnings.warn(HearthlogWarning(_NO_UTF8, self.path, each=True), stacklevel=2)
-            return parse(opcode, content, lenient=True)
+        return record
 
     def with_channels(
         self, chunks: NDArray[np.void], channels: AbstractSet[int]
@@ -267,9 +305,7 @@ class LogFile:
         LogError
             For the caller to raise.
         """
-        return LogError(
-            f"{self.path}: damaged at byte {offset} ({what}); `hearthlog recover` saves the rest"
-        )
+        return LogError(f"{self.path}: damaged at byte {offset} ({what}){RECOVER}")
 
     def _check_magic(self) -> None:
         start = self.read(0, 2 * len(MAGIC))
@@ -283,7 +319,62 @@ class LogFile:
         footer = read_footer(self.read(max(end, 0), FOOTER_SIZE))
         self.complete = footer is not None
         if footer is None or footer.summary_start in {0, end} or not self._has_index(footer, end):
-            self.scan_new()
+            if self.partial:
+                self._scan(self.size)
+            else:
+                self.scan_new()
+        self._warn_of_lost()
+
+    def _scan(self, size: int) -> None:
+        """Walk through all records; where one is damaged, go on with the next chunk."""
+        rows = array("q")
+        row = self._walk(rows, self._end, size)
+        for _ in range(_PLACES):
+            place = None if self.ended else self._next_chunk(self._end + 1, size)
+            if place is None:
+                break
+            self._lost.add(self._end, place, _LENGTH)
+            self._end = place
+            self._add_row(rows, row)
+            row = self._walk(rows, self._end, size)
+        if self.complete and not self.ended:
+            self._lost.add(self._end, size, _LENGTH)
+        self._add_last_row(rows, row)
+        self._add_chunks(rows)
+
+    def _next_chunk(self, start: int, size: int) -> int | None:
+        """Search for a compressed chunk that fits into the file, and that a record follows."""
+        while start < size:
+            window = self.read(start, min(_SEARCHED + CHUNK_HEAD_LIMIT, size - start))
+            for place in find_chunk_heads(window):
+                if place < _SEARCHED and self._is_chunk(start + place, window[place:], size):
+                    return start + place
+            start += _SEARCHED
+        return None
+
+    def _is_chunk(self, offset: int, head: bytes, size: int) -> bool:
+        """Return whether a chunk whose lengths agree begins at a byte."""
+        opcode, length = HEAD.unpack_from(head)
+        try:
+            stop = begun_chunk_head(head[HEAD.size : CHUNK_HEAD_LIMIT]).data.stop
+        except McapError:
+            return False
+        end = offset + HEAD.size + length
+        if opcode != Opcode.CHUNK or stop != length or end > size:
+            return False
+        following = self.read(end, 1)
+        return not following or 0 < following[0] <= Opcode.DATA_END
+
+    def _warn_of_lost(self) -> None:
+        """Say in one line what of the file is left out, because its records are damaged."""
+        lost = self._lost
+        if lost.places and not self.partial:
+            raise self.damaged(lost.first, lost.why)
+        if lost.places:
+            more = f" and in {lost.places - 1:,} more places" if lost.places > 1 else ""
+            text = f"damaged at byte {lost.first} ({lost.why}){more}: {lost.size:,} bytes left out"
+            text += RECOVER
+            warnings.warn(HearthlogWarning(text, self.path, each=True), stacklevel=2)
 
     def _has_index(self, footer: records.Footer, end: int) -> bool:
         """Read the summary, and return whether it has an index; warn if it is damaged."""
@@ -294,11 +385,11 @@ class LogFile:
         if not len(self.chunks) and (self.statistics is None or self.statistics.message_count):
             self._forget()
             return False
-        if not self._lists_all_messages():
+        if not self.lists_all_messages():
             self._walk_between(footer.summary_start)
         return True
 
-    def _lists_all_messages(self) -> bool:
+    def lists_all_messages(self) -> bool:
         """Return whether the message indexes of all chunks have as many entries as are counted."""
         if self.statistics is None:
             return False
@@ -320,7 +411,8 @@ class LogFile:
         behind = np.concatenate([[len(MAGIC)], np.maximum.accumulate(ends[order])[:-1]])
         rows = array("q")
         for gap in np.flatnonzero(behind < starts[order]).tolist():
-            self._add_row(rows, self._walk(rows, int(behind[gap]), int(starts[order[gap]])))
+            first, last = int(behind[gap]), int(starts[order[gap]])
+            self._add_row(rows, self._walk(rows, first, last))
         self._add_chunks(rows)
 
     def _read_summary(self, footer: records.Footer, end: int) -> bool:
@@ -339,14 +431,29 @@ class LogFile:
                 else:
                     self._add(self.parse(location.opcode, content))
             crc = zlib.crc32(self.read(end, HEAD.size + FOOTER.size), crc)
-        except (McapError, UnicodeDecodeError, struct.error):
+        except (McapError, struct.error):
             return False
         if footer.summary_crc not in {0, crc}:
             return False
         opcode, length = HEAD.unpack(self.read(len(MAGIC), HEAD.size))
-        self._note(RecordLocation(opcode, len(MAGIC), HEAD.size + length))
+        if opcode == Opcode.HEADER:
+            self._note(RecordLocation(opcode, len(MAGIC), HEAD.size + length))
         self.chunks = by_start(np.frombuffer(rows, CHUNKS))
-        return True
+        return self._is_consistent()
+
+    def _is_consistent(self) -> bool:
+        """Return whether no chunk is listed twice, or out of the time that the statistics state."""
+        places = self.chunks[["offset", "length"]][np.argsort(self.chunks["offset"])]
+        ends = places["offset"] + places["length"]
+        if (ends[:-1] > places["offset"][1:]).any():
+            return False
+        if self.statistics is None or not len(self.chunks) or not self.statistics.message_count:
+            return True
+        first, last = self.statistics.message_start_time, self.statistics.message_end_time
+        chunks = not_empty(self.chunks)
+        return bool(
+            (chunks["start"] >= min(first, LAST_TIME)).all() and (chunks["end"] <= last).all()
+        )
 
     def scan_new(self) -> NDArray[np.void]:
         """Walk through the records that were written since the last scan.
@@ -364,13 +471,20 @@ class LogFile:
         """
         rows = array("q")
         row = self._walk(rows, self._end, self.size)
+        if self._lost.places:
+            lost, self._lost = self._lost, _Lost()
+            raise self.damaged(lost.first, lost.why)
         if self.complete and not self.ended:
-            raise self.damaged(self._end, "a record claims to be longer than the file")
-        if row is not None:  # its indexes may not all be there yet
+            raise self.damaged(self._end, _LENGTH)
+        self._add_last_row(rows, row)
+        return self._add_chunks(rows)
+
+    def _add_last_row(self, rows: "array[int]", row: ChunkRow | None) -> None:
+        """Add the last row that was met; its indexes may not all be there yet."""
+        if row is not None:
             row.index_length = min(row.index_length, 0)
             row.channels.clear()
         self._add_row(rows, row)
-        return self._add_chunks(rows)
 
     def _walk(self, rows: "array[int]", start: int, end: int) -> ChunkRow | None:
         """Walk from record to record up to a byte; return the last row, which may not be whole.
@@ -391,7 +505,8 @@ class LogFile:
             location = RecordLocation(opcode, offset, length)
             chunk = self._chunk_row(location, head)
             if opcode == Opcode.MESSAGE and row is not None and row.continues(location):
-                assert chunk is not None
+                if chunk is None:
+                    continue
                 row.extend(chunk)
                 continue
             self._add_row(rows, row)
@@ -432,7 +547,15 @@ class LogFile:
         if location.opcode in {Opcode.METADATA, Opcode.ATTACHMENT}:
             self.record_locations.append(location)
         elif location.opcode in {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL}:
-            self._add(self.record(location))
+            end = location.offset + location.length
+            if location.length > LIMIT:
+                self._lost.add(location.offset, end, TOO_LARGE)
+                return
+            try:
+                content = self.read(location.offset, location.length)[HEAD.size :]
+                self._add(self.parse(location.opcode, content))
+            except McapError as error:
+                self._lost.add(location.offset, end, str(error))
 
     def _chunk_row(self, location: RecordLocation, head: bytes) -> ChunkRow | None:
         """Describe a chunk, or a message outside of one; None if the record is neither."""
@@ -441,7 +564,8 @@ class LogFile:
         try:
             return read_chunk_row(location, head)
         except McapError as error:
-            raise self.damaged(location.offset, error) from error
+            self._lost.add(location.offset, location.offset + location.length, str(error))
+            return None
 
     def channel_set(self, ids: frozenset[int]) -> int:
         """Return the place of a set of channels in `channel_sets`, where it is added if need be."""
@@ -453,10 +577,8 @@ class LogFile:
     def _add(self, record: McapRecord | None) -> None:
         if isinstance(record, records.Header):
             self.header = record
-        elif isinstance(record, records.Schema):
-            self.schemas.setdefault(record.id, record)
-        elif isinstance(record, records.Channel):
-            self.channels.setdefault(record.id, record)
+        elif isinstance(record, records.Schema | records.Channel):
+            self.define(record)
         elif isinstance(record, records.Statistics):
             self.statistics = record
         elif isinstance(record, records.AttachmentIndex | records.MetadataIndex):
@@ -464,9 +586,25 @@ class LogFile:
             opcode = Opcode.METADATA if is_metadata else Opcode.ATTACHMENT
             self.record_locations.append(RecordLocation(opcode, record.offset, record.length))
 
+    def define(self, record: records.Schema | records.Channel) -> None:
+        """Add a schema or a channel; one that contradicts an earlier one makes that doubtful."""
+        if isinstance(record, records.Schema):
+            if self.schemas.setdefault(record.id, record) != record:
+                self._doubt({n for n, c in self.channels.items() if c.schema_id == record.id})
+            return
+        first = self.channels.setdefault(record.id, record)
+        if first is not record and replace(first, metadata={}) != replace(record, metadata={}):
+            self._doubt({record.id})
+
+    def _doubt(self, channels: set[int]) -> None:
+        self.doubtful |= channels
+        text = "messages of channels that the file defines in two ways are left out"
+        warnings.warn(HearthlogWarning(text, self.path, each=True), stacklevel=2)
+
     def _forget(self) -> None:
         self.header = None
         self.late = False
+        self._lost = _Lost()
         self.chunks = np.empty(0, CHUNKS)
         self.schemas.clear()
         self.channels.clear()

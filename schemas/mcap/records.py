@@ -47,23 +47,24 @@ class _Content(ReadDataStream):
         return data
 
 
-class _LenientContent(_Content):
+class _EscapedContent(_Content):
     """The content of one record whose texts may not be UTF-8."""
 
     def read_prefixed_string(self) -> str:
-        return self.read(self.read4()).decode(errors="replace")
+        return self.read(self.read4()).decode(errors="backslashreplace")
 
 
-def parse(opcode: int, content: bytes, *, lenient: bool = False) -> McapRecord | None:
-    """Parse a record of a kind that holds no messages.
+def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord | None:
+    r"""Parse a record of a kind that holds no messages.
 
     Parameters
     ----------
     opcode : int
     content : bytes
         The record, without opcode and length.
-    lenient : bool
-        Put U+FFFD where a text is not UTF-8, and raise no error.
+    escaped : bool
+        Put `\xNN` in the place of bytes of a text that are not UTF-8, so that two names stay two,
+        and raise no error.
 
     Returns
     -------
@@ -78,8 +79,27 @@ def parse(opcode: int, content: bytes, *, lenient: bool = False) -> McapRecord |
         If a text in it is not UTF-8.
     """
     kind = _CLASSES.get(opcode)
-    stream = _LenientContent if lenient else _Content
+    stream = _EscapedContent if escaped else _Content
     return None if kind is None else kind.read(stream(BytesIO(content)))
+
+
+def parse_escaped(opcode: int, content: bytes) -> tuple[McapRecord | None, bool]:
+    """Parse a record as `parse` does; return whether a text in it had to be escaped, too.
+
+    Parameters
+    ----------
+    opcode, content
+        As of `parse`.
+
+    Raises
+    ------
+    McapError
+        If it is too short for what it claims to hold.
+    """
+    try:
+        return parse(opcode, content), False
+    except UnicodeDecodeError:
+        return parse(opcode, content, escaped=True), True
 
 
 def read_footer(tail: bytes) -> records.Footer | None:

@@ -22,13 +22,15 @@ from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile
 _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
 
 
-def time_span(path: Path) -> tuple[int, int] | None:
+def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
     """Find the first and the last log time of a log.
 
     Parameters
     ----------
     path : Path
         On this machine, or a `upath.UPath` of a store.
+    partial : bool
+        As of `LogFile`.
 
     Returns
     -------
@@ -43,7 +45,7 @@ def time_span(path: Path) -> tuple[int, int] | None:
     stated = stated_span(path)
     if stated is not None:
         return stated[0]
-    with LogFile(path) as log:
+    with LogFile(path, partial=partial) as log:
         return log.span
 
 

@@ -17,7 +17,7 @@ from hearthlog.schemas.messages.cdr_layout import (
     MessageArray,
     default_rows,
 )
-from hearthlog.schemas.messages.type_definitions import MessageType, message_type
+from hearthlog.schemas.messages.type_definitions import EndlessTextError, MessageType, message_type
 from hearthlog.schemas.messages.versions import APPENDED
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -313,9 +313,14 @@ def _by_layout(
         if not len(rest):
             return
     for _ in range(_TRIED):
-        found = _layout_of(kind, payloads, int(rest[0]), errors)
+        words: dict[int, bytes] = {}
+        found = _layout_of(kind, payloads, int(rest[0]), errors, words)
         if found is None:
-            rest = rest[1:]
+            assert errors is not None
+            error = errors[int(rest[0])]
+            alike = _alike(payloads[rest], words, error)
+            errors.update(dict.fromkeys(rest[alike].tolist(), error))
+            rest = rest[~alike]
         else:
             fitting = found.fits(payloads[rest].view(found.dtype))
             yield found, rest[fitting]
@@ -324,17 +329,34 @@ def _by_layout(
             return
     rows_of: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
     for row in rest.tolist():  # so many layouts that trying them one by one would take for ever
-        if (found := _layout_of(kind, payloads, row, errors)) is not None:
+        if (found := _layout_of(kind, payloads, row, errors, {})) is not None:
             rows_of.setdefault(tuple(found.fixed.items()), (found, []))[1].append(row)
     yield from ((layout, np.array(same)) for layout, same in rows_of.values())
 
 
+def _alike(
+    payloads: NDArray[np.void], words: Mapping[int, bytes], error: LogError
+) -> NDArray[np.bool_]:
+    """Find the payloads that have the fault of the first one, as what it depends on tells."""
+    alike = np.ones(len(payloads), bool)
+    raw = payloads.view(np.uint8).reshape(len(payloads), payloads.dtype.itemsize)
+    for place, word in words.items():
+        alike &= (raw[:, place : place + len(word)] == np.frombuffer(word, np.uint8)).all(axis=1)
+    if isinstance(error, EndlessTextError):
+        alike &= ~error.layout.fits(payloads.view(error.layout.dtype))
+    return alike
+
+
 def _layout_of(
-    kind: MessageType, payloads: NDArray[np.void], row: int, errors: dict[int, LogError] | None
+    kind: MessageType,
+    payloads: NDArray[np.void],
+    row: int,
+    errors: dict[int, LogError] | None,
+    words: dict[int, bytes],
 ) -> Layout | None:
     """Find the layout of one payload; None, and an error more, if it has none."""
     try:
-        return kind.layout_of(memoryview(payloads[row].tobytes()))
+        return kind.layout_of(memoryview(payloads[row].tobytes()), words)
     except LogError as error:
         if errors is None:
             raise

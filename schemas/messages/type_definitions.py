@@ -26,6 +26,7 @@ _MESSAGE_LIMIT = 100 << 20  # bytes
 _DEFINITION_LIMIT = 256 << 10  # bytes of text
 _LAYOUTS_KEPT = 256
 _TYPES_KEPT = 256
+_ESCAPED = re.compile(r"\\(?=x[0-9a-f]{2})")  # in a name that is not UTF-8
 _LINE_END = re.compile(r"\r+\n?")
 # Between the files of a type stand 80 signs; some writers have fewer or more, or blanks there.
 _SEPARATOR = re.compile(r"^[ \t]*={3,}[ \t]*$\n?", re.MULTILINE)
@@ -34,6 +35,20 @@ _FILE_NAME = re.compile(r"^[ \t]*(MSG|IDL):[ \t]*(\S+)[ \t]*$", re.MULTILINE)
 _IDL_FILE = re.compile(r"^={80}\nIDL: .*$", re.MULTILINE)
 _INCLUDE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
 _WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")  # which rosbags does not read either
+
+
+class EndlessTextError(LogError):
+    """A string in a message does not end where its length says.
+
+    Attributes
+    ----------
+    layout : Layout
+        What the message would have, if it did.
+    """
+
+    def __init__(self, text: str, layout: Layout) -> None:
+        super().__init__(text)
+        self.layout = layout
 
 
 class MessageType:
@@ -88,25 +103,31 @@ class MessageType:
         """
         return self._layouts.get(size, [])
 
-    def layout_of(self, payload: memoryview) -> Layout:
+    def layout_of(self, payload: memoryview, words: dict[int, bytes] | None = None) -> Layout:
         """Find the layout of an encoded message.
 
         Parameters
         ----------
         payload : memoryview
             CDR of either byte order.
+        words : dict of int to bytes, optional
+            Is filled with what the layout depends on, by place in the payload: a payload of the
+            same size that has the same there has the same layout, or the same fault, but for
+            the ends of strings.
 
         Raises
         ------
         LogError
             If the payload is not plain CDR, or not of this type.
         """
-        order = ORDERS.get(bytes(payload[:2]))
+        words = {} if words is None else words
+        words[0] = bytes(payload[:2])
+        order = ORDERS.get(words[0])
         if order is None or len(payload) < START:
             raise LogError(f"{self.name}: a message is not encoded as plain CDR")
 
         def length_at(path: str, offset: int) -> int:
-            word = payload[offset : offset + 4]
+            word = words[offset] = bytes(payload[offset : offset + 4])
             if len(word) < 4:
                 raise LogError(f"{self.name}: a message ends before its field {path}")
             return int.from_bytes(word, "little" if order == "<" else "big")
@@ -117,7 +138,7 @@ class MessageType:
             raise LogError(f"{self.name}: a message is longer than its type")
         layout = walk.layout(leaves, len(payload))
         if not layout.fits(np.frombuffer(payload, layout.dtype)).all():
-            raise LogError(f"{self.name}: a string in a message has no end")
+            raise EndlessTextError(f"{self.name}: a string in a message has no end", layout)
         if sum(map(len, self._layouts.values())) >= _LAYOUTS_KEPT:
             self._layouts.clear()
         self._layouts.setdefault(len(payload), []).append(layout)
@@ -172,7 +193,7 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         for key, fields in theirs.items()
         if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
     }
-    return MessageType(name if name in ours else normalize_msgtype(name), ours | theirs, growth)
+    return MessageType(name if name in ours else _usual_name(name), ours | theirs, growth)
 
 
 def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
@@ -203,7 +224,7 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
         raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
     if len(text) > _DEFINITION_LIMIT:
         raise LogError(f"the definition of {name} is too long")
-    name = normalize_msgtype(name)  # which is how its definition is named
+    name = _usual_name(name)  # which is how its definition is named
     if not text.strip():
         if name not in ours:
             raise LogError(f"the log does not define {name}")
@@ -214,6 +235,11 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
     except (TypesysError, RecursionError, ValueError, KeyError) as error:
         raise LogError(f"the definition of {name} cannot be read") from error
     return types
+
+
+def _usual_name(name: str) -> str:
+    """Write the name of a type as rosbags reads it, also one that is not UTF-8."""
+    return normalize_msgtype(_ESCAPED.sub("_", name))
 
 
 def _with_usual_lines(text: str) -> str:

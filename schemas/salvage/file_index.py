@@ -120,7 +120,7 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
         crc = zlib.crc32(tail[: HEAD.size + FOOTER.size], crc)
         if footer.summary_crc not in {0, crc}:
             continue
-        with suppress(McapError, UnicodeDecodeError, OverflowError):
+        with suppress(McapError, OverflowError):
             return _records_of_index(reader, start, end, moved=start != claimed)
     return None
 

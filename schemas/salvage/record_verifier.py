@@ -12,6 +12,7 @@ from contextlib import suppress
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.records import McapRecord
 from numpy.typing import NDArray
 
 from hearthlog.schemas.mcap.chunk_records import index_messages
@@ -28,14 +29,26 @@ from hearthlog.schemas.mcap.formats import (
     UINT32,
     UINT64,
 )
-from hearthlog.schemas.mcap.large_chunks import ContentStream, read_parts
-from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
+from hearthlog.schemas.mcap.large_chunks import (
+    ContentStream,
+    TooLargeError,
+    read_parts,
+    stated_size,
+)
+from hearthlog.schemas.mcap.records import (
+    LIMIT,
+    ChunkHead,
+    begun_chunk_head,
+    decompress,
+    parse_escaped,
+)
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
 from hearthlog.schemas.salvage.whole_records import (
     LargeAttachment,
     LargeChunk,
+    WholeAttachment,
     WholeChunk,
     WholeRecord,
 )
@@ -44,6 +57,7 @@ from hearthlog.schemas.storage.byte_ranges import LocalFile
 _VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # have lengths inside
 _LARGE = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT}  # may be larger than `LIMIT`
 _ATTACHMENT_HEAD = 1 << 16  # bytes in which names and times of a large attachment end
+_CHUNK_HEAD = 128  # bytes in which the head of a chunk ends, and that of its data
 _PIECE = 1 << 20  # bytes
 _UNKNOWN_CHAIN = 16  # records of unknown kinds in a row
 _LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format may add
@@ -212,8 +226,6 @@ class RecordVerifier:
         ------
         McapError
             If the record is not whole, or this is none.
-        UnicodeDecodeError
-            If a text in it is not UTF-8.
         """
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
@@ -224,17 +236,19 @@ class RecordVerifier:
             raise McapError("a record of unknown kind, or too short")
         if opcode == Opcode.MESSAGE:
             return self._message(offset, chained)
-        return self._framed(offset, opcode)
+        return self._framed(offset, opcode, strict=chained > 1)
 
-    def _framed(self, offset: int, opcode: int) -> WholeRecord:
-        """Read a record whose inner lengths tell where it ends."""
+    def _framed(self, offset: int, opcode: int, *, strict: bool) -> WholeRecord:
+        """Read a record whose inner lengths tell where it ends; a strict one in UTF-8 only."""
         outer, inner = self.ends(offset)
         end = outer if self._is_padded(inner, outer) else inner
         wrong = "" if end == outer else "the length of a record"
         if opcode == Opcode.ATTACHMENT and inner == outer and inner - offset > LIMIT:
             if outer > self.end or not self.plausible(outer):
                 raise McapError("a record claims to be longer than the file")
-            return WholeRecord(offset, outer, self._large_attachment(offset, outer))
+            large = self._large_attachment(offset, outer)
+            escaped = (large.index_record.name,) * large.escaped
+            return WholeRecord(offset, outer, large, escaped=escaped)
         if inner - offset > LARGEST[opcode]:
             raise McapError("a record claims to be too large")
         if inner > self.end:
@@ -246,9 +260,16 @@ class RecordVerifier:
         raw = self.read(offset, inner - offset)
         if inner != outer:
             raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
+        record: McapRecord | WholeAttachment | None
         if opcode == Opcode.ATTACHMENT:
-            return WholeRecord(offset, end, whole_records.read_attachment(raw), wrong)
-        return WholeRecord(offset, end, parse(opcode, raw[HEAD.size :]), wrong)
+            record, is_escaped = whole_records.read_attachment(raw)
+            name = record.index_record.name
+        else:
+            record, is_escaped = parse_escaped(opcode, raw[HEAD.size :])
+            name = whole_records.name_of(record)
+        if is_escaped and strict:
+            raise McapError("a text is not UTF-8")
+        return WholeRecord(offset, end, record, wrong, escaped=(name,) * is_escaped)
 
     def chunk(self, offset: int) -> WholeRecord:
         """Read a chunk whose content is proved, whatever its head says.
@@ -267,8 +288,6 @@ class RecordVerifier:
         ------
         McapError
             If no chunk begins here, or its content is not proved.
-        UnicodeDecodeError
-            If a text in it is not UTF-8.
         """
         name = HEAD.size + CHUNK.size  # where that of the compression begins
         head = self.read(offset, name + 4 + UINT64.size)
@@ -288,7 +307,7 @@ class RecordVerifier:
         if max(size, stored) > LIMIT:
             if not exact or outer > self.end:
                 raise McapError("the head of a chunk is damaged")
-            return WholeRecord(offset, outer, self._large_chunk(offset))
+            return WholeRecord(offset, outer, self._large_chunk(offset, outer))
         compression = head[name : first - UINT64.size]
         claim = ChunkHead(start, end, size, 0, compression, slice(None))
         # One of two lengths may be wrong. Decompressors overlook what follows their data, so the
@@ -309,18 +328,25 @@ class RecordVerifier:
         span = whole_records.span_of(entries)
         agrees = not entries or span == (start, end)
         wrong = "" if exact and agrees else "the head of a chunk"
-        definitions = whole_records.read_definitions(content, others)
+        definitions, escaped = whole_records.read_definitions(content, others)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
         stored_chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         whole = WholeChunk(stored_chunk, definitions, leading)
+        if escaped:
+            whole, content = whole_records.with_definitions(whole, content, others)
+            messages, _ = whole_records.split_content(content)
         if span[1] > LAST_TIME:
             whole = whole_records.without_late(whole, content, messages)
         behind = outer if padded else offset + first + number
-        return WholeRecord(offset, behind, whole, wrong, proved=bool(crc) or agrees)
+        proved = bool(crc) or agrees
+        return WholeRecord(offset, behind, whole, wrong, escaped=tuple(escaped), proved=proved)
 
-    def _large_chunk(self, offset: int) -> LargeChunk:
+    def _large_chunk(self, offset: int, end: int) -> LargeChunk:
         """Go through a chunk that is too large for the memory."""
-        stream = ContentStream(self.read, offset)
+        try:
+            stream = ContentStream(self.read, offset)
+        except TooLargeError as error:
+            return self._unopened_chunk(offset, end, str(error))
         entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         definitions: list[Definition] = []
         unread: Counter[int] = Counter()
@@ -339,7 +365,7 @@ class RecordVerifier:
             others = np.array([start for start, _ in part.others], np.int64)
             if not entries:
                 leading += int((others < starts[0]).sum()) if len(starts) else len(others)
-            definitions += whole_records.read_definitions(part.content, others)
+            definitions += whole_records.read_definitions(part.content, others)[0]
             for channel, rows in index_messages(part.content, starts).items():
                 moved = np.frombuffer(rows, INDEX_ENTRIES).copy()
                 moved["offset"] += part.first
@@ -350,6 +376,26 @@ class RecordVerifier:
         first = offset + HEAD.size
         data = first + head.data.start, first + head.data.stop
         return LargeChunk(stored, data, definitions, leading, unread)
+
+    def _unopened_chunk(self, offset: int, end: int, why: str) -> LargeChunk:
+        """Describe a chunk that is not opened, by its head and the indexes behind it."""
+        head = begun_chunk_head(self.read(offset + HEAD.size, _CHUNK_HEAD))
+        first = offset + HEAD.size
+        data = first + head.data.start, first + head.data.stop
+        stated = stated_size(head.compression, self.read(data[0], _CHUNK_HEAD))
+        if not head.compression:
+            stated = data[1] - data[0]
+        if stated not in {None, head.size} or max(head.start, head.end) > LAST_TIME:
+            raise McapError("the head of a chunk is damaged")
+        entries: dict[int, bytes] = {}
+        with suppress(McapError):
+            while True:
+                channel, rows, end = self.message_index(end)
+                entries[channel] = entries.get(channel, b"") + rows.tobytes()
+        span = head.start, head.end
+        stored = StoredChunk(head.compression, b"", head.size, head.crc, *span, entries)
+        counts = {channel: len(rows) // INDEX_ENTRIES.itemsize for channel, rows in entries.items()}
+        return LargeChunk(stored, data, [], 0, counts, why)
 
     def _large_message(self, offset: int, end: int) -> LargeChunk:
         """Make a chunk of a message outside of chunks that is too large to be read."""
@@ -362,11 +408,12 @@ class RecordVerifier:
 
     def _large_attachment(self, offset: int, end: int) -> LargeAttachment:
         """Check an attachment that is too large to be read."""
-        index = whole_records.index_attachment(self.read(offset, _ATTACHMENT_HEAD))
+        head = whole_records.attachment_head(self.read(offset, _ATTACHMENT_HEAD))
         (crc,) = UINT32.unpack(self.read(end - UINT32.size, UINT32.size))
         if crc not in {0, self._crc(offset + HEAD.size, end - UINT32.size)}:
             raise McapError("an attachment has another checksum than it claims")
-        return LargeAttachment(index, (offset, end))
+        inner = offset + head.first, offset + head.end
+        return LargeAttachment(head.index_record, (offset, end), inner, head.escaped)
 
     def _crc(self, start: int, end: int) -> int:
         """Return the checksum of some bytes of the file."""
@@ -377,7 +424,7 @@ class RecordVerifier:
 
     def _unknown(self, offset: int, opcode: int, length: int) -> WholeRecord:
         """Read a record of a kind that MCAP leaves to others, unless it was one of a known kind."""
-        with suppress(McapError, UnicodeDecodeError):
+        with suppress(McapError):
             return self.chunk(offset)
         end = offset + HEAD.size + length
         flipped = [kind for kind in _VARIABLE if (kind ^ opcode).bit_count() == 1]

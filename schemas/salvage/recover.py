@@ -13,6 +13,7 @@ from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.mcap.chunks import in_parts, read_in_batches
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import MAGIC, not_mcap
+from hearthlog.schemas.mcap.large_chunks import most_content
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.progress import Progress, ignore_progress
@@ -170,7 +171,8 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
         for location in file.record_locations:
             if location.length <= LIMIT:
                 file.record(location)
-        chunks = in_parts(file, file.chunks)
+        opened = file.chunks["size"] <= most_content(file.chunks["length"])
+        chunks = in_parts(file, file.chunks[opened])
         for batch in read_in_batches(file, chunks[chunks["size"] <= LIMIT]):
             for messages in batch:
                 counts[messages.channel.topic] += len(messages)

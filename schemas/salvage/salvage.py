@@ -90,6 +90,8 @@ class Salvage:
         Bytes of the file.
     offset : int
         Bytes that `pieces` has passed so far.
+    escaped : dict of str
+        Names that were met so far and are not UTF-8, or of what has other texts that are not.
 
     Raises
     ------
@@ -106,6 +108,7 @@ class Salvage:
         self._file = LocalFile(path)
         self.size = self._file.size
         self.offset = 0  # bytes that have been passed
+        self.escaped: dict[str, None] = {}
         self._reader = RecordVerifier(self._file, self.size)
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
@@ -175,6 +178,7 @@ class Salvage:
             if whole.corrected:
                 why = f"{whole.corrected} is wrong"
                 self._damages.add(Damage(offset, whole.end, why, exact=whole.proved))
+            self.escaped.update(dict.fromkeys(whole.escaped))
             self.offset = whole.end
             self._last_index = offset if whole.record is None else None
             self._compare_index(whole)
@@ -210,9 +214,9 @@ class Salvage:
             whole = reader.chunk(offset) if chunk else reader.whole(offset, 3 if searching else 1)
             self._count_kept(whole)
             self._doubt(whole, searching=searching)
-        except (McapError, UnicodeDecodeError) as error:
+        except McapError:
             self._cost = reader.work - work
-            raise McapError(str(error)) from error
+            raise
         return whole
 
     def _count_kept(self, whole: WholeRecord) -> None:
@@ -378,6 +382,12 @@ class Salvage:
         for record in chunk.definitions:
             if not self.definitions.add(record):
                 self.definitions.doubt(record)
+        if chunk.unopened:
+            why = f"{chunk.unopened}, and is copied unopened,"
+            self._damages.add(Damage(whole.offset, whole.end, why, sound=True))
+            known = {n: e for n, e in chunk.stored.entries.items() if self.definitions.defines(n)}
+            yield chunk._replace(stored=chunk.stored._replace(entries=known))
+            return
         late: Counter[int] = Counter()
         unknown = 0
         for number in chunk.stored.entries:

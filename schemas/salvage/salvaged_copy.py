@@ -27,6 +27,7 @@ from hearthlog.schemas.salvage.whole_records import (
     WholeAttachment,
     WholeChunk,
     chunk_messages,
+    encode_attachment,
 )
 
 
@@ -49,6 +50,7 @@ class Recovery:
     topics: dict[str, TopicRecovery]
     damages: list[Damage]
     complete: bool  # whether the log was finished, and its index is whole
+    escaped: Sequence[str] = ()  # names of what has texts that are not UTF-8
 
     @property
     def messages(self) -> int:
@@ -183,7 +185,8 @@ class SalvagedCopy:
                     topics[name].expected = count
         damages = self._salvage.damages()
         untraced = [] if self._salvage.unnamed else _untraced(topics, damages)
-        return Recovery(topics, [*damages, *untraced], self._salvage.complete)
+        escaped = list(self._salvage.escaped)
+        return Recovery(topics, [*damages, *untraced], self._salvage.complete, escaped)
 
     def _channel_types(self) -> Iterator[tuple[int, Channel, str]]:
         definitions = self._salvage.definitions
@@ -236,9 +239,11 @@ class SalvagedCopy:
             times = chunk.times(number)
             self._count(number, len(times), int(times.min()), int(times.max()))
 
-    def _record_of(self, piece: WholeAttachment | LargeAttachment) -> Iterable[bytes]:
+    def _record_of(self, piece: WholeAttachment | LargeAttachment) -> Iterable[bytes | memoryview]:
         if isinstance(piece, WholeAttachment):
             return [piece.record]
+        if piece.escaped:
+            return encode_attachment(piece.index_record, self._salvage.stored(*piece.inner))
         return self._salvage.stored(*piece.data)
 
     def _add_large(self, piece: LargeChunk) -> None:

@@ -3,7 +3,7 @@
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, INDEX_ENTRIES, MESSAGE, UINT32, UINT64
 from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import parse
+from hearthlog.schemas.mcap.records import encode, parse_escaped
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 
@@ -42,6 +42,7 @@ class LargeChunk(NamedTuple):
     definitions: list[Definition]
     leading: int  # how many of them stand before the first message
     unread: Mapping[int, int]  # by channel: messages that are themselves too large
+    unopened: str = ""  # why nothing of it was looked at
 
 
 class LargeAttachment(NamedTuple):
@@ -49,6 +50,8 @@ class LargeAttachment(NamedTuple):
 
     index_record: records.AttachmentIndex
     data: tuple[int, int]  # bytes of the file at which it begins, and before which it ends
+    inner: tuple[int, int]  # the same of what was attached
+    escaped: bool  # whether a text before that is not UTF-8
 
 
 class UnknownRecord(NamedTuple):
@@ -72,6 +75,7 @@ class WholeRecord(NamedTuple):
     end: int
     record: "McapRecord | Whole | None"  # None for a message index
     corrected: str = ""  # what of its head was wrong
+    escaped: tuple[str, ...] = ()  # names of what had texts that are not UTF-8
     proved: bool = True  # False: without a checksum, what is in it may be wrong instead
 
 
@@ -133,13 +137,37 @@ def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChu
         parts.append(content[place:start])
         place = start + HEAD.size + HEAD.unpack_from(content, start)[1]
     content = b"".join([*parts, content[place:]])
-    entries = index_messages(content, split_content(content)[0])
-    stored = compress_chunk(memoryview(content), span_of(entries), entries)._replace(raw=None)
+    stored = _stored(content)
     counts = {channel: len(rows) // INDEX_ENTRIES.itemsize for channel, rows in late.items()}
     return chunk._replace(stored=stored, late=counts)
 
 
-def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
+def with_definitions(chunk: WholeChunk, content: bytes, starts: Int64) -> tuple[WholeChunk, bytes]:
+    """Write the definitions of a chunk into it anew; return its content, too.
+
+    Parameters
+    ----------
+    chunk : WholeChunk
+    content : bytes
+        Its records, uncompressed.
+    starts : np.ndarray [shape=(d,)], int64
+        Bytes of the content at which its definitions begin, with their opcodes.
+    """
+    parts, place = [], 0
+    for start, record in zip(starts.tolist(), chunk.definitions, strict=True):
+        parts += [content[place:start], encode(record)]
+        place = start + HEAD.size + HEAD.unpack_from(content, start)[1]
+    content = b"".join([*parts, content[place:]])
+    return chunk._replace(stored=_stored(content)), content
+
+
+def _stored(content: bytes) -> StoredChunk:
+    """Compress the records of a chunk that were written anew."""
+    entries = index_messages(content, split_content(content)[0])
+    return compress_chunk(memoryview(content), span_of(entries), entries)._replace(raw=None)
+
+
+def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], list[str]]:
     """Read the schemas and channels of a chunk.
 
     Parameters
@@ -151,25 +179,37 @@ def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
 
     Returns
     -------
-    list of mcap.records.Schema and mcap.records.Channel
+    definitions : list of mcap.records.Schema and mcap.records.Channel
         In the order of `starts`.
+    escaped : list of str
+        Names of those with texts that are not UTF-8.
 
     Raises
     ------
     McapError
         If one is damaged, or there are more than 524288.
-    UnicodeDecodeError
-        If a text in it is not UTF-8.
     """
     if len(starts) > _DEFINITIONS_LIMIT:
         raise McapError("a chunk holds more definitions than can be kept")
     definitions: list[Definition] = []
+    names: list[str] = []
     for start in starts.tolist():
         opcode, length = HEAD.unpack_from(content, start)
-        record = parse(opcode, content[start + HEAD.size : start + HEAD.size + length])
+        raw = content[start + HEAD.size : start + HEAD.size + length]
+        record, escaped = parse_escaped(opcode, raw)
         assert isinstance(record, Definition)
         definitions.append(record)
-    return definitions
+        names += [name_of(record)] * escaped
+    return definitions, names
+
+
+def name_of(record: McapRecord | None) -> str:
+    """Name a record by its topic, its type or its own name."""
+    if isinstance(record, records.Channel):
+        return record.topic
+    if isinstance(record, records.Header):
+        return record.profile
+    return str(getattr(record, "name", ""))
 
 
 def span_of(entries: Mapping[int, bytes | bytearray]) -> tuple[int, int]:
@@ -222,35 +262,44 @@ def read_message(raw: bytes) -> records.Message:
     return records.Message(channel, log_time, raw[MESSAGE.size :], publish_time, sequence)
 
 
-def read_attachment(raw: bytes) -> WholeAttachment:
-    """Read an attachment from its record.
+class AttachmentHead(NamedTuple):
+    """What stands before the data of an attachment."""
+
+    index_record: records.AttachmentIndex  # its offset and length are 0
+    first: int  # byte of the record at which the data begin
+    escaped: bool  # whether a text in it is not UTF-8
+
+    @property
+    def end(self) -> int:
+        """Byte of the record before which the data end."""
+        return self.first + self.index_record.data_size
+
+
+def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
+    """Read an attachment from its record; return whether a text in it is not UTF-8, too.
 
     Parameters
     ----------
     raw : bytes
         The whole record, with opcode and length; the lengths inside of it add up to that.
 
-    Returns
-    -------
-    WholeAttachment
-        With an index record whose offset and length are 0.
-
     Raises
     ------
     McapError
         If its checksum is wrong.
-    UnicodeDecodeError
-        If a text in it is not UTF-8.
     """
     record = memoryview(raw)
     (crc,) = UINT32.unpack(record[-UINT32.size :])
     if crc not in {0, zlib.crc32(record[HEAD.size : -UINT32.size])}:
         raise McapError("an attachment has another checksum than it claims")
-    return WholeAttachment(raw, index_attachment(raw))
+    head = attachment_head(raw)
+    if head.escaped:
+        raw = b"".join(encode_attachment(head.index_record, [record[head.first : head.end]]))
+    return WholeAttachment(raw, head.index_record), head.escaped
 
 
-def index_attachment(raw: bytes) -> records.AttachmentIndex:
-    """Make the index record of an attachment, with an offset and a length of 0.
+def attachment_head(raw: bytes) -> AttachmentHead:
+    """Read what stands before the data of an attachment.
 
     Parameters
     ----------
@@ -261,16 +310,42 @@ def index_attachment(raw: bytes) -> records.AttachmentIndex:
     ------
     McapError
         If the record ends before that.
-    UnicodeDecodeError
-        If a text in it is not UTF-8.
     """
     record = memoryview(raw)
     try:
-        log_time, create_time, name = ATTACHMENT.unpack_from(record, HEAD.size)
-        first = HEAD.size + ATTACHMENT.size + name
-        (media,) = UINT32.unpack_from(record, first)
-        (size,) = UINT64.unpack_from(record, first + 4 + media)
+        log_time, create_time, length = ATTACHMENT.unpack_from(record, HEAD.size)
+        first = HEAD.size + ATTACHMENT.size + length
+        name = bytes(record[first - length : first])
+        (length,) = UINT32.unpack_from(record, first)
+        media = bytes(record[first + UINT32.size :][:length])
+        first += UINT32.size + length
+        (size,) = UINT64.unpack_from(record, first)
     except struct.error as error:
         raise McapError("an attachment is damaged") from error
-    texts = str(record[first - name : first], "utf-8"), str(record[first + 4 :][:media], "utf-8")
-    return records.AttachmentIndex(0, 0, log_time, create_time, size, *texts)
+    texts = [text.decode(errors="backslashreplace") for text in (name, media)]
+    index = records.AttachmentIndex(0, 0, log_time, create_time, size, *texts)
+    escaped = [text.encode() for text in texts] != [name, media]
+    return AttachmentHead(index, first + UINT64.size, escaped)
+
+
+def encode_attachment(
+    index: records.AttachmentIndex, data: Iterable[bytes | memoryview]
+) -> Iterator[bytes | memoryview]:
+    """Encode an attachment of any size, in pieces.
+
+    Parameters
+    ----------
+    index : mcap.records.AttachmentIndex
+        Its times, names and size.
+    data : iterable of bytes-like
+        Pieces of its data.
+    """
+    name, media = index.name.encode(), index.media_type.encode()
+    start = ATTACHMENT.pack(index.log_time, index.create_time, len(name)) + name
+    start += UINT32.pack(len(media)) + media + UINT64.pack(index.data_size)
+    yield HEAD.pack(Opcode.ATTACHMENT, len(start) + index.data_size + UINT32.size) + start
+    crc = zlib.crc32(start)
+    for piece in data:
+        crc = zlib.crc32(piece, crc)
+        yield piece
+    yield UINT32.pack(crc)

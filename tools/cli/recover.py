@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.text import abridged, shortened
 from hearthlog.tools.cli.options import Json
 from hearthlog.tools.cli.text import tell, wrong_use
 
@@ -81,6 +82,9 @@ def _say(log: Path, recovery: "Recovery") -> None:
     of = f" of {sum(expected)}" if expected else ""
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
     tell(f"{log}: {recovery.messages}{of} messages saved{end}")
+    if recovery.escaped:
+        what = "bytes that are not UTF-8 are written as \\xNN in the names or metadata of"
+        tell(f"{log}: {what} {abridged([shortened(n, 60) for n in recovery.escaped], 5)}")
     for text in dict.fromkeys([*map(str, recovery.damages), *recovery.losses]):
         tell(f"{log}: {text}")
 

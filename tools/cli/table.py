@@ -9,6 +9,7 @@ from hearthlog.schemas.text import printable, shortened
 NAME_WIDTH = 18  # of a class in a table of figures
 _PLAIN_WIDTH = 160
 _GAP = 2
+_MANY = 1000  # rows, of which Rich would make a table for minutes
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
@@ -30,6 +31,9 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     cells = [[printable(cell) for cell in row] for row in rows]
     if not cells:
         return
+    if len(cells) > _MANY:
+        _print_plainly([list(head)] * bool(head) + cells, words)
+        return
     table = Table(box=None, pad_edge=False, show_header=bool(head))
     for place in range(len(cells[0])):
         least = max(len(row[place]) for row in cells) if place >= words else None
@@ -45,6 +49,16 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     with console.capture() as text:
         console.print(table)
     print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
+
+
+def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
+    """Print rows of text in columns as wide as they need."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row[:words], widths, strict=False)]
+        figures = zip(row[words:], widths[words:], strict=True)
+        cells += [cell.rjust(width) for cell, width in figures]
+        print((" " * _GAP).join(cells).rstrip())
 
 
 def print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:

@@ -27,7 +27,7 @@ from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
 from hearthlog.analyzer.logs.layers import with_layers
-from hearthlog.analyzer.logs.selection import Selection, select
+from hearthlog.analyzer.logs.selection import Damages, Selection, select
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.schemas.errors import HearthlogWarning, LogError
@@ -121,7 +121,10 @@ class Logs:
         ((3600, 33), dtype('float32'))
         """
         selection = self._select(topic)
-        columns = read_columns(selection.logs, [topic], self.start, self.end, fields)
+        damages = Damages()
+        span = self.start, self.end
+        columns = read_columns(selection.logs, [topic], *span, fields, on_damage=damages.add)
+        damages.warn_of_more()
         return columns[topic] if columns else join(decode(selection.no_messages(), fields))
 
     def arrow(self, topic: str) -> "pa.Table":
