@@ -38,7 +38,10 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
     token.write_text("a-token-of-the-figures\n")
     with listen() as other:
         port = other.getsockname()[1]
-        tables = {"prometheus": {"port": port, "token_file": token}, "ping": {"url": "http://127.0.0.1:9"}}
+        tables = {
+            "prometheus": {"port": port, "token_file": token},
+            "ping": {"url": "http://127.0.0.1:9"},
+        }
         opened, _ = open_outputs(
             BridgeSettings.model_validate(tables), home, tmp_path, Saying(said.append)
         )

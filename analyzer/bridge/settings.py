@@ -130,7 +130,8 @@ class PrometheusSettings(_Table):
         examples=["/var/lib/node_exporter/hearthlog.prom"],
         description="For the textfile collector of node_exporter; ends in .prom.",
     )
-    port: _Port | None = Field(default=None, description="On loopback, with a `token_file`; none: no port."
+    port: _Port | None = Field(
+        default=None, description="On loopback, with a `token_file`; none: no port."
     )
     token_file: SecretFile | None = Field(
         default=None,
