@@ -259,6 +259,13 @@ def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
     assert again.stderr.startswith(f"hearthlog: {folder}: exists already")
 
 
+def test_a_demo_that_could_not_be_looked_at_is_refused_before_it_is_composed(hearthlog, tmp_path):
+    environment = dict.fromkeys(("DISPLAY", "WAYLAND_DISPLAY"), "")
+    result = hearthlog("demo", "--output", tmp_path / "demo", "--open", env=environment)
+    assert (result.returncode, (tmp_path / "demo").exists()) == (1, False)
+    assert "no display here: leave --open out" in result.stderr
+
+
 def as_another_account(*command):
     """Run a command as somebody whom permissions bind, even where these tests are run by root."""
     bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if not os.geteuid() else []
