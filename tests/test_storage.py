@@ -430,3 +430,24 @@ def test_what_root_writes_belongs_to_whom_the_folder_belongs_to(tmp_path):
     owners = {path.stat().st_uid for path in tmp_path.iterdir()}
     assert owners == {12345}
     os.chown(tmp_path, 0, 0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone gives files away")
+def test_what_root_writes_is_given_to_nobody_who_swaps_the_folder_meanwhile(tmp_path, monkeypatch):
+    ours, theirs, folder = (tmp_path / name for name in ("ours", "theirs", "folder"))
+    for each in (ours, theirs):
+        each.mkdir()
+    os.chown(theirs, 12345, 12345)
+    folder.symlink_to(ours)
+    change_rights = os.fchmod
+
+    def swap(descriptor, mode):
+        folder.unlink()
+        folder.symlink_to(theirs)
+        change_rights(descriptor, mode)
+
+    monkeypatch.setattr(os, "fchmod", swap)
+    with suppress(LogError), new_file(folder / "judgement") as temporary:
+        temporary.write_text("1")
+    assert {path.stat().st_uid for path in ours.iterdir()} <= {0}
+    assert list(ours.iterdir()) != []

@@ -20,6 +20,7 @@ from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 
 _AT_ONCE = 8  # files that are synced: one after the other takes a disk milliseconds for each
 _READERS = stat.S_IRGRP | stat.S_IROTH
+_LOOKUP: int = getattr(os, "O_PATH", os.O_RDONLY)  # wants no right to read a folder
 
 
 def sync_file(path: Path) -> None:
@@ -70,11 +71,19 @@ def private_folder(path: Path, *, readers: int = 0) -> None:
 
 def _give(path: Path, mode: int) -> None:
     """Set the rights of what was made, which root gives to whom the folder around it belongs to."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    # The folder is opened once: another one may get its name while this runs.
+    folder = os.open(path.parent, _LOOKUP | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        descriptor = os.open(
+            path.name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder
+        )
+    except BaseException:
+        os.close(folder)
+        raise
     try:
         with suppress(OSError):  # a disk without rights
             os.fchmod(descriptor, mode)
-        around, made = path.parent.stat(), os.fstat(descriptor)
+        around, made = os.fstat(folder), os.fstat(descriptor)
         # A file with another name could be one that somebody linked here to be given it.
         is_ours = stat.S_ISDIR(made.st_mode) or made.st_nlink == 1
         if os.geteuid() == 0 and around.st_uid != 0 and made.st_uid == 0 and is_ours:
@@ -82,6 +91,7 @@ def _give(path: Path, mode: int) -> None:
                 os.fchown(descriptor, around.st_uid, around.st_gid)
     finally:
         os.close(descriptor)
+        os.close(folder)
 
 
 @contextmanager

@@ -265,24 +265,29 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     keys: SimpleQueue[str] = SimpleQueue()
     viewer.offer(session.keys, keys.put)
     viewer.draw(timeline, close_up=bool(items))
-    if viewer.address:
-        show_page(viewer.address)
-    viewer.wait_until_drawn()
-    grid = timeline.grid
-    if not items and grid.end - grid.start <= MOST_FRAMES:
-        look_closely(grid.start, grid.end)
-    viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
-    print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
-    with read_keys(keys), suppress(KeyboardInterrupt):
+    show_page(viewer.address)
+    with read_keys(keys) as ended, suppress(KeyboardInterrupt):
+        if viewer.wait_until_drawn(lambda: ended.is_set() and keys.qsize() <= 1) is None:
+            tell("nobody opened the page, and the input ended")
+            return
+        grid = timeline.grid
+        if not items and grid.end - grid.start <= MOST_FRAMES:
+            look_closely(grid.start, grid.end)
+        viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
+        print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
         if session.run(keys):
-            words = [word for log in logs for word in ("--home", str(log))]
-            words += ["--scenario", marking.scenario] if marking.scenario else []
-            what = f"scenario {marking.scenario}" if marking.scenario else "this home"
-            train = f"hearthlog train {shlex.join(words)}"
-            judged = "" if marking.scenario else f" ({JUDGED_BY})"
-            tell(f"next: a model of {what}, from what is marked{judged}: {train}")
+            _say_next(logs, marking.scenario)
     if not marking.scenario:
         _say_how_right(logs)
+
+
+def _say_next(logs: list[Path], scenario: str) -> None:
+    words = [word for log in logs for word in ("--home", str(log))]
+    words += ["--scenario", scenario] if scenario else []
+    what = f"scenario {scenario}" if scenario else "this home"
+    judged = "" if scenario else f" ({JUDGED_BY})"
+    train = f"hearthlog train {shlex.join(words)}"
+    tell(f"next: a model of {what}, from what is marked{judged}: {train}")
 
 
 def _say_how_right(logs: list[Path]) -> None:
@@ -337,6 +342,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.review.queue.asked import (
         asked_path,
+        drawn_minutes,
         find_kept_sound,
         label_lines,
         labels_of,
@@ -375,8 +381,9 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
         write_labels(path, marks, find_coverage(logs[0]))
     write_list(asked, spans)
     clock = [datetime.fromtimestamp(one.start // NANOSECONDS, zone) for one in marks]
+    minutes = {one.first: f"a minute, to {one.last}" for one in drawn_minutes(spans, marks)}
     print_table(
-        ("line", "from", "seconds", "label", "sound"),
+        ("line", "from", "seconds", "label", "sound", "drawn at random"),
         [
             (
                 str(line),
@@ -384,6 +391,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
                 f"{(one.end - one.start) / NANOSECONDS:.1f}",
                 one.label,
                 "kept" if any(file.first == file.last == line for file in files) else "",
+                minutes.get(line, ""),
             )
             for line, (begin, one) in enumerate(zip(clock, marks, strict=True), 1)
         ],
