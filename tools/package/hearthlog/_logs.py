@@ -112,7 +112,12 @@ class Logs:
         Raises
         ------
         LogError
-            If there is no such topic, or a log is damaged.
+            If there is no such topic.
+
+        Warns
+        -----
+        HearthlogWarning
+            If a chunk is left out because it is damaged.
 
         Examples
         --------
@@ -144,8 +149,8 @@ class Logs:
         Raises
         ------
         LogError
-            If there is no such topic, a log is damaged, or the topic has several types, or a field
-            of a type changed so that no column holds all of its values.
+            If there is no such topic, or the topic has several types, or a field of a type changed
+            so that no column holds all of its values.
         HearthlogError
             If pyarrow is not installed; it is a `ModuleNotFoundError` too.
 
@@ -183,7 +188,7 @@ class Logs:
         Raises
         ------
         LogError
-            If there is no such topic, or a log is damaged.
+            If there is no such topic.
         HearthlogError
             If pandas is not installed; it is a `ModuleNotFoundError` too.
 
@@ -353,7 +358,7 @@ def open_logs(path: Path | str, start: int | None = None, end: int | None = None
     Raises
     ------
     LogError
-        If there is no log, or one is damaged.
+        If there is no log, or nothing of it can be read.
 
     Examples
     --------
