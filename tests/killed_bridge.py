@@ -10,6 +10,7 @@ import random
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +25,7 @@ from microphones import DIES_WITH_PARENT
 ZONE = "Europe/Vienna"
 _ROOT = "hearthlog/home"
 _KINDS = "on", "count_today", "count_night", "last_heard"
-_ARRIVES_SECONDS = 8.0  # a client that lost its broker tries again within so many
+_PATIENCE_SECONDS = 90.0  # on a busy machine a recorder or a bridge takes ten to begin
 
 
 class Ending(NamedTuple):
@@ -77,15 +78,28 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
             time.sleep(chance.uniform(0, 2))
             running[what] = start[what]()
     time.sleep(max(began + seconds - time.monotonic(), 0))
+    logs, zone = folder / "logs", ZoneInfo(ZONE)
+    _wait(lambda: any(each.endswith("/last_heard") for each in expected_values(logs, zone, _ROOT)))
     running["recorder"].terminate()
     running["recorder"].wait()
-    time.sleep(_ARRIVES_SECONDS)
-    found = settled_values(broker.port, f"{_ROOT}/#")
-    expected = expected_values(folder / "logs", ZoneInfo(ZONE), _ROOT)
+    expected = expected_values(logs, zone, _ROOT)
+
+    def ending() -> Ending:
+        return Ending(settled_values(broker.port, f"{_ROOT}/#"), expected, said.read_text())
+
+    _wait(lambda: not ending().wrong)
+    last = ending()
     running["bridge"].terminate()
     running["bridge"].wait()
     broker.kill()
-    return Ending(found, expected, said.read_text())
+    return last
+
+
+def _wait(is_so: Callable[[], bool]) -> None:
+    """Wait until something is so, or patience ends."""
+    end = time.monotonic() + _PATIENCE_SECONDS
+    while not is_so() and time.monotonic() < end:
+        time.sleep(0.2)
 
 
 def start_recorder(config: Path, sounds: list[Path], model: str, said: Path) -> subprocess.Popen:
