@@ -24,7 +24,7 @@ from hearthlog.analyzer.discover.groups import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.logs.files import log_readers
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import open_lock, replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
 GROUPS = "groups.safetensors"  # in a folder of logs
@@ -60,8 +60,7 @@ def locked_groups(path: Path) -> Iterator[None]:
         If its folder cannot be written.
     """
     try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
-        lock = os.fdopen(os.open(path.with_name(f".{path.name}.lock"), flags, 0o600), "ab")
+        lock = os.fdopen(open_lock(path.with_name(f".{path.name}.lock")), "rb")
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror})") from error
     with lock:

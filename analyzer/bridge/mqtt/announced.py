@@ -14,7 +14,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import private_folder, replaced_file
+from hearthlog.schemas.storage.new_files import (
+    create_file,
+    open_lock,
+    private_folder,
+    replaced_file,
+)
 from hearthlog.schemas.storage.small_file import read_whole
 
 _PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
@@ -164,9 +169,8 @@ class Announced:
             )
             self._is_changed = self.is_new = False
             try:
-                with replaced_file(self.path) as temporary:
-                    temporary.touch(0o600)
-                    temporary.write_text(content.model_dump_json(), "utf-8")
+                with replaced_file(self.path) as temporary, create_file(temporary) as stream:
+                    stream.write(content.model_dump_json().encode())
                 for path in self._former:
                     path.unlink(missing_ok=True)
             except (LogError, OSError) as error:
@@ -182,9 +186,7 @@ class Announced:
     def _take_lock(self, folder: Path) -> int | None:
         try:
             private_folder(folder)
-            descriptor = os.open(
-                folder / f".{self.path.stem}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
-            )
+            descriptor = open_lock(folder / f".{self.path.stem}.lock")
         except OSError as error:
             self._say(f"mqtt: {folder}: cannot be used ({error.strerror}); nothing is remembered")
             return None
