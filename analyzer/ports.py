@@ -104,9 +104,9 @@ def is_asked_in_digits(bind: str, host: str) -> bool:
 
 
 def host_name(url: str) -> str:
-    """Return the host of a URL in lower case, without its port; empty if it has none."""
+    """Return the host of a URL in lower case, without port and final dot; empty if it has none."""
     try:
-        return urlsplit(url).hostname or ""
+        return (urlsplit(url).hostname or "").removesuffix(".")
     except ValueError:
         return ""
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self, get_origin
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -53,6 +54,17 @@ def _checked(check: Any) -> AfterValidator:
     return AfterValidator(validate)
 
 
+def _check_path(value: Any) -> Any:
+    if isinstance(value, str) and not value.strip():
+        raise ValueError("is empty; write a path, or leave the key out")
+    if isinstance(value, str) and value.startswith(("~", "$")):
+        raise ValueError(f"{value[:64]!r}: ~ and $ are of the shell; write the whole path")
+    return value
+
+
+PlainPath = Annotated[Path, BeforeValidator(_check_path)]
+
+
 def _checked_places(places: list[list[float]]) -> list[list[float]]:
     try:
         if places:
@@ -65,7 +77,7 @@ def _checked_places(places: list[list[float]]) -> list[list[float]]:
 _MODELS: list[Any] = ["models/champion.safetensors"]
 _SCENARIOS: list[Any] = [{"speakers": "models/speakers.safetensors"}]
 Scenarios = Annotated[
-    dict[Annotated[str, _checked(check_scenario_name)], Path], Field(max_length=8)
+    dict[Annotated[str, _checked(check_scenario_name)], PlainPath], Field(max_length=8)
 ]
 
 
@@ -101,7 +113,7 @@ class MicrophoneSettings(BaseModel):
         description="The channel to hear of several, from 1 on; by default the first one, and of "
         "files their mean.",
     )
-    model: Path | None = Field(
+    model: PlainPath | None = Field(
         default=None, examples=_MODELS, description="Instead of the recorder's; none: no labels."
     )
     scenarios: Scenarios | None = Field(
@@ -139,8 +151,8 @@ class Settings(BaseModel):
     node: Annotated[str, _checked(check_node_name)] = Field(
         default="home", description="Name of this recorder, with which the names of its logs begin."
     )
-    output: Path = Field(default=Path("logs"), description="Folder of the logs.")
-    model: Path | None = Field(
+    output: PlainPath = Field(default=Path("logs"), description="Folder of the logs.")
+    model: PlainPath | None = Field(
         default=None,
         examples=_MODELS,
         description="Model file, or a link to one; general or bathroom, which come with hearthlog; "

@@ -15,9 +15,15 @@ Schema = Mapping[str, Any]
 
 _LONGEST = 40  # characters of a value that are shown
 _MOST = 100  # slips that are said
-_UNITS = {"s": 1, "sec": 1, "m": 60, "min": 60, "h": 3600, "d": 86_400}
+_DAY = 86_400
+_UNITS = {"s": 1, "m": 60, "h": 3600, "d": _DAY, "w": 7 * _DAY}  # seconds, by the first letter
+_LONGER = {"mo": 30 * _DAY, "y": 365 * _DAY}
 _MEASURED = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ?([a-zA-Z%]{1,8})")
-_SECONDS = re.compile(r"seconds|duration")
+_UNIT = re.compile(
+    r"(mo)(?:n|nths?)?|(y)(?:r|rs|ears?)?|([smhdw])|(s)ec(?:ond)?s?|(m)in(?:ute)?s?|(h)(?:r|rs|ours?)|"
+    r"(d)ays?|(w)eeks?"
+)
+_COUNTED = ((re.compile(r"_days$"), _DAY), (re.compile(r"seconds|duration"), 1))  # by the key
 _PLURALS = {"array": "lists", "integer": "whole numbers", "number": "numbers", "string": "texts"}
 
 
@@ -219,16 +225,22 @@ def _example_of_value(name: str, value: Any, place: _Place) -> str:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if kind == "string" and "format" not in about and "enum" not in about and is_number:
         return json.dumps(str(value))
-    if kind in {"integer", "number"} and is_word and (found := _MEASURED.fullmatch(value)):
-        return f"{_without_unit(name, found, about)}, without a unit"
+    found = _MEASURED.fullmatch(value) if is_word and kind in {"integer", "number"} else None
+    if found is not None and (without := _without_unit(name, found, about)):
+        return f"{without}, without a unit"
     return _example(name, about)
 
 
 def _without_unit(name: str, found: re.Match[str], about: Schema) -> str:
-    """Return a number that was written with a unit, in seconds where the key counts them."""
-    number = float(found[1])
-    if _SECONDS.search(name):
-        number *= _UNITS.get(found[2].lower(), 1)
+    """Return a number that was written with a unit, in what the key counts; empty if unknown."""
+    number, unit = float(found[1]), _UNIT.fullmatch(found[2].lower())
+    if unit is not None:
+        counted = next((one for words, one in _COUNTED if words.search(name)), None)
+        if counted is None:
+            return ""
+        number *= (_UNITS | _LONGER)[next(filter(None, unit.groups()))] / counted
+        if about.get("type") == "integer":
+            number = math.ceil(number)
     number = min(max(number, about.get("minimum", number)), about.get("maximum", number))
     return f"{number:.10g}"
 

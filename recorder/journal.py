@@ -1,5 +1,6 @@
 """Lines on standard error, which a service manager keeps in its journal."""
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -40,6 +41,14 @@ def say(text: str) -> None:
     with suppress(OSError):  # the log says it too
         sys.stderr.write(f"hearthlog: {text}\n")
         sys.stderr.flush()
+
+
+def writes_to_journal() -> bool:
+    """Return whether standard error is the journal of systemd, which says so as DEVICE:INODE."""
+    with suppress(OSError):
+        status = os.fstat(2)
+        return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+    return False
 
 
 class HealthJournal:

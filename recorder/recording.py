@@ -34,6 +34,7 @@ def record_files(
     source: FileSource,
     stop: Flag,
     reload_requests: ReloadRequests | None = None,
+    state: RecorderState | None = None,
 ) -> RecordingSummary:
     """Record audio files as if a microphone had captured them.
 
@@ -45,6 +46,8 @@ def record_files(
         Once set, the log is completed.
     reload_requests : ReloadRequests or None
         Make the recorder check at once whether a model's file has been replaced.
+    state : RecorderState or None
+        Is kept true while it records.
 
     Raises
     ------
@@ -61,7 +64,8 @@ def record_files(
     """
     with FolderLock(settings.output, settings.node):
         recovered = recover_active(settings.output, settings.node)
-        summary = record(settings, source, stop, reload_requests)
+        sources = {settings.microphone[0].name: source}
+        summary = _record(settings, sources, stop, reload_requests, state=state)
     summary.recovered = recovered
     return summary
 

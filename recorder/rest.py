@@ -40,6 +40,9 @@ class QuietHours(NamedTuple):
         return max(length - (minute - self.start) % _DAY, 0)
 
 
+_DASHES = frozenset("\N{HYPHEN}\N{NON-BREAKING HYPHEN}\N{EN DASH}\N{EM DASH}\N{MINUS SIGN}")
+
+
 def quiet_hours(text: str) -> QuietHours:
     """Read hours such as `22:00-06:30`.
 
@@ -54,7 +57,8 @@ def quiet_hours(text: str) -> QuietHours:
     """
     found = _FORM.fullmatch(text)
     if found is None:
-        raise ConfigurationError(f"{text[:64]!r} are no hours; write them as 22:00-06:30")
+        hyphen = ", with the - of the keyboard" if _DASHES & set(text) else ""
+        raise ConfigurationError(f"{text[:64]!r} are no hours; write them as 22:00-06:30{hyphen}")
     hour, minute, last_hour, last_minute = map(int, found.groups())
     return QuietHours(60 * hour + minute, 60 * last_hour + last_minute)
 

@@ -45,7 +45,7 @@ class LiveHome:
             for microphone in microphones
             for topic in topics_of(microphone, FEATURE_NAMES, self.classes, beside)
         }
-        path = log_path(folder, "home", self.start)
+        path = log_path(folder, metadata.get("node", "home"), self.start)
         self._writer = LogWriter(
             path, list(topics.values()), {"version": "0", "node": "home"} | metadata
         )

@@ -275,6 +275,49 @@ def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_
     }
 
 
+def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_line_is_wrong(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
+    home, said, now = Home(tmp_path / "logs", "home", UTC), [], time.time_ns()
+    with server() as (port, good), server() as (other, mended):
+        right, typo = f"json://127.0.0.1:{port}", f"jsno://127.0.0.1:{other}"
+        settings = DeliverySettings(urls_file=addresses(tmp_path, right, typo))
+        own = AlertsOutput([], settings, home, tmp_path, said.append)
+        own._outbox.put([Ring("it", now, "first", is_known=True, due=now)])
+        wait_for(lambda: len(good) == 1)
+        before = own._lines.names
+        addresses(tmp_path, "# anna", f"{right}/?verify=no", typo)  # while it runs
+        wait_for(lambda: own._lines.names != before)
+        own.close()
+        addresses(tmp_path, f"{right}/?verify=yes", typo, "# and while it does not")
+        own = AlertsOutput([], settings, home, tmp_path, said.append)
+        own._outbox.put([Ring("it", now + 1, "second", is_known=True, due=now)])
+        wait_for(lambda: len(good) == 2)
+        addresses(tmp_path, f"{right}/?rto=9", typo.replace("jsno", "json"))  # both at once
+        wait_for(lambda: len(mended) == 2)
+        own._outbox.put([Ring("it", now + 2, "third", is_known=True, due=now)])
+        wait_for(lambda: len(own._outbox) == 0)
+        own.close()
+    for texts in (good, mended):
+        assert [text.partition(": ")[2] for text in texts] == ["first", "second", "third"]
+
+
+def test_addresses_are_read_again_when_the_package_that_was_missing_is_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
+    home, said, now = Home(tmp_path / "logs", "home", UTC), [], time.time_ns()
+    with server() as (port, texts):
+        settings = DeliverySettings(urls_file=addresses(tmp_path, f"json://127.0.0.1:{port}"))
+        with monkeypatch.context() as missing:
+            missing.setitem(sys.modules, "apprise", None)
+            own = AlertsOutput([], settings, home, tmp_path, said.append)
+            own._outbox.put([Ring("it", now, "first", is_known=True, due=now)])
+            assert said[0].startswith("alerts: apprise is not installed; try: ")
+        wait_for(lambda: len(texts) == 1)
+        own.close()
+    assert said[-1].endswith("every line of it can be read now")
+
+
 def _is_told(own, broker):
     own.update(SimpleNamespace(state=HomeState()))
     return len(broker) == 1

@@ -116,6 +116,9 @@ def named(tmp_path_factory, dashboard):
     [
         ("raspberrypi.local:8380", 200),
         ("RaspberryPi.local", 200),
+        ("raspberrypi.local.:8380", 200),  # the same name, written in full
+        ("localhost.", 200),
+        ("evil.example.", 403),
         ("home.example:8443", 200),
         ("home.example", 403),
         ("home.example:80", 403),

@@ -15,7 +15,7 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import EventRecord
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HeardNow
 from hearthlog.analyzer.bridge.home_state import Health, HomeState, MicrophoneState
-from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
+from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.totals import Total, Totals
@@ -154,7 +154,8 @@ def test_a_class_of_any_name_has_a_topic_of_its_own(label):
     assert not {"+", "#", "\x00"} & set(topic)
     assert topic.count("/") == 5
     if label.isprintable():
-        assert topics.parse_told(topics.of_told(label)) == label
+        for place in (Place("told", label=label), Place("on", "mic", label)):
+            assert topics.parse(topics.name(place)) == place
         assert topic.split("/")[-2] == topics.of_told(label).split("/")[-1]
 
 

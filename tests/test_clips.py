@@ -393,7 +393,7 @@ def test_when_the_clock_is_set_back_sound_stays_beside_its_own_log(noise, tmp_pa
 def test_clips_become_wav_files_and_doctor_finds_no_fault(noise, tmp_path, hearthlog):
     keep([noise(5)], asked(tmp_path / "logs", keep_audio="always", never_keep=[]))
     result = hearthlog("doctor", tmp_path / "logs")
-    assert (result.returncode, result.stderr) == (0, "2 files: 0 errors, 0 warnings\n")
+    assert (result.returncode, result.stdout) == (0, "2 files: 0 errors, 0 warnings\n")
     result = hearthlog("export", tmp_path / "logs", "--format", "wav", "-o", tmp_path / "wav")
     assert result.returncode == 0, result
     (file,) = (tmp_path / "wav").iterdir()

@@ -206,6 +206,20 @@ def test_every_number_has_bounds(tmp_path, value):
         ("quiet_hours = '22:00-06:30'", 'not a list of texts; write quiet_hours = ["22:00-06:30"]'),
         ("max_bag_duration = '1h'", "write max_bag_duration = 3600, without a unit"),
         ("flush_seconds = '2 min'", "write flush_seconds = 120, without a unit"),
+        ("max_bag_duration = '1 hour'", "write max_bag_duration = 3600, without a unit"),
+        ("retention_days = '2 weeks'", "write retention_days = 14, without a unit"),
+        ("retention_days = '6 months'", "write retention_days = 180, without a unit"),
+        ("retention_days = '1 year'", "write retention_days = 365, without a unit"),
+        ("retention_days = '36h'", "write retention_days = 2, without a unit"),
+        ("statistics_every = '5 s'", "write statistics_every = 20"),
+        ("output = ''", "output: is empty; write a path, or leave the key out"),
+        ("[[microphone]]\nmodel = ' '", "model: is empty; write a path"),
+        ("[bridge.mqtt]\nhost='x'\npassword_file=''", "password_file: is empty; write a path"),
+        ("output = '~/logs'", "'~/logs': ~ and $ are of the shell; write the whole path"),
+        ("[bridge]\nstate = '$HOME/state'", "~ and $ are of the shell; write the whole path"),
+        ("[scenarios]\nbath = '~/bath.safetensors'", "scenarios.bath: '~/bath.safetensors': ~ and"),
+        ("quiet_hours = ['22:00\u201306:30']", "as 22:00-06:30, with the - of the keyboard"),
+        ("quiet_hours = ['22:00-06:00' '12:00-13:00']", "closed, or a comma is missing"),
         ("node = 7", 'node: 7 is not a text in quotes; write node = "7"'),
         ("quiet_hour = ['22:00-06:30']", "unknown key 'quiet_hour'; is quiet_hours meant?"),
         (
@@ -233,6 +247,9 @@ def test_a_file_of_an_editor_of_windows_is_read_or_named(tmp_path):
     path.write_bytes('node = "flat"\r\n'.encode("utf-8-sig"))
     assert load_bridge_settings(path)[0].node == "flat"
     path.write_bytes('node = "flat"\n'.encode("utf-16"))
+    with pytest.raises(ConfigurationError, match="it is UTF-16\\); save it as UTF-8"):
+        load_bridge_settings(path)
+    path.write_bytes('node = "flat"\n'.encode("utf-16-be"))  # without a mark
     with pytest.raises(ConfigurationError, match="it is UTF-16\\); save it as UTF-8"):
         load_bridge_settings(path)
     path.write_bytes('\nnode = "M\xfcller"\n'.encode("latin-1"))

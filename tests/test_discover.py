@@ -431,6 +431,15 @@ def groups_file(two_days, tmp_path_factory):
     return path
 
 
+def test_groups_of_which_a_bit_has_changed_are_refused(groups_file):
+    content = bytearray(groups_file.read_bytes())
+    content[-9] ^= 1
+    path = groups_file.with_name("changed")
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"changed: is not as it was written \(sha256 .* backup"):
+        load_groups(path)
+
+
 @settings(deadline=None, max_examples=40)
 @given(st.data())
 def test_a_damaged_file_of_groups_is_one_line_or_a_file_of_groups(groups_file, data):

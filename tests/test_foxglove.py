@@ -240,6 +240,28 @@ def test_every_channel_is_decoded_live_and_has_the_bytes_of_the_log(day, model_f
     assert viewer.of("error") == []
 
 
+def test_a_journal_has_no_token_but_the_name_of_a_file_that_only_we_read(tmp_path):
+    reading, writing = os.pipe()
+    journal = os.fstat(writing)
+    environment = os.environ | {"JOURNAL_STREAM": f"{journal.st_dev}:{journal.st_ino}"}
+    command = [*HEARTHLOG, "watch", str(tmp_path), "--foxglove", "--port", str(free_port())]
+    with subprocess.Popen(command, stderr=writing, env=environment) as process:
+        os.close(writing)
+        with os.fdopen(reading) as lines:
+            line = next(each for each in lines if "Lichtblick" in each)
+            file = Path(re.search(r"it, is in (\S+)", line)[1])
+            url = file.read_text().strip()
+            assert file.parent.stat().st_mode & 0o777 == 0o700
+            assert "token" not in line
+            with connected(url) as viewer:
+                viewer.sendall(head(url))
+                assert b" 101 " in viewer.recv(100)
+            process.send_signal(signal.SIGTERM)
+            assert "token" not in lines.read()
+        assert process.wait(timeout=60) == 0
+    assert not file.exists()
+
+
 def test_one_who_comes_late_is_told_of_the_stream(day, model_file, tmp_path):
     with (
         serving(tmp_path) as (_, url),

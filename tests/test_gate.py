@@ -131,7 +131,7 @@ def test_a_model_that_is_deaf_to_silence_is_refused_and_it_is_said_what_would_ch
     done = run(capfd, "models", "promote", "deaf")
     assert done.returncode == 1
     assert " min from silence to " in done.stdout
-    assert ", taken for the 12 min recorded, deaf instead of one would change:\n" in done.stdout
+    assert "deaf in place of one would change of the 12 min recorded, judged by " in done.stdout
     refused = done.stderr.splitlines()[-1]
     assert refused.startswith("hearthlog: deaf refused: silence falls from ")
     assert "`hearthlog models promote deaf --anyway`" in refused
@@ -174,7 +174,7 @@ def test_a_model_that_does_no_harm_is_promoted_and_judged_once(capfd):
     keep_alike()
     done = run(capfd, "models", "promote", "alike")
     assert done.returncode == 0, done.stderr
-    assert "the 12 min recorded, alike instead of one would change less than half" in done.stdout
+    assert "alike in place of one would change less than half a minute of the 12" in done.stdout
     assert champion() == "alike"
     assert run(capfd, "models", "promote", "alike").stdout == "alike is the champion already\n"
 

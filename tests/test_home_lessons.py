@@ -334,8 +334,8 @@ def test_too_few_marks_of_what_counts_as_unknown_teach_that_and_it_is_said(two_d
     kettle(two_days, (5, 0))
     lessons = home_lessons([two_days], base)
     assert lessons.notes[0] == (
-        "1 mark of kettle: they count as unknown; 5 more seconds, on another day, and it can be "
-        "learned"
+        "1 mark of kettle: 5 more seconds, from another day, make it a class; until then they "
+        "count as unknown"
     )
     of_home = lessons.segments.collection == lessons.segments.collection_names.index(HOME)
     assert set(lessons.segments.target[of_home]) == {base.classes.index("unknown")}
@@ -371,9 +371,10 @@ def test_a_class_of_two_days_and_ten_seconds_is_learned_and_stays_as_long_as_its
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [
-        ((5, 0), "1 mark of kettle: 5 more seconds, on another day, and it can be learned"),
-        ((3, 3), "2 marks of kettle: 4 more seconds, and it can be learned"),
-        ((12, 0), "1 mark of kettle: on another day, and it can be learned"),
+        ((5, 0), "1 mark of kettle: 5 more seconds, from another day, make it a class"),
+        ((3, 3), "2 marks of kettle: 4 more seconds make it a class"),
+        ((6, 3), "2 marks of kettle: 1 more second makes it a class"),
+        ((12, 0), "1 mark of kettle: any, from another day, makes it a class"),
     ],
 )
 def test_what_lacks_of_a_new_class_is_said_before_learning(

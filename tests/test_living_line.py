@@ -126,6 +126,21 @@ def recording(labmic, folder, terminal):
             process.kill()
 
 
+def test_files_have_a_bar_and_at_the_pace_of_real_time_the_line(tmp_path, terminal, day):
+    command = [*HEARTHLOG, "record", str(day), "-o", str(tmp_path / "logs"), "--realtime"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=terminal.end) as process:
+        terminal.wait_for(r"\d\d:\d\d  -\d+ dB")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+    assert "\x1b" not in terminal.text
+    terminal.text = ""
+    command = [*command[:-2], str(tmp_path / "fast")]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=terminal.end) as process:
+        terminal.wait_for(r"recording .*100%")
+        assert process.wait(timeout=60) == 0
+    assert " dB" not in terminal.text
+
+
 @pytest.fixture
 def terminal():
     terminal = Terminal()

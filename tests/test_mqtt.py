@@ -168,7 +168,13 @@ def test_a_microphone_that_the_newest_log_has_no_more_is_cleared_and_nobody_else
 
 @pytest.mark.parametrize(
     ("hours", "is_renamed"),
-    [({"old": [7], "new": [8, 9]}, True), ({"old": [7, 9], "new": [8]}, False)],
+    [
+        ({"old": [7], "new": [8, 9]}, True),
+        ({"old": [7, 9], "new": [8]}, False),
+        ({"old": [8, 9], "new": [7, 10]}, True),
+        ({"old": [8, 10], "new": [7, 9, 11]}, False),
+        ({"old": [8, 9], "new": [7]}, False),
+    ],
 )
 def test_a_recorder_that_records_beside_another_one_is_no_other_name_of_it(
     tmp_path, hours, is_renamed
@@ -388,6 +394,72 @@ def test_what_earlier_versions_switched_off_is_taken_over_where_commands_are_tak
             listener.wait_for(f"{ROOT}/told/music", "ON")
     assert listener.values[f"{ROOT}/told/speech"] == "OFF"
     assert any("the broker is not told of coughing, speech; " in line for line in bridged.said)
+
+
+@pytest.mark.parametrize("commands", [True, False])
+def test_what_a_bridge_left_whose_memory_is_lost_is_cleared_and_nobody_elses_is(
+    tmp_path, broker, commands
+):
+    home = LiveHome(tmp_path / "logs", ("kitchen", "mic"))
+    for microphone in ("kitchen", "mic"):
+        home.hears("coughing", microphone)
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker, commands=True):
+            for microphone in ("kitchen", "mic"):
+                listener.wait_for(f"{ROOT}/{microphone}/class/coughing/on", "ON")
+            listener.wait_for(COMMANDS)
+        home.close()
+        (home.folder.parent / "bridge" / "mqtt-home.json").unlink()
+        kitchen = f"homeassistant/device/{device_id('home', 'kitchen')}/config"
+        description = listener.values[kitchen]
+        changes = {  # of others, however alike
+            "homeassistant/device/hearthlog-attic-kitchen/config": ("home", "attic"),
+            "homeassistant/device/another/config": ("hearthlog-home-kitchen", "another"),
+            "homeassistant/device/moved/config": ("hearthlog/home/bridge", "x/home/bridge"),
+        }
+        foreign = {topic: description.replace(*change) for topic, change in changes.items()}
+        foreign["homeassistant/device/no/config"] = "[" * 9000
+        foreign["hearthlog/attic/bridge"] = "online"
+        for topic, value in foreign.items():
+            listener.publish(topic, value, retain=True)
+        time.sleep(1)  # logs are named by the second
+        later = LiveHome(home.folder, ("mic",))
+        later.hears("coughing")
+        with Bridged(home.folder, broker, commands=commands):
+            listener.wait_for(kitchen, "")
+            listener.wait_until(lambda: "" not in settled_values(broker.port, seconds=0.3))
+            listener.wait_until(
+                lambda: not any("kitchen" in key for key in _own(broker.port) - {*foreign})
+            )
+            listener.wait_until(lambda: (COMMANDS in _own(broker.port)) == commands)
+        later.close()
+        after = settled_values(broker.port, seconds=0.3)
+    assert {topic: after.get(topic) for topic in foreign} == foreign
+    assert f"{ROOT}/mic/class/coughing/on" in after
+
+
+def _own(port):
+    return settled_values(port, seconds=0.3).keys()
+
+
+def test_a_recorder_that_gets_its_former_name_back_leaves_nothing_of_the_other(tmp_path, broker):
+    with Listener(broker.port) as listener:
+        for node in ("home", "attic", "home"):
+            home = LiveHome(tmp_path / "logs", node=node)
+            home.hears("coughing")
+            with Bridged(home.folder, broker, node=node):
+                listener.wait_for(f"hearthlog/{node}/mic/class/coughing/on", "ON")
+                other = "attic" if node == "home" else "home"
+                listener.wait_until(
+                    lambda other=other: (
+                        not any(
+                            f"/{other}/" in topic or f"hearthlog-{other}" in topic
+                            for topic in _own(broker.port)
+                        )
+                    )
+                )
+            home.close()
+            time.sleep(1)  # logs are named by the second
 
 
 def test_two_bridges_with_one_folder_clear_nothing_of_each_other(home, broker):

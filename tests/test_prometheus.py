@@ -172,21 +172,26 @@ def test_a_port_that_is_taken_is_named(home, tmp_path):
         bridged(home, tmp_path, port=port).__enter__()
 
 
-def test_a_port_without_a_token_is_open_for_one_release_more_and_is_said_to_be(home, tmp_path):
-    home.hears("silence")
-    port, said = free_port(), []
+def test_a_port_without_a_token_stays_closed(home, tmp_path):
+    port = free_port()
+    settings = PrometheusSettings(port=port)
     place = Home(home.folder, "home", UTC)
-    settings = PrometheusSettings(port=port, text_file=tmp_path / "hearthlog.prom")
-    output = PrometheusOutput(settings, place, tmp_path, time.time_ns() - HOUR, said.append)
-    with following(place, {"prometheus": output}, said):
-        wait_for(lambda: known(port))
-        assert ask(port, Authorization="")[0] == 200
-    assert [line.partition(";")[0] for line in said] == [
-        f"bridge.prometheus: every account of this machine may read {tmp_path}/hearthlog.prom",
-        f"bridge.prometheus: every account of this machine may read the figures on port {port}",
-    ]
-    assert "`token_file`" in said[1]
-    assert "readable_by" in said[0]
+    with pytest.raises(BridgeError, match=f"port {port} stays closed.*name a `token_file`"):
+        PrometheusOutput(settings, place, tmp_path, 0, pytest.fail)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), timeout=10)
+
+
+def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):
+    said = []
+    path = tmp_path / "hearthlog.prom"
+    PrometheusOutput(
+        PrometheusSettings(text_file=path), Home(home.folder, "home", UTC), tmp_path, 0, said.append
+    ).close()
+    (line,) = said
+    assert line.startswith(
+        f"bridge.prometheus: every account of this machine may read {path}; write readable_by"
+    )
 
 
 @pytest.mark.parametrize("request_so_far", [b"", b"GET /metrics HTTP/1.1\r\nX: "])

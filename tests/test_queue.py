@@ -1,5 +1,6 @@
 """A queue that is worth a person's ten minutes: spans that teach, and minutes drawn at random."""
 
+import re
 import shutil
 from datetime import UTC
 from itertools import pairwise
@@ -319,6 +320,8 @@ def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_l
     assert "of the others no sound was kept" in done.stderr
     begins = [n for n, line in enumerate(lines, 1) if "a minute drawn at random" in line[-1]]
     assert len(begins) == 2
+    table = [row for row in done.stdout.splitlines() if re.search(r" a minute, to \d+", row)]
+    assert [int(row.split()[0]) for row in table] == begins
     for first in begins:
         start = read_time(lines[first - 1][0])
         heard_of_it = cut(kept, start, start + MINUTE).length > 0

@@ -474,3 +474,24 @@ def test_a_lock_is_a_regular_file_and_not_a_hard_link_that_root_follows(tmp_path
         with pytest.raises(OSError, match="Not a regular file"):
             open_lock(tmp_path / "linked")
         os.chown(tmp_path, 0, 0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone gives files away")
+def test_what_root_writes_is_given_to_nobody_who_swaps_the_folder_meanwhile(tmp_path, monkeypatch):
+    ours, theirs, folder = (tmp_path / name for name in ("ours", "theirs", "folder"))
+    for each in (ours, theirs):
+        each.mkdir()
+    os.chown(theirs, 12345, 12345)
+    folder.symlink_to(ours)
+    change_rights = os.fchmod
+
+    def swap(descriptor, mode):
+        folder.unlink()
+        folder.symlink_to(theirs)
+        change_rights(descriptor, mode)
+
+    monkeypatch.setattr(os, "fchmod", swap)
+    with suppress(LogError), new_file(folder / "judgement") as temporary:
+        temporary.write_text("1")
+    assert {path.stat().st_uid for path in ours.iterdir()} <= {0}
+    assert list(ours.iterdir()) != []

@@ -1,11 +1,14 @@
 """Another model takes over while the recorder runs: no sound is lost, the log says from when."""
 
 import os
+import re
+import shutil
 import signal
 import subprocess
 import time
 from contextlib import chdir, contextmanager, suppress
 from itertools import pairwise
+from pathlib import Path
 from queue import SimpleQueue
 from types import SimpleNamespace
 
@@ -20,11 +23,13 @@ from spliced import run
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.timing import label_timing
+from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
+from hearthlog.models.starter import SHA256, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
@@ -325,7 +330,33 @@ def test_a_recorder_whose_terminal_is_closed_completes_its_log(folder, tmp_path)
     assert LogReader(log).complete
 
 
-def test_a_champion_of_which_a_bit_has_changed_is_named_at_the_start(folder, capfd):
+@pytest.mark.parametrize("scenario", ["", "bathroom"])
+def test_a_model_of_which_a_bit_has_changed_is_named_at_the_start_and_labels(
+    folder, capfd, scenario
+):
+    file = (folder / "champion.safetensors").resolve()
+    data = bytearray(file.read_bytes())
+    data[-8] ^= 1
+    file.write_bytes(data)
+    ModelWatch(file, SimpleQueue(), scenario).close()
+    (line,) = capfd.readouterr().err.splitlines()
+    said = rf"{file}: is not as it was written \(sha256 \w{{12}}, not \w{{12}}\): .* backup.*labels"
+    assert re.search(said, line)
+    assert ("scenario bathroom: " in line) == bool(scenario)
+    with pytest.raises(ModelError, match="is not as it was written"):
+        load_model(file)
+
+
+def test_a_starter_of_which_a_bit_has_changed_is_named(monkeypatch, capfd):
+    monkeypatch.setitem(SHA256, "general", "0" * 64)
+    ModelWatch(Path("general"), SimpleQueue()).close()
+    (line,) = capfd.readouterr().err.splitlines()
+    assert re.search(
+        r"general\.safetensors: is not as .*, not 0{12}\).*install hearthlog again", line
+    )
+
+
+def test_a_champion_that_was_replaced_is_named_at_the_start(folder, capfd):
     def said_at_start():
         ModelWatch(folder / "champion.safetensors", SimpleQueue()).close()
         return [line for line in capfd.readouterr().err.splitlines() if "was promoted" in line]
@@ -333,9 +364,7 @@ def test_a_champion_of_which_a_bit_has_changed_is_named_at_the_start(folder, cap
     insist(folder, load_model(folder / "champion.safetensors").sha256)
     assert said_at_start() == []
     file = (folder / "champion.safetensors").resolve()
-    data = bytearray(file.read_bytes())
-    data[-8] ^= 1
-    file.write_bytes(data)
+    shutil.copyfile(starter_file("bathroom"), file)
     (line,) = said_at_start()
     assert line.startswith(f"hearthlog: model {file.stem} is not the file that was promoted")
     for judgement in (folder / "judgements").iterdir():

@@ -1,6 +1,7 @@
 """What a timeline reads of logs, and what a Rerun recording of it holds."""
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -30,6 +31,7 @@ from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.timeline import read_timeline as reading
 from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
+from hearthlog.analyzer.review.timeline.decode import worded
 from hearthlog.analyzer.review.timeline.disagreements import disagreements
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
 from hearthlog.analyzer.review.timeline.home_clock import home_clock
@@ -194,7 +196,8 @@ def test_segments_gaps_and_marks_are_the_spans_of_the_log(timeline, folder):
 def test_what_the_recorder_said_in_words_is_there(timeline, folder):
     lines = read(folder, "rosout")
     assert len(lines) > 2
-    assert timeline.lines.texts.tolist() == [line.msg for line in lines]
+    assert timeline.lines.texts.tolist() == [worded(line.msg) for line in lines]
+    assert any(re.match(r"Quiet for [\d.]+ s \(\d+ %\)$", text) for text in timeline.lines.texts)
     assert timeline.lines.levels.tolist() == [line.level for line in lines]
     assert timeline.lines.times.tolist() == [nanoseconds(line.stamp) for line in lines]
 

@@ -463,6 +463,15 @@ def test_a_file_of_voices_is_read_as_it_was_written(tmp_path):
     assert load_voices(tmp_path / "none") is None
 
 
+def test_voices_of_which_a_bit_has_changed_are_refused(tmp_path):
+    path = a_file(tmp_path)
+    content = bytearray(path.read_bytes())
+    content[-8] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"is not as it was written \(sha256 .* backup"):
+        load_voices(path)
+
+
 @pytest.mark.parametrize(
     "spoilt",
     [

@@ -140,7 +140,11 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path) -> Model:
     save_model(model, path)
     path.chmod(0o644)  # it learned from published recordings, and is passed on
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
-    return load_model(path)
+    changed: list[str] = []
+    model = load_model(path, changed.append)  # where it takes the place of another
+    if changed:
+        print(f"{path}: write its sha256 {model.sha256} into {path.with_name('__init__.py')}")
+    return model
 
 
 def _page(models: Sequence[Model]) -> str:

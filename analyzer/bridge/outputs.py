@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News, Output
-from hearthlog.analyzer.bridge.page.page_token import read_token
+from hearthlog.analyzer.bridge.page.page_token import figures_token, read_token
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import BridgeSettings
@@ -182,9 +182,10 @@ def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_St
         from hearthlog.analyzer.bridge.mqtt.connection import read_password  # noqa: PLC0415
 
         yield mqtt.password_file, partial(read_password, mqtt)
-    for table in (settings.page, settings.prometheus):
-        if table is not None and table.token_file is not None:
-            yield table.token_file, partial(read_token, table.token_file)
+    if (page := settings.page) is not None and page.token_file is not None:
+        yield page.token_file, partial(read_token, page.token_file)
+    if (figures := settings.prometheus) is not None and figures.port is not None:
+        yield figures.token_file, partial(figures_token, figures.port, figures.token_file)
     if settings.ping is not None and (url := settings.ping.url_file) is not None:
         yield url, lambda: read_ping_address(secret_path(url))
     if (file := settings.delivery.urls_file) is not None:

@@ -25,7 +25,7 @@ from hearthlog.analyzer.bridge.listeners import (
     scenario_of_listener,
 )
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.page_token import read_token
+from hearthlog.analyzer.bridge.page.page_token import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
 from hearthlog.analyzer.ports import HOST, is_asked_in_digits
@@ -61,7 +61,7 @@ class PrometheusOutput:
     Raises
     ------
     BridgeError
-        If the port cannot be had, or what is remembered is damaged.
+        If the port cannot be had or has no token, or what is remembered is damaged.
     """
 
     def __init__(
@@ -74,7 +74,6 @@ class PrometheusOutput:
     ) -> None:
         self._settings = settings
         self._home = home
-        self._say = say
         self.totals = Totals(state_folder / TOTALS, since)
         self._text, self._made = b"", -math.inf  # and when, by CLOCK_MONOTONIC
         self._lock = Lock()
@@ -112,15 +111,9 @@ class PrometheusOutput:
             self._settings.text_file.unlink(missing_ok=True)
 
     def _listen(self, port: int) -> "_Server":
-        token = self._settings.token_file and read_token(self._settings.token_file)
-        if not token:
-            self._say(
-                f"bridge.prometheus: every account of this machine may read the figures on port "
-                f"{port}; name a `token_file`, and the same file as `credentials_file` in "
-                "Prometheus: the next release opens no port without one"
-            )
+        token = figures_token(port, self._settings.token_file)
         try:
-            return _Server(port, token or "", self._current)
+            return _Server(port, token, self._current)
         except OSError as error:
             raise BridgeError(
                 f"bridge.prometheus: cannot listen on port {port} ({error.strerror}); take another"
@@ -134,11 +127,11 @@ class PrometheusOutput:
 
 
 class _Server(HttpServer):
-    """Gives figures to who has the token, if there is one."""
+    """Gives figures to who has the token."""
 
     def __init__(self, port: int, token: str, current: Callable[[], bytes | None]) -> None:
         super().__init__(HOST, port, _Handler)
-        self.expected = f"Bearer {token}".encode() if token else None
+        self.expected = f"Bearer {token}".encode()
         self.current = current
         self.start()
 
@@ -155,7 +148,7 @@ class _Handler(HttpHandler):
             self._refuse(HTTPStatus.FORBIDDEN, "ask for an address in digits, and from no page")
             return
         shown = self.headers.get("Authorization", "").encode("utf-8", "replace")
-        if server.expected is not None and not compare_digest(shown, server.expected):
+        if not compare_digest(shown, server.expected):
             self._refuse(
                 HTTPStatus.UNAUTHORIZED,
                 "show the token of token_file in [bridge.prometheus]: `authorization: "

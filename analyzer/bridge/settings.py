@@ -17,7 +17,13 @@ from hearthlog.analyzer.bridge.alerts.rules import AlertRules
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings, SecretFile
 from hearthlog.analyzer.ping import is_ping_address
 from hearthlog.analyzer.ports import ip_of
-from hearthlog.recorder.config import BRIDGE, MicrophoneSettings, Settings, load_settings
+from hearthlog.recorder.config import (
+    BRIDGE,
+    MicrophoneSettings,
+    PlainPath,
+    Settings,
+    load_settings,
+)
 from hearthlog.recorder.config_origins import Origins, key_lines
 from hearthlog.recorder.config_problems import configuration_error
 from hearthlog.recorder.errors import ConfigurationError
@@ -106,11 +112,11 @@ class MqttSettings(_Table):
         default=None, examples=["/etc/hearthlog/mqtt-password"], description="Of one line."
     )
     tls: bool = Field(default=False, description="Whether the connection is encrypted.")
-    ca_file: Path | None = Field(
+    ca_file: PlainPath | None = Field(
         default=None, description="Of who signs the broker's certificate; none: the machine's own."
     )
-    certificate_file: Path | None = Field(default=None, description="Of this client.")
-    key_file: Path | None = Field(default=None, description="Of this client.")
+    certificate_file: PlainPath | None = Field(default=None, description="Of this client.")
+    key_file: PlainPath | None = Field(default=None, description="Of this client.")
     client_id: str = Field(default="", description="Empty: hearthlog- and the recorder's name.")
     topic: _Topic = Field(default="hearthlog", description="Begins all topics.")
     home_assistant: bool = Field(default=True, description="Whether Home Assistant is told.")
@@ -125,12 +131,14 @@ class MqttSettings(_Table):
 class PrometheusSettings(_Table):
     """Where a Prometheus finds its figures."""
 
-    text_file: Path | None = Field(
+    text_file: PlainPath | None = Field(
         default=None,
         examples=["/var/lib/node_exporter/hearthlog.prom"],
         description="For the textfile collector of node_exporter; ends in .prom.",
     )
-    port: _Port | None = Field(default=None, description="On loopback; none: no port.")
+    port: _Port | None = Field(
+        default=None, description="On loopback, with a `token_file`; none: no port."
+    )
     token_file: SecretFile | None = Field(
         default=None,
         description="Of one line, which who asks on the port has to show: the `credentials_file` "
@@ -187,7 +195,7 @@ class PingSettings(_Table):
 class BridgeSettings(_Table):
     """Everything that can be configured; the field names are the keys of the table `bridge`."""
 
-    state: Path | None = Field(
+    state: PlainPath | None = Field(
         default=None,
         description="Folder of what the bridge has to remember; by default that of systemd, or "
         "`bridge` beside the logs.",

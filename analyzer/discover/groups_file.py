@@ -1,7 +1,6 @@
 """The file of the groups of a home: arrays and names, checked when read."""
 
 import fcntl
-import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ import numpy as np
 import safetensors
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
-from safetensors.numpy import load, save
 
 from hearthlog.analyzer.discover.descriptors import descriptor_width
 from hearthlog.analyzer.discover.groups import (
@@ -23,6 +21,7 @@ from hearthlog.analyzer.discover.groups import (
 )
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.models.modelfile.sealed_file import read_sealed, write_sealed
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.storage.new_files import open_lock, replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
@@ -78,7 +77,7 @@ def save_groups(groups: Groups, path: Path) -> None:
     """
     head = _Head(format=_FORMAT, id=groups.id, features=list(groups.features), names=groups.names)
     arrays = {name: np.ascontiguousarray(getattr(groups, name)) for name in _ARRAYS}
-    data = save(arrays, {_KEY: head.model_dump_json()})
+    data = write_sealed(arrays, _KEY, head.model_dump_json())
     with replaced_file(path, readers=log_readers(path.parent)) as temporary:
         temporary.write_bytes(data)
 
@@ -98,11 +97,12 @@ def load_groups(path: Path) -> Groups | None:
     if size > _LARGEST_HEADER:
         raise DataError(f"{path}: is no file of groups (its header is too large)")
     try:
-        arrays = load(data)
-        text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(_KEY, "")
+        arrays, text, damaged = read_sealed(path, data, _KEY)
         head = _Head.model_validate_json(text)
     except (safetensors.SafetensorError, KeyError, ValidationError) as error:
         raise DataError(f"{path}: is no file of groups of this version of hearthlog") from error
+    if damaged:
+        raise DataError(damaged)
     if problem := _problem(head, arrays):
         raise DataError(f"{path}: is damaged: {problem}; move it away to begin anew")
     return Groups(tuple(head.features), **arrays, names=head.names, id=head.id)

@@ -1,6 +1,5 @@
 """The file of the voices of a home: arrays and names, checked when read."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -8,13 +7,13 @@ import numpy as np
 import safetensors
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
-from safetensors.numpy import load, save
 
 from hearthlog.analyzer.discover.home_voices import MOST_VOICES, Voices
 from hearthlog.analyzer.discover.voice_space import voice_space
 from hearthlog.analyzer.discover.voices import Evidence
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.models.modelfile.sealed_file import read_sealed, write_sealed
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
@@ -57,7 +56,7 @@ def save_voices(voices: Voices, path: Path) -> None:
             f"{path}: not written, for some speech has features that no sound has; leave out logs "
             "that hearthlog did not record"
         )
-    data = save(arrays, {_KEY: head.model_dump_json()})
+    data = write_sealed(arrays, _KEY, head.model_dump_json())
     with replaced_file(path, readers=log_readers(path.parent)) as temporary:
         temporary.write_bytes(data)
 
@@ -77,11 +76,12 @@ def load_voices(path: Path) -> Voices | None:
     if size > _LARGEST_HEADER:
         raise DataError(f"{path}: is no file of voices (its header is too large)")
     try:
-        arrays = load(data)
-        text = json.loads(data[8 : 8 + size]).get("__metadata__", {}).get(_KEY, "")
+        arrays, text, damaged = read_sealed(path, data, _KEY)
         head = _Head.model_validate_json(text)
     except (safetensors.SafetensorError, KeyError, ValidationError) as error:
         raise DataError(f"{path}: is no file of voices of this version of hearthlog") from error
+    if damaged:
+        raise DataError(damaged)
     if not _fits(head, arrays):
         raise DataError(f"{path}: is damaged; move it away to begin anew")
     return Voices(

@@ -172,13 +172,14 @@ def _with_new_classes(
             learned[name] = every[name]
             continue
         count = sum(class_name(one.label) == name for one in others)
-        more = [f"{math.ceil(round(seconds, 3))} more seconds"] if seconds else []
-        more += ["on another day"] if amount.sources < _FEWEST_DAYS else []
+        whole = math.ceil(round(seconds, 3))
+        more = f"{whole} more {'second' if whole == 1 else 'seconds'}" if whole else "any"
+        day = ", from another day," if amount.sources < _FEWEST_DAYS else ""
         what = "the model has no room for it"
         if room:
-            what = f"{', '.join(more)}, and it can be learned"
+            what = f"{more}{day} {'make' if whole > 1 else 'makes'} it a class"
         if any(meant_by(label, as_unknown) for label in every[name]):
-            what = f"they count as unknown; {what}"
+            what += "; until then they count as unknown"
         else:
             unlearned |= set(every[name])
         notes.append(f"{count} {'mark' if count == 1 else 'marks'} of {name}: {what}")

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import numpy as np
 import safetensors
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from safetensors.numpy import load, save
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import (
@@ -28,7 +27,8 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.starter import STARTERS, starter_file
+from hearthlog.models.modelfile.sealed_file import damage, read_sealed, write_sealed
+from hearthlog.models.starter import SHA256, STARTERS, starter_file
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
 from hearthlog.schemas.storage.small_file import read_whole
@@ -94,7 +94,7 @@ def save_model(model: Model, path: Path) -> None:
     arrays = {name: np.ascontiguousarray(a) for name, a in {**model.arrays, **common}.items()}
     _check(path, model.description, arrays)
     text = json.dumps(model.description.model_dump(), ensure_ascii=False)
-    data = save({name: _halved(array) for name, array in arrays.items()}, {_KEY: text})
+    data = write_sealed({name: _halved(array) for name, array in arrays.items()}, _KEY, text)
     _check_header(path, data)
     try:
         with new_file(path) as temporary:
@@ -103,7 +103,7 @@ def save_model(model: Model, path: Path) -> None:
         raise ModelError(str(error)) from error
 
 
-def load_model(path: Path) -> Model:
+def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> Model:
     """Read a model file and check everything in it; nothing of it is executed.
 
     Parameters
@@ -111,6 +111,8 @@ def load_model(path: Path) -> Model:
     path : Path
         The file, or a symbolic link to it: the model has the name of the file. Where there is none,
         the name of a starter model (`hearthlog.models.starter`) means that.
+    on_damage : callable, optional
+        Told in a line that the file is not as it was written; by default that is an error.
 
     Raises
     ------
@@ -122,17 +124,23 @@ def load_model(path: Path) -> Model:
     path, data = _read(path)
     _check_header(path, data)
     try:
-        arrays = load(data)
+        arrays, text, damaged = read_sealed(path, data, _KEY)
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
         raise ModelError(f"{path}: is not a model file ({one_line(error)})") from error
-    description = _description(path, data)
+    digest = hashlib.sha256(data).hexdigest()
+    if path.stem in STARTERS and path == starter_file(path.stem) and digest != SHA256[path.stem]:
+        damaged = damage(path, SHA256[path.stem], digest, "install hearthlog again")
+    if damaged and on_damage is None:
+        raise ModelError(damaged)
+    description = _description(path, text)
     arrays = _widened(description, arrays)
     _check(path, description, arrays)
     for array in arrays.values():
         array.flags.writeable = False
     common = {name: arrays.pop(name) for name in _COMMON if name in arrays}
-    name, digest = path.stem, hashlib.sha256(data).hexdigest()
-    return Model(description, arrays, **common, name=name, sha256=digest)
+    if damaged and on_damage is not None:
+        on_damage(damaged)
+    return Model(description, arrays, **common, name=path.stem, sha256=digest)
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:
@@ -214,10 +222,8 @@ def _check_header(path: Path, data: bytes) -> None:
         raise ModelError(f"{path}: is not a model file (its header is too large)")
 
 
-def _description(path: Path, data: bytes) -> Description:
-    length = int.from_bytes(data[:8], "little")
-    text = json.loads(data[8 : 8 + length]).get("__metadata__", {}).get(_KEY)
-    if text is None:
+def _description(path: Path, text: str) -> Description:
+    if not text:
         raise ModelError(f"{path}: is no model of hearthlog: it does not describe itself")
     try:
         return read_description(text)

@@ -4,7 +4,7 @@ A model that replaces another one labels only if there is a judgement that lets 
 scenario needs none.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -105,20 +105,24 @@ class ModelWatch:
         self._judged: FileIdentity = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
-        if not scenario:
-            _warn_if_changed(path, self._last)
         self._results: SimpleQueue[Loaded | str | None] = SimpleQueue()  # None: that in use
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
         self._thread.start()
 
     def _load_first(self) -> Loaded:
-        if self._starts_with_starter:
-            return load_checked(Path(GENERAL))
+        """Load it; one of which a bit has changed labels all the same, rather than none."""
+        path = Path(GENERAL) if self._starts_with_starter else self._path
+        damaged: list[str] = []
         try:
-            return load_checked(self._path)
+            loaded = load_checked(path, damaged.append)
         except ModelError as error:
             raise ModelError(f"{self._where()}{error}") from error
+        for line in damaged:
+            say(f"{self._where()}{line}. It labels all the same")
+        if not damaged and not self._scenario:
+            _warn_if_changed(path, loaded.model)
+        return loaded
 
     def refusals(self) -> Iterator[str]:
         """Yield why models were refused since the last call, and update `ready`.
@@ -266,20 +270,22 @@ def _warn_if_changed(path: Path, champion: Model) -> None:
         )
 
 
-def load_checked(path: Path) -> Loaded:
+def load_checked(path: Path, on_damage: Callable[[str], object] | None = None) -> Loaded:
     """Load a model, and check that it can classify.
 
     Parameters
     ----------
     path : Path
         Model file, or the name of a starter model.
+    on_damage : callable, optional
+        As `load_model` takes it.
 
     Raises
     ------
     ModelError
         If it cannot be used.
     """
-    model = load_model(path)
+    model = load_model(path, on_damage)
     return Loaded(model, Classifier(model))
 
 

@@ -22,6 +22,7 @@ from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 
 _AT_ONCE = 8  # files that are synced: one after the other takes a disk milliseconds for each
 _READERS = stat.S_IRGRP | stat.S_IROTH
+_LOOKUP: int = getattr(os, "O_PATH", os.O_RDONLY)  # wants no right to read a folder
 
 
 def sync_file(path: Path) -> None:
@@ -107,9 +108,8 @@ def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
     OSError
         If it cannot be created.
     """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    descriptor = os.open(path, flags, mode)
-    _set_owner(descriptor, path.parent)
+    descriptor, folder = _open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    _set_owner(descriptor, folder)
     return os.fdopen(descriptor, "wb")
 
 
@@ -131,23 +131,15 @@ def open_lock(path: Path) -> int:
     OSError
         If it cannot be opened, is a link or no regular file.
     """
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    descriptor = os.open(path, flags, 0o600)
-    try:
-        _check_lock(descriptor, path)
-        _set_owner(descriptor, path.parent)
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor
-
-
-def _check_lock(descriptor: int, path: Path) -> None:
-    """Refuse what is no regular file, and for root a file of others that was linked here."""
+    descriptor, folder = _open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600)
     opened = os.fstat(descriptor)
-    is_linked = opened.st_nlink > 1 and opened.st_uid != path.parent.stat().st_uid
-    if not stat.S_ISREG(opened.st_mode) or (os.geteuid() == 0 and is_linked):
+    # Root writes to no file of others that was linked here.
+    is_linked = opened.st_nlink > 1 and opened.st_uid != folder.st_uid and os.geteuid() == 0
+    if not stat.S_ISREG(opened.st_mode) or is_linked:
+        os.close(descriptor)
         raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    _set_owner(descriptor, folder)
+    return descriptor
 
 
 def hand_over(path: Path, mode: int | None = None) -> None:
@@ -165,21 +157,32 @@ def hand_over(path: Path, mode: int | None = None) -> None:
     OSError
         If it is not there, or is a link.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor, folder = _open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         if mode is not None and _is_own(os.fstat(descriptor)):
             with suppress(OSError):  # a disk without rights
                 os.fchmod(descriptor, mode)
-        _set_owner(descriptor, path.parent)
+        _set_owner(descriptor, folder)
     finally:
         os.close(descriptor)
 
 
-def _set_owner(descriptor: int, folder: Path) -> None:
-    around, made = folder.stat(), os.fstat(descriptor)
-    if os.geteuid() == 0 and around.st_uid != 0 and made.st_uid == 0 and _is_own(made):
+def _open(path: Path, flags: int, mode: int = 0) -> tuple[int, os.stat_result]:
+    """Open what has a name, no link, and return the status of its folder, too."""
+    # The folder is opened once: another one may get its name while this runs.
+    folder = os.open(path.parent, _LOOKUP | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        descriptor = os.open(path.name, flags | os.O_NOFOLLOW | os.O_CLOEXEC, mode, dir_fd=folder)
+        return descriptor, os.fstat(folder)
+    finally:
+        os.close(folder)
+
+
+def _set_owner(descriptor: int, folder: os.stat_result) -> None:
+    made = os.fstat(descriptor)
+    if os.geteuid() == 0 and folder.st_uid != 0 and made.st_uid == 0 and _is_own(made):
         with suppress(OSError):  # a disk without owners
-            os.fchown(descriptor, around.st_uid, around.st_gid)
+            os.fchown(descriptor, folder.st_uid, folder.st_gid)
 
 
 def _is_own(made: os.stat_result) -> bool:

@@ -33,10 +33,11 @@ _HINTS = (  # by what the parser says, and the line it stopped at
     ),
     (
         re.compile(r"Unclosed|Unterminated|newline|Illegal character '\\n'", re.IGNORECASE),
-        "; a quote or a bracket is not closed",
+        "; a quote or a bracket is not closed, or a comma is missing",
     ),
 )
 _UTF_16 = {b"\xff\xfe", b"\xfe\xff"}
+_IS_UTF_16 = "no UTF-8: it is UTF-16"
 _DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of their number
 
 
@@ -105,15 +106,15 @@ def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, A
     try:
         text = data.decode("utf-8-sig")  # editors of Windows begin a file with a mark
         keys = (line for line in text.split("\n") if not line.lstrip().startswith("#"))
+        if "\0" in text:
+            raise error(f"{path}: cannot be read as TOML ({_IS_UTF_16}); save it as UTF-8")
         deep = any(line.count(".") > _DEEPEST for line in keys)
         if not deep:
             content = tomllib.loads(text)
     except UnicodeDecodeError as reason:
         line = data.count(b"\n", 0, reason.start) + 1
-        place = "it is UTF-16" if data[:2] in _UTF_16 else f"at line {line}"
-        raise error(
-            f"{path}: cannot be read as TOML (no UTF-8: {place}); save it as UTF-8"
-        ) from reason
+        problem = _IS_UTF_16 if data[:2] in _UTF_16 else f"no UTF-8: at line {line}"
+        raise error(f"{path}: cannot be read as TOML ({problem}); save it as UTF-8") from reason
     except ValueError as reason:
         raise error(f"{path}: cannot be read as TOML ({_toml_problem(text, reason)})") from reason
     except RecursionError:

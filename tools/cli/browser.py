@@ -18,12 +18,8 @@ def print_recording(path: Path) -> None:
 
 def show_page(address: str) -> None:
     """Say where a page is, and open it where there is a display."""
-    from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.review.viewer.process import check_display
+    from hearthlog.analyzer.review.viewer.process import has_display
 
     tell(f"open {address}")
-    try:
-        check_display("")
-    except DataError:
-        return  # a browser of the terminal would take it from us
-    webbrowser.open(address)
+    if has_display():  # else a browser of the terminal would take it from us
+        webbrowser.open(address)

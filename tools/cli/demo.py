@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _START = "2026-03-01T00:00:00"
 _SEED = 1
+_POLL_SECONDS = 0.2
 
 
 def demo(
@@ -22,6 +23,7 @@ def demo(
     minutes: Annotated[
         float, typer.Option(min=1, max=1440, help="Length of the simulated day.")
     ] = 24.0,
+    look: Annotated[bool, typer.Option("--open", help="Show the day in Rerun at the end.")] = False,
 ) -> None:
     """Compose a day of a home, record it with the starter model, and draw the result."""
     from hearthlog.analyzer.extras import require
@@ -29,7 +31,11 @@ def demo(
     require("scipy", "rerun", "rerun_cli")
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import save_timeline
-    from hearthlog.analyzer.review.viewer.process import hidden_options
+    from hearthlog.analyzer.review.viewer.process import (
+        ViewerProcess,
+        has_display,
+        hidden_options,
+    )
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL
     from hearthlog.recorder.config import load_settings
@@ -40,6 +46,8 @@ def demo(
     from hearthlog.tools.cli.options import parse_time
     from hearthlog.tools.home.simulate import write_day
 
+    if look and not has_display():
+        raise HearthlogError("there is no display here: leave --open out, and look elsewhere")
     if output.exists():
         raise HearthlogError(f"{output}: exists already; delete it or choose another --output")
     model = load_model(Path(GENERAL))
@@ -72,6 +80,11 @@ def demo(
     print("                      (by these options no web page finds what Rerun shows)")
     print(f"What is true:         {day.with_suffix('.txt')}, a label track for Audacity")
     print(f"Record a microphone:  {_command('hearthlog')} record")
+    if look:
+        with ViewerProcess(["--hide-welcome-screen", str(timeline)]) as viewer:
+            while viewer.is_running():
+                time.sleep(_POLL_SECONDS)
+            viewer.check()
 
 
 def _composed_of(truth: "Truth") -> str:

@@ -1,7 +1,6 @@
 """`hearthlog doctor`: whether logs are what they should be."""
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -119,9 +118,8 @@ def _print(files: "list[Findings]") -> None:
             print(finding)
         for (level, rule), count in findings.more().items():
             print(printable(f"{level}: {findings.path}: {count} more of this kind [{rule}]"))
-    # Nobody who reads the findings with a program wants this among them.
     counts = number(errors, "error"), number(warnings, "warning")
-    print(f"{number(len(files), 'file')}: {', '.join(counts)}", file=sys.stderr)
+    print(f"{number(len(files), 'file')}: {', '.join(counts)}")
 
 
 def _as_json(files: "list[Findings]") -> dict[str, Any]:

@@ -1,8 +1,11 @@
 """`hearthlog watch --foxglove`: what is heard, or what was, in Foxglove and Lichtblick."""
 
 import secrets
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from ipaddress import ip_address
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Event
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -41,8 +44,10 @@ def show_in_foxglove(
             publisher.advertise(channel, schema)
         player = Player(recording, publisher, stop)
     listener = listen(port or PORT, address)
-    with serve(listener, admission, TellOnce(), publisher, player) as server:
-        _say_where(admission, port or PORT)
+    with (
+        serve(listener, admission, TellOnce(), publisher, player) as server,
+        _address_said(admission, port or PORT),
+    ):
         if player is not None:
             player.play(server)
         else:
@@ -50,10 +55,26 @@ def show_in_foxglove(
     return bool(damaged)
 
 
-def _say_where(admission: "Admission", port: int) -> None:
+@contextmanager
+def _address_said(admission: "Admission", port: int) -> Iterator[None]:
+    """Say where viewers connect; in a journal the name of a file that has the token for now."""
+    from hearthlog.recorder.journal import writes_to_journal
+
     host = f"[{admission.bind}]" if ":" in admission.bind else admission.bind
     place = f"{host}:{port}"
-    tell(f"open in Foxglove or Lichtblick: ws://{place}/?token={admission.token}")
+    address = f"ws://{place}/?token={admission.token}"
+    with ExitStack() as until_the_end:
+        if writes_to_journal():  # which others may read
+            folder = until_the_end.enter_context(TemporaryDirectory(prefix="hearthlog-"))
+            file = Path(folder) / "foxglove-address"
+            file.write_text(f"{address}\n")  # the folder is this account's alone
+            address = f"ws://{place}/; its whole address, which opens it, is in {file}"
+        tell(f"open in Foxglove or Lichtblick: {address}")
+        _say_who_reaches(admission, place)
+        yield
+
+
+def _say_who_reaches(admission: "Admission", place: str) -> None:
     if ip_address(admission.bind).is_loopback:
         tell(f"from another machine, first: ssh -L {place}:{place} and the name of this one")
     else:

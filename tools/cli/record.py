@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from threading import Event as Flag
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.options import (
     MaxBagFiles,
     MaxRecordSize,
@@ -23,11 +25,11 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from hearthlog.recorder.config import Settings
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
-    from hearthlog.recorder.recording_session import RecordingSummary
+    from hearthlog.recorder.recording_session import RecorderState, RecordingSummary
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.progress import Progress
 
@@ -160,11 +162,14 @@ def record(
     if files:
         if len(settings.microphone) > 1:
             wrong_use("files take the place of one microphone; the configuration has several")
-        with share_done("recording") as progress:
+        lives = realtime and sys.stderr.isatty()  # as a microphone; else a bar says how far it is
+        with ExitStack() as shown:
+            progress = ignore_progress if lives else shown.enter_context(share_done("recording"))
             source, doubts, refused = _open_files(
                 files, start, start_pattern, settings, realtime, progress
             )
-            recording = record_files(settings, source, stop, reload_requests)
+            state = shown.enter_context(_living_line(settings)) if lives else None
+            recording = record_files(settings, source, stop, reload_requests, state)
         losses = [*refused, *source.warnings]
         if not recording.labels and settings.model != NO_MODEL:
             doubts.append("the sound is too short for a label; a model needs a second of it")
@@ -188,13 +193,20 @@ def _listen(
 
     if not sys.stderr.isatty():
         return record_microphones(settings, stop, reload_requests)
+    with _living_line(settings) as state:
+        return record_microphones(settings, stop, reload_requests, state)
+
+
+@contextmanager
+def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
+    """Show in a line what is heard, from the state that is yielded."""
     from hearthlog.recorder.recording_session import RecorderState
     from hearthlog.tools.cli.living_line import living_line
 
-    tell("listening; Ctrl-C completes the log")
+    tell("Ctrl-C ends it, and completes the log")
     state = RecorderState()
     with living_line(state, settings):
-        return record_microphones(settings, stop, reload_requests, state)
+        yield state
 
 
 def with_model(settings: "Settings") -> "Settings":

@@ -337,6 +337,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.review.queue.asked import (
         asked_path,
+        drawn_minutes,
         find_kept_sound,
         label_lines,
         labels_of,
@@ -375,8 +376,9 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
         write_labels(path, marks, find_coverage(logs[0]))
     write_list(asked, spans)
     clock = [datetime.fromtimestamp(one.start // NANOSECONDS, zone) for one in marks]
+    minutes = {one.first: f"a minute, to {one.last}" for one in drawn_minutes(spans, marks)}
     print_table(
-        ("line", "from", "seconds", "label", "sound"),
+        ("line", "from", "seconds", "label", "sound", "drawn at random"),
         [
             (
                 str(line),
@@ -384,6 +386,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
                 f"{(one.end - one.start) / NANOSECONDS:.1f}",
                 one.label,
                 "kept" if any(file.first == file.last == line for file in files) else "",
+                minutes.get(line, ""),
             )
             for line, (begin, one) in enumerate(zip(clock, marks, strict=True), 1)
         ],

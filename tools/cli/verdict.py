@@ -60,11 +60,11 @@ def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
     from hearthlog.analyzer.gate.changes import time_words
 
     changes = evidence.changes
-    much = ":" if changes.pairs() else f" less than half a minute{changes.each}"
-    whole = "" if changes.each else f", taken for the {time_words(evidence.recorded)} recorded"
+    much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")
+    whole = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
     print(
-        f"\nby {time_words(evidence.minutes)} of the last two weeks that it has not learned from"
-        f"{whole}, {model} instead of {champion} would change{much}"
+        f"\n{model} in place of {champion} would change{much}{whole}, judged by "
+        f"{time_words(evidence.minutes)} of the last two weeks that it has not learned from{end}"
     )
     print_changes(changes, champion, model)
 

@@ -1,4 +1,4 @@
-"""What the rules remember from one start of the bridge to the next, in a file."""
+"""What is remembered of rules and addresses from one start of the bridge to the next, in files."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -80,6 +80,44 @@ class Memory:
                 temporary.write_text(json.dumps(content), "utf-8")
         except LogError as error:
             self._say(f"{error}; alerts may come twice after the next start")
+
+
+class KnownLines:
+    """Remembers the lines of the file of addresses, by the names of their targets.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file in which they are kept.
+    say : callable
+        Told what is wrong, in a line.
+
+    Attributes
+    ----------
+    names : list of str
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self._path = path
+        self._say = say
+        self.names: list[str] = []
+        try:
+            if path.exists():
+                content = json.loads(read_whole(path, "memory", _LIMIT, LogError))
+                self.names = [str(name) for name in content]
+        except _DAMAGED:
+            say(f"{path}: cannot be read; whoever is on an edited line may be told twice")
+
+    def keep(self, names: Sequence[str]) -> None:
+        """Remember the lines that there are now."""
+        if names == self.names:
+            return
+        self.names = list(names)
+        try:
+            with replaced_file(self._path) as temporary:
+                temporary.write_text(json.dumps(self.names), "utf-8")
+        except LogError as error:
+            self._say(f"{error}; whoever is on an edited line may be told twice")
 
 
 def _progress(content: dict[str, int]) -> Progress:

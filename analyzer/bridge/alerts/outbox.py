@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -87,6 +87,21 @@ class Outbox:
         with self._lock:
             self._targets = frozenset(targets)
             self._remove_done(now)
+
+    def replace_targets(self, former: Mapping[str, str]) -> None:
+        """Take targets for those whose place they have now: they know what those were told.
+
+        Parameters
+        ----------
+        former : mapping of str to str
+            Name of the target before, by its name now.
+        """
+        with self._lock:
+            for waiting in self._waiting.values():
+                told = {now for now, before in former.items() if before in waiting.told}
+                if told - waiting.told:
+                    waiting.told |= told
+                    self._write(waiting)
 
     def _remove_done(self, now: int) -> None:
         for name in [n for n, each in self._waiting.items() if self._is_done(each, now)]:

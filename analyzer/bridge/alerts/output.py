@@ -13,14 +13,14 @@ from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
 from hearthlog.analyzer.bridge.alerts.gathering import Gathered
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
-from hearthlog.analyzer.bridge.alerts.memory import Memory
+from hearthlog.analyzer.bridge.alerts.memory import KnownLines, Memory
 from hearthlog.analyzer.bridge.alerts.open_run import Label
 from hearthlog.analyzer.bridge.alerts.outbox import UNREAD, Outbox
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule, unknown_class
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
-from hearthlog.analyzer.bridge.alerts.targets import find_targets
+from hearthlog.analyzer.bridge.alerts.targets import Addresses, find_targets, replaced_names
 from hearthlog.analyzer.bridge.alerts.watch import AHEAD, RuleWatch
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
@@ -96,6 +96,7 @@ class AlertsOutput:
             self._outbox = Outbox(folder / "outbox", [BROKER, UNREAD], say)
         except OSError as error:
             raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
+        self._lines = KnownLines(folder / "lines.json", say)
         memory = Memory(folder / "rules.json", say)
         now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
@@ -163,16 +164,21 @@ class AlertsOutput:
         state = None if self._file is None else _state_of(self._file)
         if state == self._read_file:
             return
-        targets, problems = ([], []) if self._file is None else find_targets(self._file, self._say)
-        self._read_file = state
+        targets, problems, names, lacks_package = (
+            Addresses([], [], []) if self._file is None else find_targets(self._file, self._say)
+        )
+        self._read_file = object() if lacks_package else state
         for problem in problems:
             self._say(f"alerts: {problem}; the others are told, and who is meant when it is mended")
         if self._has_problems and not problems:
             self._say(f"alerts: {self._file}: every line of it can be read now")
         self._has_problems = bool(problems)
-        names = [target.name for target in targets] + [UNREAD] * bool(problems)
-        names += [BROKER] * (self._on_ring is not None)
-        self._outbox.set_targets(names, time.time_ns())
+        if names:
+            self._outbox.replace_targets(replaced_names(self._lines.names, names))
+            self._lines.keep(names)
+        told = [target.name for target in targets] + [UNREAD] * bool(problems)
+        told += [BROKER] * (self._on_ring is not None)
+        self._outbox.set_targets(told, time.time_ns())
         self._delivery.set_targets(targets)
 
     def _follow(self) -> None:

@@ -1,9 +1,10 @@
 """How alerts are delivered."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from hearthlog.recorder.config import PlainPath
 
 
 def _check_secret_file(value: Any) -> Any:
@@ -12,7 +13,7 @@ def _check_secret_file(value: Any) -> Any:
     return value
 
 
-SecretFile = Annotated[Path, BeforeValidator(_check_secret_file)]
+SecretFile = Annotated[PlainPath, BeforeValidator(_check_secret_file)]
 
 
 class DeliverySettings(BaseModel):

@@ -2,12 +2,14 @@
 
 import codecs
 import hashlib
+import importlib
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from difflib import SequenceMatcher
 from pathlib import Path
 from threading import get_ident
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
@@ -56,7 +58,7 @@ class AppriseTarget:
 
     def __init__(self, plugin: Any, address: str, line: int) -> None:
         self._plugin = plugin
-        self.name = hashlib.sha256(address.encode()).hexdigest()[:16]
+        self.name = _name(address)
         self.place = f"line {line}, {_scheme_and_host(plugin, address)}"
 
     def deliver(self, title: str, text: str) -> str:
@@ -96,6 +98,26 @@ def _reason(said: str) -> str:
     return "no connection" if is_away else "`apprise -v -b test ADDRESS` says why"
 
 
+class Addresses(NamedTuple):
+    """What was read of a file of addresses.
+
+    Attributes
+    ----------
+    targets : list of AppriseTarget
+    problems : list of str
+        Why somebody who was meant cannot be told, a line each, without any address.
+    names : list of str
+        What names the target of each line, whether it can be read or not.
+    lacks_package : bool
+        Whether nothing could be read, for a package is missing.
+    """
+
+    targets: list[AppriseTarget]
+    problems: list[str]
+    names: list[str]
+    lacks_package: bool = False
+
+
 def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
     """Read a file of addresses, one a line; `#` begins a line that is none.
 
@@ -111,13 +133,13 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
     BridgeError
         If the file cannot be read, a line is no address that Apprise knows, or none is there.
     """
-    targets, problems = find_targets(file, say)
-    if problems:
-        raise BridgeError("; ".join(problems))
-    return targets
+    found = find_targets(file, say)
+    if found.problems:
+        raise BridgeError("; ".join(found.problems))
+    return found.targets
 
 
-def find_targets(file: Path, say: Callable[[str], None]) -> tuple[list[AppriseTarget], list[str]]:
+def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
     """Read a file of addresses as `read_targets` does, as far as it can be read.
 
     Parameters
@@ -126,22 +148,18 @@ def find_targets(file: Path, say: Callable[[str], None]) -> tuple[list[AppriseTa
         As `secret_path` finds it.
     say : callable
         Told in a line that others may read the file.
-
-    Returns
-    -------
-    targets : list of AppriseTarget
-    problems : list of str
-        Why somebody who was meant cannot be told, a line each, without any address.
     """
     file = secret_path(file)
     try:
+        importlib.invalidate_caches()  # it may have been installed since the last time
         import apprise  # noqa: PLC0415
 
         text = _text(read_whole(file, "file of addresses", _LIMIT, BridgeError))
     except BridgeError as error:
-        return [], [str(error)]
+        return Addresses([], [str(error)], [])
     except ModuleNotFoundError as error:
-        return [], [f"{error.name} is not installed; {remedy(error.name or '')}"]
+        problem = f"{error.name} is not installed; {remedy(error.name or '')}"
+        return Addresses([], [problem], [], lacks_package=True)
     if line := exposed_secret(file):
         say(line)
     # Nothing is loaded from the disk, and nothing written there.
@@ -151,10 +169,9 @@ def find_targets(file: Path, say: Callable[[str], None]) -> tuple[list[AppriseTa
     asset.app_id = asset.app_desc = "hearthlog"
     targets: dict[str, AppriseTarget] = {}
     problems = []
-    lines = [line.strip() for line in text.splitlines()]
-    for number, address in enumerate(lines, 1):
-        if not address or address.startswith("#"):
-            continue
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    for number, address in lines:
         plugin = _plugin(address, asset)
         if plugin is None:
             problems.append(
@@ -165,7 +182,29 @@ def find_targets(file: Path, say: Callable[[str], None]) -> tuple[list[AppriseTa
             targets.setdefault(target.name, target)
     if not targets and not problems:
         problems = [f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic"]
-    return [*targets.values()], problems
+    return Addresses([*targets.values()], problems, [_name(line) for _, line in lines])
+
+
+def replaced_names(before: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Return which lines of a file of addresses were edited: the name of each now, and before.
+
+    Parameters
+    ----------
+    before, names : sequence of str
+        `Addresses.names`.
+    """
+    matcher = SequenceMatcher(None, before, names, autojunk=False)
+    edited = [
+        pair
+        for kind, i, i_end, j, j_end in matcher.get_opcodes()
+        if kind == "replace"
+        for pair in zip(names[j:j_end], before[i:i_end], strict=False)
+    ]
+    return {now: former for now, former in edited if now not in before and former not in names}
+
+
+def _name(address: str) -> str:
+    return hashlib.sha256(address.encode()).hexdigest()[:16]
 
 
 def _plugin(address: str, asset: Any) -> Any:

@@ -8,11 +8,11 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.mqtt.topics import Place
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.storage.new_files import (
     create_file,
@@ -24,14 +24,6 @@ from hearthlog.schemas.storage.small_file import read_whole
 
 _PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
 _LIMIT = 4 << 20  # bytes
-
-
-class Place(NamedTuple):
-    """The subject of a topic; parts that do not apply are empty."""
-
-    kind: str
-    microphone: str = ""
-    label: str = ""
 
 
 class _Content(BaseModel):
@@ -81,18 +73,23 @@ class Announced:
         self._is_changed = False
         self._descriptor = self._take_lock(folder)
         self._former: list[Path] = []  # of names that the recorder had
-        if self._descriptor is not None and not self.path.exists():
+        if self._descriptor is not None:
             self._former = [
                 path
                 for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}"))
-                if is_renamed(path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX))
+                if path != self.path
+                and not _is_used(path)
+                and is_renamed(path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX))
             ]
-        source = self._former[-1] if self._former else self.path
-        self.is_new = self._descriptor is None or not source.exists()
-        content = _Content() if self.is_new else self._load(source)
+        sources = [*self._former, *([self.path] if self.path.exists() else [])]
+        self.is_new = self._descriptor is None or not sources
+        contents = [] if self.is_new else [self._load(source) for source in sources]
+        content = contents[-1] if contents else _Content()
         self._is_changed = bool(self._former)
         self._broker = broker
-        self.topics = content.topics if content.broker == broker else {}
+        self.topics: dict[str, Place] = {}
+        for each in contents:
+            self.topics |= each.topics if each.broker == broker else {}
         self._muted = set(content.muted)
         self._last_events = content.last_events
 
@@ -186,7 +183,7 @@ class Announced:
     def _take_lock(self, folder: Path) -> int | None:
         try:
             private_folder(folder)
-            descriptor = open_lock(folder / f".{self.path.stem}.lock")
+            descriptor = open_lock(_lock_path(self.path))
         except OSError as error:
             self._say(f"mqtt: {folder}: cannot be used ({error.strerror}); nothing is remembered")
             return None
@@ -208,3 +205,24 @@ class Announced:
         except (HearthlogError, ValidationError):
             self._say(f"mqtt: {path}: cannot be read, and begins anew; all classes are told of")
             return _Content()
+
+
+def _lock_path(path: Path) -> Path:
+    return path.with_name(f".{path.stem}.lock")
+
+
+def _is_used(path: Path) -> bool:
+    """Return whether a bridge runs that remembers there."""
+    try:
+        descriptor = os.open(_lock_path(path), os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False

@@ -221,8 +221,8 @@ class Connection:
         self._is_refused = False
         self._connected = time.monotonic()
         self._sent = None
-        for topic in self._subscriptions:
-            client.subscribe(topic, _QOS)
+        if self._subscriptions:
+            client.subscribe([(topic, _QOS) for topic in self._subscriptions])
         client.publish(self._alive, "online", _QOS, retain=True)
         self._is_new = True
         self._ready_at = self._connected + _KEPT_SECONDS
@@ -271,9 +271,9 @@ class Connection:
     def _on_subscribe(
         self, _client: mqtt.Client, _data: Any, _number: int, reasons: list[ReasonCode], _more: Any
     ) -> None:
-        for reason in reasons:
+        for topic, reason in zip(self._subscriptions, reasons, strict=False):
             if reason.is_failure:
-                self._say(f"{self._place}: may not read some topics: {reason}")
+                self._say(f"{self._place}: may not read {topic}: {reason}")
 
 
 def place_of(settings: MqttSettings) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hearthlog._version import __version__
-from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
+from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, Place, Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
 _BY = "Home Assistant"
@@ -123,6 +123,37 @@ def command_discovery(
         "availability": [{"topic": topics.of_home("bridge")}],
         "components": components,
     }
+
+
+def described(topics: Topics, payload: bytes) -> list[Place]:
+    """Return the places of a device that a bridge of this recorder described; of others none.
+
+    Parameters
+    ----------
+    topics : Topics
+    payload : bytes
+        As `discovery` and `command_discovery` make it, or anything else.
+    """
+    try:
+        content = json.loads(payload)
+        (own,) = content["device"]["identifiers"]
+        bridge, *listening = [each["topic"] for each in content["availability"]]
+        named = [
+            each[key]
+            for each in content["components"].values()
+            for key in ("state_topic", "json_attributes_topic")
+            if key in each
+        ]
+        places = [topics.parse(topic) for topic in [*listening, *named]]
+    except (ValueError, RecursionError, KeyError, TypeError, AttributeError):
+        return []
+    microphone = places[0].microphone if listening and places[0] is not None else ""
+    device = device_id(topics.node, microphone) if microphone else home_id(topics.node)
+    if (own, bridge) != (device, topics.of_home("bridge")):
+        return []
+    more = [Place("last_event", microphone)] if microphone else []
+    found = [each for each in places if each is not None and each.microphone == microphone]
+    return [Place(CONFIG, microphone), *found, *more]
 
 
 def _device(own: str, name: str) -> dict[str, Any]:

@@ -15,15 +15,16 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState, Known, MicrophoneState
-from hearthlog.analyzer.bridge.mqtt.announced import Announced, Place
+from hearthlog.analyzer.bridge.mqtt.announced import Announced
 from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
 from hearthlog.analyzer.bridge.mqtt.discovery import (
     command_discovery,
+    described,
     device_id,
     discovery,
     home_id,
 )
-from hearthlog.analyzer.bridge.mqtt.topics import Topics
+from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE, UNKNOWN
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
-_CONFIG, _TOLD = "config", "told"  # kinds of topics
 _BORN = b"online"  # of Home Assistant
 _MOST_ASKED = 20  # commands that wait
 _MOST_BEGUN = 1000
@@ -83,13 +83,16 @@ class MqttPublisher:
         )
         self._forgotten: set[str] = set()  # topics that the broker is just told to forget
         self._has_said_muted = False
-        # Earlier versions left it to the broker to remember what is switched off.
-        self._reads_back = settings.commands and self._announced.is_new
+        # Earlier versions left it to the broker to remember what it keeps, and is not told of.
+        self._is_new = self._announced.is_new
+        self._reads_back = settings.commands and self._is_new
         self._was_ready = False
         if settings.commands:
             subscriptions.append(self._command_topic)
             if self._reads_back:
                 subscriptions.append(topics.told_filter)
+        if self._is_new:
+            subscriptions.append(self._discovery_topic("+"))
         client_id = settings.client_id or f"hearthlog-{home.node}"
         try:
             self._connection = Connection(
@@ -213,10 +216,16 @@ class MqttPublisher:
             if not message.retain:  # else it was meant for whoever was there then
                 self._asked.append(bytes(message.payload))
         elif self._reads_back and message.retain and message.payload == b"OFF":
-            label = self._topics.parse_told(message.topic)
-            if label is not None:
-                self._announced.switch(label, is_told=False)
+            place = self._topics.parse(message.topic)
+            if place is not None and place.kind == TOLD:
+                self._announced.switch(place.label, is_told=False)
                 self._has_said_muted = False
+        elif self._is_new and message.retain:
+            for place in described(self._topics, bytes(message.payload)):
+                self._announced.add(self._topic(place), place)
+
+    def _discovery_topic(self, device: str) -> str:
+        return f"{self._settings.discovery_topic}/device/{device}/config"
 
     def _say_muted(self) -> None:
         """Say once which classes the broker is not told of, and how to change that."""
@@ -233,18 +242,12 @@ class MqttPublisher:
 
     def _topic(self, place: Place) -> str:
         """Name the topic that is about something."""
-        kind, microphone, label = place
+        kind, microphone, _ = place
         node = self._topics.node
-        if kind == _CONFIG:
+        if kind == CONFIG:
             device = device_id(node, microphone) if microphone else home_id(node)
-            return f"{self._settings.discovery_topic}/device/{device}/config"
-        if kind == _TOLD:
-            return self._topics.of_told(label)
-        if label:
-            return self._topics.of_class(microphone, label, kind)
-        if microphone:
-            return self._topics.of_microphone(microphone, kind)
-        return self._topics.of_home(kind)
+            return self._discovery_topic(device)
+        return self._topics.name(place)
 
     def _keep(self, place: Place, value: str) -> None:
         """Publish a value that the broker keeps, and remember that it does."""
@@ -260,7 +263,7 @@ class MqttPublisher:
         if self._settings.home_assistant:
             gone = sorted(self._announced.labels(name).difference(classes))
             config = discovery(self._topics, name, classes, gone)
-            self._keep(Place(_CONFIG, name), json.dumps(config))
+            self._keep(Place(CONFIG, name), json.dumps(config))
 
     def _describe_switches(self) -> None:
         """Tell Home Assistant what it may command; nothing where it may not."""
@@ -271,7 +274,7 @@ class MqttPublisher:
         if switches != self._switches:
             self._switches = switches
             config = command_discovery(self._topics, *switches)
-            self._keep(Place(_CONFIG), json.dumps(config))
+            self._keep(Place(CONFIG), json.dumps(config))
 
     def _clear_gone(self, state: HomeState) -> None:
         """Have the broker forget what this bridge, or an earlier one, gave it and is no more."""
@@ -290,10 +293,10 @@ class MqttPublisher:
         kind, microphone, label = place
         if topic != self._topic(place):  # the recorder, or a topic, has another name now
             return True
-        if kind == _CONFIG and not self._settings.home_assistant:
+        if kind == CONFIG and not self._settings.home_assistant:
             return True
         if not microphone:
-            return kind in {_CONFIG, _TOLD} and not self._settings.commands
+            return kind in {CONFIG, TOLD} and not self._settings.commands
         if state.is_left_out(microphone):
             return True
         classes = self._classes.get(microphone)
@@ -316,7 +319,7 @@ class MqttPublisher:
         for label in (each for each in microphone.classes if each != SILENCE):
             is_told = self._announced.is_told(label)
             if self._settings.commands:
-                self._keep(Place(_TOLD, label=label), _ON[is_told])
+                self._keep(Place(TOLD, label=label), _ON[is_told])
             for kind, value in class_values(microphone, label, news, known):
                 shown = value if is_told or kind != "on" else _ON[False]
                 self._keep(Place(kind, microphone.name, label), shown)
@@ -371,18 +374,23 @@ def event_fields(event: Event, news: News) -> dict[str, str | float]:
 def _is_renamed(home: Home, former: str) -> bool:
     """Return whether another recorder of the folder has the name of this one now.
 
-    It does not record, and all of its logs are from before the first one of this recorder: two
-    recorders of one folder write theirs side by side.
+    It does not record, and this recorder wrote none of its logs between those of the other, but
+    later ones, or writes now: two recorders of one folder write theirs side by side.
     """
     if former == home.node:
         return False
-    if any(each.node == former and each.is_held is not False for each in node_locks(home.folder)):
+    locks = {each.node: each.is_held for each in node_locks(home.folder)}
+    if locks.get(former, False) is not False:
         return False
     names = [
         log_name(Path(entry.name))
         for entry in walk_logs(home.folder)
         if not is_layer(Path(entry.name))
     ]
-    own = min((each.time for each in names if each.node == home.node), default="")
-    last = max((each.time for each in names if each.node == former), default="")
-    return not own or last < own
+    own = [each.time for each in names if each.node == home.node]
+    theirs = [each.time for each in names if each.node == former]
+    if not own or not theirs:
+        return True
+    first, last = min(theirs), max(theirs)
+    is_since = max(own) > last or bool(locks.get(home.node, False))
+    return is_since and not any(first <= time <= last for time in own)

@@ -8,6 +8,17 @@ _CLASS_PART = "/class/"
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
 
 
+CONFIG, TOLD = "config", "told"  # kinds of places
+
+
+class Place(NamedTuple):
+    """The subject of a topic; parts that do not apply are empty."""
+
+    kind: str
+    microphone: str = ""
+    label: str = ""
+
+
 class Topics(NamedTuple):
     """Names the topics of one recorder.
 
@@ -57,10 +68,30 @@ class Topics(NamedTuple):
         """The subscription that matches all names of `of_told`."""
         return f"{self.root}/told/+"
 
-    def parse_told(self, topic: str) -> str | None:
-        """Return the class of a topic that says whether it is told of; None of another one."""
-        name = topic.removeprefix(f"{self.root}/told/")
-        return None if name == topic else unquote(name)
+    def name(self, place: Place) -> str:
+        """Name the topic of a place of any kind but `config`, which has a topic of discovery."""
+        kind, microphone, label = place
+        if kind == TOLD:
+            return self.of_told(label)
+        if label:
+            return self.of_class(microphone, label, kind)
+        return self.of_microphone(microphone, kind) if microphone else self.of_home(kind)
+
+    def parse(self, topic: str) -> Place | None:
+        """Return the place of a topic that `name` gives; None of another one."""
+        parts = topic.removeprefix(f"{self.root}/").split("/")
+        match parts:
+            case [kind]:
+                place = Place(kind)
+            case ["told", label]:
+                place = Place(TOLD, label=unquote(label))
+            case [microphone, kind]:
+                place = Place(kind, microphone)
+            case [microphone, "class", label, kind]:
+                place = Place(kind, microphone, unquote(label))
+            case _:
+                return None
+        return place if self.name(place) == topic else None
 
 
 def _part(label: str) -> str:

@@ -1,11 +1,9 @@
 """The page of the home, made of what the bridge knows, once a second where something changed."""
 
 import json
-import os
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from hearthlog.analyzer.bridge.page.server import PageServer
 from hearthlog.analyzer.bridge.page.words import clock, room
 from hearthlog.analyzer.bridge.settings import PageSettings
 from hearthlog.analyzer.ports import ip_of
+from hearthlog.recorder.journal import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
 
 _EVERY_SECONDS = 1.0
@@ -84,7 +83,7 @@ class HomePage:
             self._server.end()
             raise
         # Others may read the journal.
-        if _writes_to_journal():
+        if writes_to_journal():
             whole = f"{address}; its whole address, which opens it, is in {file.absolute()}"
         say(f"the page of the home: {whole}")
         if not bind.is_loopback:
@@ -150,11 +149,3 @@ def _day_key(news: News) -> Any:
         )
         for each in microphones
     ]
-
-
-def _writes_to_journal() -> bool:
-    """Whether standard error is the journal of systemd, which says so as DEVICE:INODE."""
-    with suppress(OSError):
-        status = os.fstat(2)
-        return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
-    return False

@@ -80,6 +80,22 @@ def read_token(file: Path) -> str:
     return token
 
 
+def figures_token(port: int, file: Path | None) -> str:
+    """Return the token of the port for Prometheus.
+
+    Raises
+    ------
+    BridgeError
+        If there is none: every account of the machine can reach a port of loopback.
+    """
+    if file is None:
+        raise BridgeError(
+            f"bridge.prometheus: port {port} stays closed, as every account of this machine could "
+            "read it: name a `token_file`, and the same file as `credentials_file` in Prometheus"
+        )
+    return read_token(file)
+
+
 def _kept(path: Path) -> str:
     if not path.exists():
         _write(path, secrets.token_urlsafe(16))

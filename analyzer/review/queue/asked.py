@@ -151,7 +151,7 @@ def sound_files(
     kept : KeptSound
     """
     lines = [SoundFile(n, n, mark.start, mark.end) for n, mark in enumerate(marks, 1)]
-    files = [*lines, *(one for one in _minutes(asked, marks) if one.last > one.first)]
+    files = [*lines, *(one for one in drawn_minutes(asked, marks) if one.last > one.first)]
     return [one for one in files if cut(kept.time, one.start, one.end).length >= _SHORTEST]
 
 
@@ -210,7 +210,7 @@ def label_lines(
         Of the home.
     """
     notes: dict[int, list[str]] = {}
-    for minute in _minutes(asked, marks):
+    for minute in drawn_minutes(asked, marks):
         text = f"a minute drawn at random, to line {minute.last}"
         notes.setdefault(minute.first, []).append(text)
     for file in files:
@@ -233,7 +233,7 @@ def _clock(nanoseconds: int, zone: tzinfo) -> str:
     return f"{text[:19]}.{decimals}{text[19:]}" if decimals else text
 
 
-def _minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterator[SoundFile]:
+def drawn_minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterator[SoundFile]:
     """Yield the minutes that were drawn at random; one whose log is gone has no lines."""
     for span in asked:
         lines = [number for number, mark in enumerate(marks, 1) if _answers(mark, span)]

@@ -1,5 +1,6 @@
 """Messages of logs as rows of a timeline: fields taken out, names of values checked."""
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,12 +10,14 @@ from hearthlog.analyzer.logs.bearings import as_vectors
 from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.health import MicrophoneState, microphone_states
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
+from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import TopicName, is_review, parse_topic
 
 ENERGY = "energy"
+_SEGMENT_LINE = re.compile(r"^(\w+) for(?= [\d.]+ s \(\d+ %\)$)")
 FIELDS = {
     message_types.FEATURES: ("header.stamp", "values"),
     message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
@@ -132,11 +135,17 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
         If a channel does not name its values, or names another number of them.
     """
     if columns.type == message_types.LOG:
-        return LogLines(columns["stamp"], columns["level"], columns["msg"])
+        texts = np.array([worded(text) for text in columns["msg"]], object)
+        return LogLines(columns["stamp"], columns["level"], texts)
     if columns.type == message_types.DIAGNOSTICS:
         return StateRows(list(microphone_states(columns)))
     topic = shown_topic(columns.topic)
     return topic and _microphone_rows(path, columns, topic)
+
+
+def worded(line: str) -> str:
+    """Return a line about a segment with the name that the lane of its class has."""
+    return _SEGMENT_LINE.sub(lambda found: f"{in_words(found[1])} for", line)
 
 
 def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:

@@ -56,6 +56,12 @@ def hidden_options() -> str:
     return f"--bind {address} --port {free_port(bind=address)}"
 
 
+def has_display() -> bool:
+    """Tell whether a window can be opened: on Linux by a display of X11 or Wayland."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or any(map(os.environ.get, names))
+
+
 def check_display(instead: str) -> None:
     """Raise DataError where no window can be opened.
 
@@ -69,8 +75,7 @@ def check_display(instead: str) -> None:
     DataError
         If this is Linux without a display of X11 or Wayland.
     """
-    names = ("DISPLAY", "WAYLAND_DISPLAY")
-    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in names):
+    if not has_display():
         raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
 
 
