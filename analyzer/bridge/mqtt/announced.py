@@ -45,7 +45,7 @@ class Announced:
     node : str
         Name of the recorder.
     broker : str
-        Host and port. What another broker was given is forgotten.
+        Host and port.
     is_renamed : callable
         Given the name of another recorder, returns whether it has this name now: what was
         remembered of it is taken over.
@@ -88,8 +88,9 @@ class Announced:
         self._is_changed = bool(self._former)
         self._broker = broker
         self.topics: dict[str, Place] = {}
+        # Of another address of the broker, too: it may be the same one, and else has none of them.
         for each in contents:
-            self.topics |= each.topics if each.broker == broker else {}
+            self.topics |= each.topics
         self._muted = set(content.muted)
         self._last_events = content.last_events
 

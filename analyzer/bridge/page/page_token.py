@@ -49,6 +49,11 @@ def cookie_key(state: Path) -> bytes:
     return _kept(state / _COOKIES).encode()
 
 
+def page_secrets(state: Path) -> list[Path]:
+    """Name the files of secrets that the page keeps in a folder."""
+    return [state / name for name in (_TOKEN, _COOKIES, _ADDRESS)]
+
+
 def keep_address(address: str, state: Path) -> Path:
     """Write the whole address of the page into a file that only its owner may read.
 
