@@ -497,6 +497,18 @@ def converted(path, target, *options):
 
 
 @needs_ffmpeg
+@pytest.mark.parametrize("suffix", ["wave", "flv", "eac3", "mpg", "mts", "snd"])
+def test_what_is_read_by_its_name_is_found_in_a_folder_too(wav, tmp_path, suffix):
+    if suffix == "wave":
+        path = wav("card/b.wave")
+    else:
+        (tmp_path / "card").mkdir()
+        options = ("-f", "au") if suffix == "snd" else ()
+        path = converted(wav("a.wav"), tmp_path / "card" / f"b.{suffix}", *options)
+    assert find_audio([path.parent]) == ([path], [])
+
+
+@needs_ffmpeg
 @pytest.mark.parametrize("suffix", ["m4a", "aac", "webm", "wma", "mka", "oga"])
 def test_what_libsndfile_cannot_read_is_read_by_ffmpeg(wav, sound, tmp_path, suffix):
     path = converted(wav("a.wav"), tmp_path / f"b.{suffix}")

@@ -58,10 +58,11 @@ def locked_groups(path: Path) -> Iterator[None]:
     DataError
         If its folder cannot be written.
     """
+    lock_file = path.with_name(f".{path.name}.lock")
     try:
-        lock = os.fdopen(open_lock(path.with_name(f".{path.name}.lock")), "rb")
+        lock = os.fdopen(open_lock(lock_file), "rb")
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        raise DataError(f"{lock_file}: cannot be written ({error.strerror})") from error
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

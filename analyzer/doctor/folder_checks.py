@@ -75,7 +75,7 @@ def _check_layers(files: Sequence[ExaminedFile]) -> None:
         first, last = spans.get(log, (start, end))
         if end < first - _BESIDE or last + _BESIDE < start:
             findings = next(file.findings for file in files if file.findings.path == path)
-            what = f"is of {millisecond_text(start)}, when {log.name} was not recorded"
+            what = f"speaks of a time when {log.name} was not recorded"
             advice = "it belongs to another log; move it beside that"
             findings.warning("layer", what, advice, time=start)
 
