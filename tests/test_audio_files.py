@@ -503,7 +503,7 @@ def test_what_is_read_by_its_name_is_found_in_a_folder_too(wav, tmp_path, suffix
         path = wav("card/b.wave")
     else:
         (tmp_path / "card").mkdir()
-        options = ("-f", "au") if suffix == "snd" else ()
+        options = ("-f", "au") if suffix == "snd" else ("-ar", 44_100)
         path = converted(wav("a.wav"), tmp_path / "card" / f"b.{suffix}", *options)
     assert find_audio([path.parent]) == ([path], [])
 

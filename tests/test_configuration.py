@@ -215,7 +215,7 @@ def test_every_number_has_bounds(tmp_path, value):
         ("clip_minutes_a_day = '90 s'", "write clip_minutes_a_day = 2, without a unit"),
         ("clip_min_free_space = '2G'", "write clip_min_free_space = 2000, without a unit"),
         ("clip_min_free_space = '500 MiB'", "write clip_min_free_space = 500, without a unit"),
-        ("clip_min_free_space = '2h'", "write clip_min_free_space = 2"),
+        ("clip_min_free_space = '2h'", "write clip_min_free_space = 500"),
         ("quiet_hours = '10pm-6am'", 'write quiet_hours = ["22:00-06:30"]'),
         ("quiet_hours = '8:00-9:00'", 'write quiet_hours = ["22:00-06:30"]'),
         ("privacy = 'talking'", 'write privacy = ["talking"]'),

@@ -89,8 +89,8 @@ def _check_bind(address: str) -> str:
     found = ip_of(address)
     if found is None or found.is_multicast:
         raise ValueError(
-            f"{address[:64]!r} is no address of a machine: write one of this machine in digits, "
-            "such as 127.0.0.1"
+            f"{address[:64]!r} is no address: write one of this machine in digits, such as "
+            "127.0.0.1"
         )
     return address
 
