@@ -15,6 +15,7 @@ Schema = Mapping[str, Any]
 
 _LONGEST = 40  # characters of a value that are shown
 _MOST = 100  # slips that are said
+_MOST_LISTED = 16  # keys of a table
 _DAY = 86_400
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": _DAY, "w": 7 * _DAY}  # seconds, by the first letter
 _LONGER = {"mo": 30 * _DAY, "y": 365 * _DAY}
@@ -155,6 +156,8 @@ def _unknown_key(
     near = next(iter(get_close_matches(name.lower(), known, 1, 0.6)), "")
     if near:
         return near, f"; is {near} meant?"
+    if 0 < len(known) <= _MOST_LISTED:
+        return "", f"; the keys of this table are {', '.join(known)}"
     return "", "; `hearthlog config schema` lists the keys" if known else ""
 
 

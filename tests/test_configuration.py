@@ -239,6 +239,7 @@ def test_every_number_has_bounds(tmp_path, value):
             "unknown key 'microphone.0.node'; it belongs above the first",
         ),
         ("[bridge.page]\nquiet_hours = []", "; it belongs above the first table"),
+        ("[bridge.page]\nzzz = 1", "the keys of this table are port, bind, token_file, names, fr"),
         ("[bridge.mqtt]\nhost='x'\npassword='geheim'", 'write password_file = "/etc/hearthlog/'),
         ("[bridge.mqtt]\nhost='x'\ntopic='a/#'", "'a/#' cannot begin topics; write 1 to 200"),
         ("[[bridge.alert]]\nname='x'\nrule='more'", 'rule is one of "longer_than", "more_than"'),

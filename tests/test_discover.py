@@ -436,7 +436,7 @@ def test_groups_of_which_a_bit_has_changed_are_refused(groups_file):
     content[-9] ^= 1
     path = groups_file.with_name("changed")
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"changed: is not as it was written \(sha256 .* backup"):
+    with pytest.raises(DataError, match=r"changed: is not as it was written \(digest .* backup"):
         load_groups(path)
 
 

@@ -1282,9 +1282,9 @@ def test_the_command_says_how_it_went_by_its_exit_status(hearthlog, recorded, lo
     assert hearthlog("doctor", tmp_path / "none").returncode == 1
 
 
-def test_a_sound_log_has_status_0_and_nothing_to_say(hearthlog, series):
+def test_a_sound_log_has_status_0_and_nothing_but_the_sum_is_said(hearthlog, series):
     result = hearthlog("doctor", find_logs(series)[0])
-    assert (result.returncode, result.stdout) == (0, "")
+    assert (result.returncode, result.stdout) == (0, "1 file: 0 errors, 0 warnings\n")
 
 
 def test_the_findings_as_json(hearthlog, recorded):

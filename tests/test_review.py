@@ -735,6 +735,13 @@ def test_a_file_that_exists_is_left_alone(recorded_home, capfd, tmp_path):
     assert "exists already" in done.stderr
 
 
+def test_the_end_of_the_input_ends_a_review_whose_page_nobody_opened(recorded_home):
+    command = [*HEARTHLOG, "review", str(recorded_home), "--queue", "--web"]
+    done = subprocess.run(command, input="", capture_output=True, text=True, check=False)
+    assert done.returncode in {0, 3}
+    assert "nobody opened the page, and the input ended" in done.stderr
+
+
 def test_a_queue_of_logs_without_labels_is_refused(tmp_path, capfd, day):
     record(Settings(output=tmp_path / "logs"), FileSource([day], START), Flag())
     done = run(capfd, "review", tmp_path / "logs", "--web", "--queue", "novel")

@@ -189,7 +189,7 @@ def test_a_log_says_which_scenarios_ran_and_is_sound(log, capfd):
     assert "model.scenario-water.json" in facts["attachments"]
     assert set(facts["segments"]) == {"mic", "mic/scenario/water"}
     checked = run(capfd, "doctor", log)
-    assert (checked.returncode, checked.stdout) == (0, "")
+    assert (checked.returncode, checked.stdout) == (0, "1 file: 0 errors, 0 warnings\n")
 
 
 def test_a_replay_gives_the_labels_of_a_scenario_again(log, tmp_path, capfd):

@@ -232,7 +232,9 @@ def test_a_service_may_use_the_network_if_a_microphone_is_there(service):
 
 def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service):
     told = 'readable_by = "group"\n[bridge.prometheus]\nport = 9177\n'
+    told += 'token_file = "/etc/prometheus-token"\n'
     service.write("/etc/home.toml", told)
+    service.write("/etc/prometheus-token", "a-token-of-the-figures\n")
     install(service, "--config", "/etc/home.toml")
     wait_for_labels(service)
     # Where Python was built with its library in a home, the service would find that of the system.
@@ -241,7 +243,9 @@ def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service
     result = install(service, "--bridge", "--config", "/etc/home.toml")
     assert result.stdout == "/etc/systemd/system/hearthlog-bridge.service\n"
     asked = (
-        "from urllib.request import urlopen as u; print(u('http://127.0.0.1:9177/metrics').read())"
+        "from urllib.request import Request, urlopen; shown = {'Authorization': "
+        "'Bearer a-token-of-the-figures'}; print(urlopen(Request("
+        "'http://127.0.0.1:9177/metrics', headers=shown)).read())"
     )
     python = f"{PREFIX}/bin/python"
     service.wait(

@@ -147,7 +147,7 @@ def test_log_time_never_runs_backwards_and_the_doctor_finds_nothing(two_logs, he
     for log in find_logs(two_logs[1]):
         times = [item.log_time for item in LogReader(log).messages()]
         assert times == sorted(times)
-    assert "0 errors" in hearthlog("doctor", two_logs[1]).stderr
+    assert "0 errors" in hearthlog("doctor", two_logs[1]).stdout
 
 
 def test_what_is_held_goes_into_the_log_of_the_model_before(model_file):

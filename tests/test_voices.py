@@ -468,7 +468,7 @@ def test_voices_of_which_a_bit_has_changed_are_refused(tmp_path):
     content = bytearray(path.read_bytes())
     content[-8] ^= 1
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"is not as it was written \(sha256 .* backup"):
+    with pytest.raises(DataError, match=r"is not as it was written \(digest .* backup"):
         load_voices(path)
 
 

@@ -74,7 +74,7 @@ def damage(
     """Return the line about a file whose digest is not what it was written with."""
     expected = ascii(expected[:12])[1:-1]  # it may be anything
     return (
-        f"{path}: is not as it was written (sha256 {found[:12]}, not {expected}): the disk or "
+        f"{path}: is not as it was written (digest {found[:12]}, not {expected}): the disk or "
         f"somebody has changed it; {cure}"
     )
 

@@ -17,7 +17,9 @@ def print_recording(path: Path) -> None:
 
 
 def show_page(address: str) -> None:
-    """Say where a page is, and open it where there is a display."""
+    """Say where a page is, and open it where there is a display; without an address nothing."""
+    if not address:
+        return
     from hearthlog.analyzer.review.viewer.process import has_display
 
     tell(f"open {address}")

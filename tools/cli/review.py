@@ -265,24 +265,29 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     keys: SimpleQueue[str] = SimpleQueue()
     viewer.offer(session.keys, keys.put)
     viewer.draw(timeline, close_up=bool(items))
-    if viewer.address:
-        show_page(viewer.address)
-    viewer.wait_until_drawn()
-    grid = timeline.grid
-    if not items and grid.end - grid.start <= MOST_FRAMES:
-        look_closely(grid.start, grid.end)
-    viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
-    print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
-    with read_keys(keys), suppress(KeyboardInterrupt):
+    show_page(viewer.address)
+    with read_keys(keys) as ended, suppress(KeyboardInterrupt):
+        if viewer.wait_until_drawn(lambda: ended.is_set() and keys.qsize() <= 1) is None:
+            tell("nobody opened the page, and the input ended")
+            return
+        grid = timeline.grid
+        if not items and grid.end - grid.start <= MOST_FRAMES:
+            look_closely(grid.start, grid.end)
+        viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
+        print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
         if session.run(keys):
-            words = [word for log in logs for word in ("--home", str(log))]
-            words += ["--scenario", marking.scenario] if marking.scenario else []
-            what = f"scenario {marking.scenario}" if marking.scenario else "this home"
-            train = f"hearthlog train {shlex.join(words)}"
-            judged = "" if marking.scenario else f" ({JUDGED_BY})"
-            tell(f"next: a model of {what}, from what is marked{judged}: {train}")
+            _say_next(logs, marking.scenario)
     if not marking.scenario:
         _say_how_right(logs)
+
+
+def _say_next(logs: list[Path], scenario: str) -> None:
+    words = [word for log in logs for word in ("--home", str(log))]
+    words += ["--scenario", scenario] if scenario else []
+    what = f"scenario {scenario}" if scenario else "this home"
+    judged = "" if scenario else f" ({JUDGED_BY})"
+    train = f"hearthlog train {shlex.join(words)}"
+    tell(f"next: a model of {what}, from what is marked{judged}: {train}")
 
 
 def _say_how_right(logs: list[Path]) -> None:

@@ -242,8 +242,18 @@ class Viewer:
         self._reviewed[microphone, lane.name].show(lane, self._canvas)
         self._flush()
 
-    def wait_until_drawn(self) -> ViewerState:
+    def wait_until_drawn(self, is_over: Callable[[], bool] = bool) -> ViewerState | None:
         """Wait until the viewer shows what was sent to it; for a page, until somebody opens it.
+
+        Parameters
+        ----------
+        is_over : callable, optional
+            Returns whether nobody will open the page any more.
+
+        Returns
+        -------
+        ViewerState or None
+            None if nobody will.
 
         Raises
         ------
@@ -253,6 +263,8 @@ class Viewer:
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while self.address or time.monotonic() < deadline:
+            if self.address and is_over():
+                return None
             try:
                 state = self.state()
             except (ConnectionError, TimeoutError):
