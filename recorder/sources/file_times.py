@@ -26,18 +26,12 @@ _IN_NAME = re.compile(
       |h(?P<minute_h>\d\d)m(?P<second_h>\d\d)s?)
     (?!\d)
     (?:[.,](?P<fraction>\d{1,9})(?![0-9A-Za-z]|$)|[.,](?P<fraction_z>\d{1,9})(?=Z|$))?
-    (?:[ _\u00a0\u202f-]?(?P<half>[AaPp])(?:[Mm]|\.[ \u00a0\u202f]?[Mm]\.?)(?![0-9A-Za-z])
+    (?:[ _\u202f]?(?P<half>[AaPp])[Mm](?![0-9A-Za-z])
       |(?P<zone>Z|[ _]?(?:UTC|GMT)(?:[+-]\d\d?(?::?\d\d)?)?|[+-]\d\d:?\d\d|\+\d\d)
        (?![0-9A-Za-z]))?
     """,
     re.VERBOSE | re.ASCII,
 )
-_MAY_BE_HALF = re.compile(r"[ _\u00a0\u202f-]?[AaPp]\.?[Mm]\d")  # or a microphone's name
-# Of the zones that there are; other numbers behind a time count parts of a recording.
-_PARTS_OF_HOURS = {
-    *("+0330", "+0430", "+0530", "+0545", "+0630", "+0845", "+0930", "+1030", "+1245", "+1345"),
-    *("-0230", "-0330", "-0430", "-0930"),
-}
 _HEXADECIMAL = re.compile(r"[0-9A-F]{8}")  # of old AudioMoths: seconds since 1970
 _AUDIOMOTH = re.compile(
     r"Recorded at (\d\d:\d\d:\d\d(?:\.\d{3})?) (\d\d)/(\d\d)/(\d{4}) "
@@ -95,7 +89,6 @@ class _Moment(NamedTuple):
 
     time: datetime  # without a zone where the text has none
     step: int  # ns
-    doubt: str = ""
 
 
 def file_time(path: Path, zone: tzinfo, pattern: str = "") -> FileTime:
@@ -276,19 +269,7 @@ def _moment(found: re.Match[str]) -> _Moment | None:
     except ValueError:
         return None
     step = NANOSECONDS // 10 ** len(fraction) if second else 60 * NANOSECONDS
-    zone = _offset(found["zone"])
-    return _Moment(moment.replace(tzinfo=zone), step, _doubt(found, zone))
-
-
-def _doubt(found: re.Match[str], zone: tzinfo | None) -> str:
-    """Say what else the text behind a time may mean; empty if nothing."""
-    text = found["zone"] or ""
-    if zone and re.fullmatch(r"-\d{4}", text) and found["between"] != "T":
-        return f"{text!r} in its name was taken for a time zone, and may be a number"
-    behind = _MAY_BE_HALF.match(found.string, found.end())
-    if behind and not found["half"] and 1 <= int(found["hour"]) <= 12:
-        return f"{behind.group()!r} in its name may mean the morning or the evening"
-    return ""
+    return _Moment(moment.replace(tzinfo=_offset(found["zone"])), step)
 
 
 def _offset(text: str | None) -> tzinfo | None:
@@ -298,9 +279,6 @@ def _offset(text: str | None) -> tzinfo | None:
     found = re.search(r"([+-])(\d\d?):?(\d\d)?$", text)
     if found is None:
         return UTC
-    compact = re.fullmatch(r"[+-]\d\d(?!00)\d\d|-0000|-1[34]00", text)
-    if compact and text not in _PARTS_OF_HOURS:
-        return None
     minutes = int(found[2]) * 60 + int(found[3] or 0)
     if minutes > 14 * 60 or minutes % 15:
         return None
@@ -310,7 +288,7 @@ def _offset(text: str | None) -> tzinfo | None:
 def _by_name(path: Path, moments: list[_Moment], zone: tzinfo) -> FileTime:
     """Choose the first time of a name; the metadata may say in which zone it is."""
     moment, *others = moments
-    remark = moment.doubt
+    remark = ""
     if moment.time.tzinfo is None:
         same = (
             one.time

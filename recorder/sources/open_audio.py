@@ -26,9 +26,8 @@ BLOCK_SECONDS = 10.0
 RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
 
 _SUFFIXES = frozenset(
-    {".wav", ".wave", ".flac", ".ogg", ".oga", ".opus", ".spx", ".mp3", ".aif", ".aiff", ".aifc"}
-    | {".au", ".snd", ".caf", ".w64", ".rf64", ".voc", ".eac3", ".ec3", ".ape", ".dsf"}
-    | {".flv", ".f4v", ".mpg", ".mpeg", ".vob", ".mts", ".m2ts"}  # .ts may be a program's text
+    {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf"}
+    | {".w64", ".rf64", ".voc"}
     | {".m4a", ".m4b", ".aac", ".mp4", ".m4v", ".mov", ".3gp", ".3g2", ".amr", ".awb", ".webm"}
     | {".mka", ".mkv", ".wma", ".wmv", ".asf", ".avi", ".mp2", ".mpga", ".ac3", ".wv", ".tta"}
 )
