@@ -1,6 +1,7 @@
 """The state of the recorders of a folder now: whether they run, hear, write, and what to do."""
 
 import os
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -189,15 +190,11 @@ def _moment(stamp: int) -> str:
 
 def _write_problem(folder: Path) -> str:
     """Try the disk with a block; return what it says, empty if it takes it."""
-    probe = folder / f".probe-{os.getpid()}"
     try:
-        with probe.open("xb") as file:
+        with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
         return error.strerror or str(error)
-    finally:
-        with suppress(OSError):
-            probe.unlink()
     return ""

@@ -30,6 +30,11 @@ def is_ping_address(url: str) -> bool:
     return is_whole and url.isascii() and url.isprintable() and " " not in url
 
 
+def has_password(url: str) -> bool:
+    """Return whether an address, as `is_ping_address` takes it, has a user or a password in it."""
+    return "@" in urlsplit(url).netloc
+
+
 def read_ping_address(file: Path) -> str:
     """Read a file of one line with an address: who knows it could ping in the place of the box.
 

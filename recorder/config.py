@@ -59,6 +59,8 @@ def _check_path(value: Any) -> Any:
         raise ValueError("is empty; write a path, or leave the key out")
     if isinstance(value, str) and value.startswith(("~", "$")):
         raise ValueError(f"{value[:64]!r}: ~ and $ are of the shell; write the whole path")
+    if isinstance(value, str) and "\0" in value:
+        raise ValueError(f"{value[:64]!r}: no path has the character \\x00; write another one")
     return value
 
 

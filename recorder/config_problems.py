@@ -24,7 +24,13 @@ _UNIT = re.compile(
     r"(mo)(?:n|nths?)?|(y)(?:r|rs|ears?)?|([smhdw])|(s)ec(?:ond)?s?|(m)in(?:ute)?s?|(h)(?:r|rs|ours?)|"
     r"(d)ays?|(w)eeks?"
 )
-_COUNTED = ((re.compile(r"_days$"), _DAY), (re.compile(r"seconds|duration"), 1))  # by the key
+_COUNTED = (  # by the key
+    (re.compile(r"_days$"), _DAY),
+    (re.compile(r"minutes"), 60),
+    (re.compile(r"seconds|duration"), 1),
+)
+_SIZE = re.compile(r"([kmgt])i?b?")
+_MEGABYTES = {"k": 1e-3, "m": 1, "g": 1e3, "t": 1e6}
 _PLURALS = {"array": "lists", "integer": "whole numbers", "number": "numbers", "string": "texts"}
 
 
@@ -185,6 +191,8 @@ def _problem_of_table(value: Any, about: Schema, key: Key, name: str) -> str:
     head = _dotted(tuple(part for part in key if isinstance(part, str)))
     if about.get("type") == "array" and ("$ref" in items or "oneOf" in items):
         return f"write [[{head}]], with two brackets, above the keys of each {name}"
+    if "properties" in about and isinstance(key[-1], int):
+        return f"is a table; write [[{head}]], with two brackets, above the keys of each {name}"
     if "properties" in about:
         is_many = isinstance(value, list)
         once = "with one bracket, above its keys, once" if is_many else "and its keys below it"
@@ -223,7 +231,8 @@ def _example_of_value(name: str, value: Any, place: _Place) -> str:
     about = place.named
     kind, items = about.get("type"), about.get("items", {})
     is_word = isinstance(value, str) and "://" not in value and 0 < len(value) <= _LONGEST
-    if kind == "array" and items.get("type") == "string" and is_word and place.about is about:
+    is_text = kind == "array" and items.get("type") == "string" and place.about is about
+    if is_text and is_word and _has_form_of_examples(value, about):
         return json.dumps([value], ensure_ascii=False)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if kind == "string" and "format" not in about and "enum" not in about and is_number:
@@ -234,10 +243,22 @@ def _example_of_value(name: str, value: Any, place: _Place) -> str:
     return _example(name, about)
 
 
+def _has_form_of_examples(value: str, about: Schema) -> bool:
+    """Return whether a text has its digits where the examples have theirs, if those have any."""
+    examples = [text for each in about.get("examples", ()) for text in each]
+    forms = [re.sub(r"\d", "0", text) for text in examples]
+    return all("0" not in form for form in forms) or re.sub(r"\d", "0", value) in forms
+
+
 def _without_unit(name: str, found: re.Match[str], about: Schema) -> str:
     """Return a number that was written with a unit, in what the key counts; empty if unknown."""
     number, unit = float(found[1]), _UNIT.fullmatch(found[2].lower())
-    if unit is not None:
+    if name.endswith("_space"):
+        size = _SIZE.fullmatch(found[2].lower())
+        if size is None:
+            return ""
+        number = math.ceil(number * _MEGABYTES[size[1]])
+    elif unit is not None:
         counted = next((one for words, one in _COUNTED if words.search(name)), None)
         if counted is None:
             return ""

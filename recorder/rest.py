@@ -2,8 +2,8 @@
 
 import os
 import re
+import stat
 import time
-from contextlib import suppress
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from typing import NamedTuple
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.messages.gaps import PAUSED, QUIET_HOURS
+from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.text import shortened
 
 _FORM = re.compile(r"([01]\d|2[0-3]):([0-5]\d)-([01]\d|2[0-3]):([0-5]\d)")
@@ -136,18 +137,15 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
 
     Raises
     ------
-    OSError
+    LogError
         If the folder cannot be written to.
     """
     end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
-    temporary = folder / f"{_PAUSE_FILE}.new"
-    temporary.touch(mode=0o600)
-    temporary.write_text(f"{end}\n{who}" if who else end, encoding="utf-8")
     # A recorder of another account has to read until when.
     is_own = folder.stat().st_uid == os.geteuid()
-    with suppress(OSError):  # a disk without rights
-        temporary.chmod(0o600 | log_readers(folder) if is_own else 0o644)
-    temporary.replace(folder / _PAUSE_FILE)
+    readers = log_readers(folder) if is_own else stat.S_IRGRP | stat.S_IROTH
+    with replaced_file(folder / _PAUSE_FILE, readers=readers) as temporary:
+        temporary.write_text(f"{end}\n{who}" if who else end, encoding="utf-8")
 
 
 def resume(folder: Path) -> bool:

@@ -300,6 +300,22 @@ def test_a_folder_of_ones_own_has_sources_by_folder_or_name(written, tmp_path):
     assert {(row["source"], row["licence"]) for row in rows} == {("me", "CC BY 4.0")}
 
 
+def test_a_manifest_has_no_text_that_a_spreadsheet_would_run_and_is_read_as_it_was(tmp_path):
+    names = ["=1+1/a.wav", "b/@SUM(A1).wav", "'=c/d.wav", "-2+3.wav"]
+    for name in names:
+        (tmp_path / "coughing" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "coughing" / name).touch()
+    own = {"source": "=cmd|'/c calc'!A1", "licence": "@x"}
+    table = tmp_path / "coughing" / "m.csv"
+    make_manifest(NAMED["folder"], tmp_path, table, ignore_progress, **own)
+    with table.open(newline="") as file:
+        fields = [field for row in csv.reader(file) for field in row]
+    assert not any(field.startswith(("=", "@", "+", "-")) for field in fields)
+    clips = read_manifest(table, LABELS)
+    assert {(clip.source, clip.licence) for clip in clips} == {(own["source"], "@x")}
+    assert {clip.path for clip in clips} == {tmp_path / "coughing" / name for name in names}
+
+
 def test_files_of_one_name_are_said_to_count_as_one_recording(tmp_path):
     for label in ("coughing", "speech"):
         (tmp_path / "own" / label).mkdir(parents=True)

@@ -211,6 +211,18 @@ def test_every_number_has_bounds(tmp_path, value):
         ("retention_days = '6 months'", "write retention_days = 180, without a unit"),
         ("retention_days = '1 year'", "write retention_days = 365, without a unit"),
         ("retention_days = '36h'", "write retention_days = 2, without a unit"),
+        ("clip_minutes_a_day = '1h'", "write clip_minutes_a_day = 60, without a unit"),
+        ("clip_minutes_a_day = '90 s'", "write clip_minutes_a_day = 2, without a unit"),
+        ("clip_min_free_space = '2G'", "write clip_min_free_space = 2000, without a unit"),
+        ("clip_min_free_space = '500 MiB'", "write clip_min_free_space = 500, without a unit"),
+        ("clip_min_free_space = '2h'", "write clip_min_free_space = 500"),
+        ("quiet_hours = '10pm-6am'", 'write quiet_hours = ["22:00-06:30"]'),
+        ("quiet_hours = '8:00-9:00'", 'write quiet_hours = ["22:00-06:30"]'),
+        ("privacy = 'talking'", 'write privacy = ["talking"]'),
+        ("microphone = ['kitchen']", "microphone.0: is a table; write [[microphone]], with two"),
+        ("[bridge]\nalert = ['a']", "bridge.alert.0: "),
+        ('output = "a\\u0000b"', "'a\\x00b': no path has the character"),
+        ('[bridge]\nstate = "\\u0000"', "no path has the character"),
         ("statistics_every = '5 s'", "write statistics_every = 20"),
         ("output = ''", "output: is empty; write a path, or leave the key out"),
         ("[[microphone]]\nmodel = ' '", "model: is empty; write a path"),
@@ -328,6 +340,68 @@ def test_what_the_bridge_refuses_at_its_start_is_refused_all_at_once(hearthlog, 
     assert len(lines) == len(expected)
     for words in expected:
         assert any(line.startswith(f"hearthlog: {words}") for line in lines), words
+
+
+ALERT = """
+[[microphone]]
+name = "mic"
+[bridge.mqtt]
+host = "x"
+[[bridge.alert]]
+name = "a"
+rule = "more_than"
+class = "coughing"
+count = 3
+window = "1h"
+microphone = "kitchn"
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "words"),
+    [
+        (
+            '[[bridge.alert]]\nname = "a"\nrule = "recorder_silent"\nsilent_for = "1m"\n',
+            1,
+            "bridge.alert: nobody would be told; name urls_file",
+        ),
+        (
+            "[bridge.page]\nport = 9380\n[bridge.prometheus]\nport = 9380\ntoken_file = 'token'\n",
+            1,
+            "bridge.prometheus: port 9380 is that of [bridge.page]",
+        ),
+        (
+            ALERT,
+            3,
+            "a: there is no microphone 'kitchn', so that it hears nothing; there is mic",
+        ),
+    ],
+)
+def test_what_the_bridge_could_not_tell_of_is_named_before_it_starts(
+    hearthlog, tmp_path, text, status, words
+):
+    file = tmp_path / "home.toml"
+    file.write_text(f'model = "none"\noutput = "{tmp_path}/logs"\n{text}')
+    result = hearthlog("config", "check", file)
+    assert result.returncode == status
+    assert words in result.stderr
+
+
+def test_secrets_that_the_page_keeps_and_an_address_with_a_password_are_named(hearthlog, tmp_path):
+    for name in ("page-token", "page-cookies", "page-address"):
+        (tmp_path / name).write_text("0123456789abcdef0123")
+        (tmp_path / name).chmod(0o644)
+    file = tmp_path / "home.toml"
+    file.write_text(
+        f'model = "none"\noutput = "{tmp_path}/logs"\n[bridge]\nstate = "{tmp_path}"\n'
+        '[bridge.page]\n[bridge.ping]\nurl = "https://user:word@127.0.0.1:9/a"\n'
+    )
+    file.chmod(0o644)
+    result = hearthlog("config", "check", file)
+    assert result.returncode == 3
+    for name in ("page-token", "page-cookies", "page-address", "home.toml"):
+        assert f"{tmp_path}/{name}: holds secrets, and everybody" in result.stderr
+    assert "word@" not in result.stderr
 
 
 def test_a_credential_of_the_service_is_not_missed(hearthlog, tmp_path):

@@ -39,6 +39,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
@@ -51,7 +52,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.files import find_logs, review_path
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS
@@ -1230,6 +1231,19 @@ def test_a_log_whose_frames_do_not_continue_is_found(folder):
             message.data = bytes(data)
     log.write(path)
     assert errors(folder) == {"frames-continue"}
+
+
+def test_a_layer_that_lies_beside_a_log_of_another_time_is_found(folder):
+    log, second = find_logs(folder)[:2]
+    layer = write_marks(log, [Mark("mic", START, START + NANOSECONDS, "coughing")])
+    shutil.copy(layer, review_path(second))  # ten seconds later, which may be the border's
+    shutil.copy(layer, review_path(folder / "home_20270301T070000Z.mcap"))  # which is not there
+    assert ("warning", "layer") not in found(folder)
+    layer.unlink()
+    late = START + 3600 * NANOSECONDS
+    write_marks(log, [Mark("mic", late, late + NANOSECONDS, "coughing")])
+    (findings,) = [each for each in examine(folder) if ("warning", "layer") in each.counts]
+    assert f"a time when {log.name} was not recorded" in findings.shown[0].what
 
 
 def test_logs_of_one_node_that_overlap_are_found(folder, recorded):

@@ -37,7 +37,7 @@ class Bridged:
     def __init__(self, folder: Path, broker: Broker, outputs=(), node="home", **settings):
         self.said = []
         place = Home(folder, node, midday_zone())
-        mqtt = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
+        mqtt = MqttSettings(**({"host": "127.0.0.1", "port": broker.port} | settings))
         state = folder.parent / "bridge"
         publisher = MqttPublisher(mqtt, place, state, self.said.append)
         everybody = dict(outputs) | {"mqtt": publisher}
@@ -394,6 +394,33 @@ def test_what_earlier_versions_switched_off_is_taken_over_where_commands_are_tak
             listener.wait_for(f"{ROOT}/told/music", "ON")
     assert listener.values[f"{ROOT}/told/speech"] == "OFF"
     assert any("the broker is not told of coughing, speech; " in line for line in bridged.said)
+
+
+def test_what_no_model_knows_is_not_switched_off_by_what_is_left_at_the_broker(home, broker):
+    home.hears("coughing")
+    with Listener(broker.port) as listener:
+        for label in ("coughing", "%3Devil", "kettle"):
+            listener.publish(f"{ROOT}/told/{label}", "OFF", retain=True)
+        with Bridged(home.folder, broker, commands=True) as bridged:
+            listener.wait_for(f"{COUGHING}/on", "OFF")
+    assert [line.partition("; ")[0] for line in bridged.said] == [
+        "mqtt: the broker is not told of coughing"
+    ]
+    memory = json.loads((home.folder.parent / "bridge" / "mqtt-home.json").read_text())
+    assert memory["muted"] == ["coughing"]
+
+
+def test_topics_with_another_name_are_cleared_at_a_broker_by_another_address(home, broker):
+    home.hears("coughing")
+    with Listener(broker.port) as listener:
+        with Bridged(home.folder, broker):
+            listener.wait_for(f"{COUGHING}/on", "ON")
+        with Bridged(home.folder, broker, host="localhost", topic="house"):
+            listener.wait_for(f"{ROOT}/bridge", "")
+            listener.wait_until(lambda: "" not in settled_values(broker.port, seconds=0.3))
+        after = settled_values(broker.port, seconds=0.3)
+    assert not any(topic.startswith(ROOT) for topic in after)
+    assert any(topic.startswith("house/") for topic in after)
 
 
 @pytest.mark.parametrize("commands", [True, False])

@@ -125,6 +125,21 @@ def test_quiet_hours_last_from_their_start_to_their_end_over_midnight_too(start,
         assert (minute + left) % (24 * 60) == end
 
 
+def test_a_pause_follows_no_link_and_belongs_to_whom_the_folder_belongs_to(tmp_path):
+    other, logs = tmp_path / "other", tmp_path / "logs"
+    other.write_text("1")
+    logs.mkdir()
+    for name in (".pause", ".pause.new", ".pause.tmp"):
+        (logs / name).symlink_to(other)
+    if os.geteuid() == 0:
+        os.chown(logs, 12345, 12345)
+    pause(logs, timedelta(hours=1), "Anna")
+    assert other.read_text() == "1"
+    assert not (logs / ".pause").is_symlink()
+    assert (logs / ".pause").stat().st_uid == logs.stat().st_uid
+    assert Rest([], UTC, logs).describe().startswith("paused by Anna until ")
+
+
 def test_a_pause_ends_by_itself(tmp_path):
     rest = Rest([], UTC, tmp_path)
     pause(tmp_path, timedelta(seconds=1))

@@ -42,6 +42,17 @@ def test_systemd_understands_every_line_of_the_units(tmp_path, has_network):
         assert (result.returncode, result.stderr) == (0, "")
 
 
+@pytest.mark.parametrize("name", ["ho$ME", "${HOME}", "a b%c$$", "plain"])
+def test_a_program_may_be_in_a_folder_with_any_name(tmp_path, name):
+    program = tmp_path / name / "hearthlog"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    needs = Needs(str(LOGS), [], False, "owner")
+    result = analyzed("verify", system_unit([str(program), "a$b"], "hearthlog", needs), tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
 @pytest.mark.parametrize(("has_network", "most"), [(False, 10), (True, 16)])
 def test_the_service_of_the_machine_may_do_little(tmp_path, has_network, most):
     unit = system_unit(RECORD, "hearthlog", Needs(str(LOGS), [], has_network, "owner"))

@@ -34,8 +34,12 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.statistics import time_span, topic_counts
 from hearthlog.schemas.storage.new_files import (
     check_new,
+    create_file,
+    hand_over,
+    make_folders,
     new_file,
     new_folder,
+    open_lock,
     private_folder,
     replaced_file,
 )
@@ -427,9 +431,49 @@ def test_what_root_writes_belongs_to_whom_the_folder_belongs_to(tmp_path):
     with new_file(tmp_path / "judgement") as temporary:
         temporary.write_text("1")
     private_folder(tmp_path / "folder")
-    owners = {path.stat().st_uid for path in tmp_path.iterdir()}
+    make_folders(tmp_path / "2026/03/01")
+    create_file(tmp_path / "2026/03/01/log").close()
+    os.close(open_lock(tmp_path / ".lock"))
+    owners = {path.stat().st_uid for path in tmp_path.rglob("*")}
     assert owners == {12345}
     os.chown(tmp_path, 0, 0)
+
+
+def test_what_is_created_never_goes_where_a_link_leads(tmp_path):
+    other, link, nowhere = (tmp_path / name for name in ("other", "link", "nowhere"))
+    other.write_text("1")
+    other.chmod(0o600)
+    link.symlink_to(other)
+    (tmp_path / "dangling").symlink_to(nowhere)
+    for path in (link, tmp_path / "dangling"):
+        with pytest.raises(FileExistsError):
+            create_file(path)
+        for use in (open_lock, partial(hand_over, mode=0o666)):
+            with pytest.raises(OSError, match="symbolic link"):
+                use(path)
+    assert (other.read_text(), other.stat().st_mode & 0o777) == ("1", 0o600)
+    assert not nowhere.exists()
+
+
+def test_rights_of_a_file_that_has_another_name_stay(tmp_path):
+    (tmp_path / "other").touch(0o600)
+    (tmp_path / "name").hardlink_to(tmp_path / "other")
+    hand_over(tmp_path / "name", 0o644)
+    assert (tmp_path / "other").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_lock_is_a_regular_file_and_not_a_hard_link_that_root_follows(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="Not a regular file"):
+        open_lock(tmp_path / "pipe")
+    (tmp_path / "other").touch()
+    (tmp_path / "linked").hardlink_to(tmp_path / "other")
+    os.close(open_lock(tmp_path / "linked"))  # a backup of hard links
+    if os.geteuid() == 0:
+        os.chown(tmp_path, 12345, 12345)
+        with pytest.raises(OSError, match="Not a regular file"):
+            open_lock(tmp_path / "linked")
+        os.chown(tmp_path, 0, 0)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="root alone gives files away")

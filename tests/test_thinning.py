@@ -1,6 +1,8 @@
 """Old logs are thinned as configured: what is left of them is as it was, and read as before."""
 
+import fcntl
 import json
+import os
 import random
 import shutil
 import signal
@@ -226,6 +228,30 @@ def test_without_room_for_a_copy_a_log_stays_as_it_is_and_that_is_said(logs):
     assert "cannot be thinned (File too large)" in json.loads(result.stdout)[1]
     assert [log.read_bytes() for log in logs] == before
     assert len(find_logs(logs[0].parents[3])) == len(logs)
+
+
+def test_a_link_at_the_name_of_the_copy_is_not_followed_and_a_log_keeps_its_owner(logs, tmp_path):
+    other, folder = tmp_path / "other", logs[0].parent
+    other.write_text("1")
+    logs[0].with_name(logs[0].name + ".thinning").symlink_to(other)
+    if os.geteuid() == 0:
+        os.chown(folder, 12345, 12345)
+        os.chown(logs[0], 12345, 12345)
+    logs[0].chmod(0o640)
+    keep(logs, features=1)
+    assert thinned(logs) == [2, 2, 2, 2, 2, 0]
+    assert other.read_text() == "1"
+    assert not logs[0].is_symlink()
+    assert logs[0].stat().st_mode & 0o777 == 0o640
+    assert logs[0].stat().st_uid == folder.stat().st_uid
+    assert not list(folder.glob("*.thinning"))
+
+
+def test_a_log_that_another_process_thins_is_left_to_it(logs):
+    with logs[0].open("rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        keep(logs, features=1)
+    assert thinned(logs) == [0, 2, 2, 2, 2, 0]
 
 
 def test_a_dry_run_says_what_would_be_thinned(logs, tmp_path, hearthlog):

@@ -1,22 +1,25 @@
 """The outputs that are configured, opened, and opened again where that failed."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from hearthlog.analyzer.bridge.alerts.rules import unknown_microphone
+from hearthlog.analyzer.bridge.alerts.settings import NO_LISTENER
 from hearthlog.analyzer.bridge.day import today
+from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.output import News, Output
-from hearthlog.analyzer.bridge.page.page_token import figures_token, read_token
+from hearthlog.analyzer.bridge.page.page_token import figures_token, page_secrets, read_token
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.analyzer.bridge.settings import BridgeSettings
+from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
 from hearthlog.analyzer.extras import remedy
-from hearthlog.analyzer.ping import read_ping_address
-from hearthlog.analyzer.ports import listen
+from hearthlog.analyzer.ping import has_password, read_ping_address
+from hearthlog.analyzer.ports import ip_of, listen
 from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.storage.regular_file import exposed_secret
@@ -146,22 +149,29 @@ def open_outputs(
     return outputs, since
 
 
-def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
+def output_problems(
+    settings: BridgeSettings, microphones: Collection[str]
+) -> tuple[list[str], list[str]]:
     """Look for what the outputs would refuse at their start, and open nothing.
 
     Parameters
     ----------
     settings : BridgeSettings
+    microphones : collection of str
+        The names of those that are recorded.
 
     Returns
     -------
     problems : list of str
         Why an output could not be opened, a line each.
     warnings : list of str
-        Files that may be credentials of the service, which are not here.
+        Files that may be credentials of the service, which are not here, and alerts of microphones
+        that are not recorded.
     """
     problems: list[str] = []
-    warnings: list[str] = []
+    warnings = [line for rule in settings.alert if (line := unknown_microphone(rule, microphones))]
+    if settings.alert and settings.mqtt is None and settings.delivery.urls_file is None:
+        problems.append(NO_LISTENER)
     for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:
         if path is not None and not path.is_absolute() and not secret_path(path).exists():
             warnings.append(f"{path}: not here; it has to be a credential of the service")
@@ -202,19 +212,40 @@ def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
         yield None, partial(tls_context, mqtt)
     if (page := settings.page) is not None:
         yield None, lambda: listen(bind=page.bind).close()
-    if settings.prometheus is not None and (text := settings.prometheus.text_file) is not None:
-        yield None, partial(check_writable, text.absolute().parent)
+    if (figures := settings.prometheus) is not None and figures.text_file is not None:
+        yield None, partial(check_writable, figures.text_file.absolute().parent)
+    if page is not None and figures is not None and figures.port == page.port:
+        yield None, partial(_check_ports, page)
     if settings.state is not None:
         yield None, partial(check_writable, settings.state)
 
 
-def exposed_files(settings: BridgeSettings) -> list[str]:
-    """Return the lines that say which files of secrets everybody may read."""
+def _check_ports(page: PageSettings) -> None:
+    address = ip_of(page.bind)
+    if address is None or address.is_loopback or address.is_unspecified:
+        raise BridgeError(
+            f"bridge.prometheus: port {page.port} is that of [bridge.page]; choose another one"
+        )
+
+
+def exposed_files(settings: BridgeSettings, file: Path | None, state: Path | None) -> list[str]:
+    """Return the lines that say which files of secrets everybody may read or change.
+
+    Parameters
+    ----------
+    settings : BridgeSettings
+    file : Path or None
+        That has them.
+    state : Path or None
+        The folder of what the bridge has to remember; None if it is not known.
+    """
     mqtt, page, figures, ping = settings.mqtt, settings.page, settings.prometheus, settings.ping
     files = [settings.delivery.urls_file]
     files += [] if figures is None else [figures.token_file]
     files += [] if ping is None else [ping.url_file]
     files += [] if mqtt is None else [mqtt.password_file, mqtt.key_file]
     files += [] if page is None else [page.token_file]
-    found = [exposed_secret(secret_path(file)) for file in files if file is not None]
-    return [line for line in found if line]
+    paths = [secret_path(each) for each in files if each is not None]
+    paths += [] if page is None or state is None else page_secrets(state)
+    paths += [file] if file is not None and ping is not None and has_password(ping.url) else []
+    return [line for line in map(exposed_secret, paths) if line]

@@ -29,7 +29,7 @@ from hearthlog.analyzer.bridge.page.page_token import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
 from hearthlog.analyzer.ports import HOST, is_asked_in_digits
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import create_file, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
@@ -99,9 +99,9 @@ class PrometheusOutput:
             self._text, self._made = text, time.monotonic()
         if self._settings.text_file is not None:
             rights = _READERS[self._settings.readable_by or "all"]
-            with replaced_file(self._settings.text_file, readers=rights) as temporary:
-                temporary.touch(0o600)
-                temporary.write_bytes(text)
+            put = replaced_file(self._settings.text_file, readers=rights)
+            with put as temporary, create_file(temporary) as stream:
+                stream.write(text)
 
     def close(self) -> None:
         """Answer no more; the text file goes, so that nobody takes it for today's."""

@@ -86,7 +86,8 @@ def _check_origin(origin: str) -> str:
 
 
 def _check_bind(address: str) -> str:
-    if ip_of(address) is None:
+    found = ip_of(address)
+    if found is None or found.is_multicast:
         raise ValueError(
             f"{address[:64]!r} is no address: write one of this machine in digits, such as "
             "127.0.0.1"
@@ -127,6 +128,19 @@ class MqttSettings(_Table):
         default=False, description="Whether corrections and pauses are taken from the broker."
     )
 
+    @model_validator(mode="after")
+    def _check_files(self) -> Self:
+        for name in ("ca_file", "certificate_file", "key_file"):
+            if getattr(self, name) and not self.tls:
+                raise ValueError(
+                    f"{name} is for an encrypted connection; write tls = true, or leave it out"
+                )
+        if self.key_file and not self.certificate_file:
+            raise ValueError("key_file belongs to a certificate; name that, with certificate_file")
+        if self.password_file and not self.user:
+            raise ValueError("password_file is the password of a user; say of which, with user")
+        return self
+
 
 class PrometheusSettings(_Table):
     """Where a Prometheus finds its figures."""
@@ -147,6 +161,16 @@ class PrometheusSettings(_Table):
     readable_by: Literal["owner", "group", "all"] | None = Field(
         default=None, description="Who of this machine may read `text_file`."
     )
+
+    @model_validator(mode="after")
+    def _check_outputs(self) -> Self:
+        if self.text_file is None and self.port is None:
+            raise ValueError("gives the figures to nobody; name a text_file, or a port")
+        if self.text_file is not None and self.text_file.is_dir():
+            raise ValueError(
+                f"text_file: {self.text_file} is a folder; name a file in it, as hearthlog.prom"
+            )
+        return self
 
 
 class PageSettings(_Table):

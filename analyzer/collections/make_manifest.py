@@ -14,6 +14,7 @@ from hearthlog.analyzer.collections.installed import FOLDER, Collection, check_f
 from hearthlog.analyzer.collections.label_map import SKIPPED, LabelMap, read_map
 from hearthlog.analyzer.collections.spans import Part, labelled_parts
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.text_files import disarmed
 from hearthlog.analyzer.training.manifest import OPTIONAL, REQUIRED, SIZE_LIMIT
 from hearthlog.models.classes import OTHER_NEGATIVE
 from hearthlog.models.classifiers.description import TEXT
@@ -120,7 +121,7 @@ def make_manifest(  # noqa: PLR0913, PLR0917
         path = os.path.relpath(clip.path, output.parent.resolve())
         times = _seconds_text(part.start), _seconds_text(part.end)
         about = part.label, clip.source_group, source, clip.licence
-        writer.writerow((path, *about, *times, part.detail))
+        writer.writerow(map(disarmed, (path, *about, *times, part.detail)))
     if not summary.clips:
         raise DataError(_nothing_left(folder, summary))
     raw = table.getvalue().encode(errors="replace")

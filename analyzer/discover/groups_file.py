@@ -23,7 +23,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.modelfile.sealed_file import read_sealed, write_sealed
 from hearthlog.schemas.logs.files import log_readers
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import open_lock, replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
 GROUPS = "groups.safetensors"  # in a folder of logs
@@ -58,11 +58,11 @@ def locked_groups(path: Path) -> Iterator[None]:
     DataError
         If its folder cannot be written.
     """
+    lock_file = path.with_name(f".{path.name}.lock")
     try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
-        lock = os.fdopen(os.open(path.with_name(f".{path.name}.lock"), flags, 0o600), "ab")
+        lock = os.fdopen(open_lock(lock_file), "rb")
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        raise DataError(f"{lock_file}: cannot be written ({error.strerror})") from error
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

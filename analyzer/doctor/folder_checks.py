@@ -10,11 +10,12 @@ from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.message_checks import ALLOWED_DELAY
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.files import SUFFIX
+from hearthlog.schemas.logs.files import SUFFIX, is_layer, log_of_layer
 from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
 _DAY = re.compile(r"\d{4}/\d{2}/\d{2}")
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
+_BESIDE = 60 * NANOSECONDS  # that a layer may go beyond its log
 _LEFT = {
     f"{SUFFIX}.damaged": "is what could not be recovered whole; `hearthlog recover` may save more",
     f"{SUFFIX}.recovering": "was left by a recovery that was cut short; the next one makes it anew",
@@ -63,6 +64,20 @@ def check_series(files: Sequence[ExaminedFile]) -> None:
         _check_overlaps(same)
         for microphone in {name for file in same for name in file.frames}:
             _check_frames(microphone, [file for file in same if microphone in file.frames])
+    _check_layers(files)
+
+
+def _check_layers(files: Sequence[ExaminedFile]) -> None:
+    """Find layers that say nothing of the time of the log that they are named after."""
+    spans = {file.findings.path: file.span for file in files if file.span is not None}
+    for path in filter(is_layer, spans):
+        log, (start, end) = log_of_layer(path), spans[path]
+        first, last = spans.get(log, (start, end))
+        if end < first - _BESIDE or last + _BESIDE < start:
+            findings = next(file.findings for file in files if file.findings.path == path)
+            what = f"speaks of a time when {log.name} was not recorded"
+            advice = "it belongs to another log; move it beside that"
+            findings.warning("layer", what, advice, time=start)
 
 
 def _folder_of_days(path: Path) -> Path | None:

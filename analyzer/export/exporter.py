@@ -443,7 +443,7 @@ class TableFile(io.RawIOBase):
     def write(self, data: Any, /) -> int:
         """Append bytes."""
         try:
-            descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND)
+            descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
         except FileNotFoundError:
             return len(data)
         with open(descriptor, "ab") as stream:  # noqa: PTH123

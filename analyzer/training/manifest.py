@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.text_files import csv_records, read_text
+from hearthlog.analyzer.logs.text_files import csv_records, read_text, without_disarming
 from hearthlog.models.classes import meant_by
 from hearthlog.models.classifiers.description import TEXT
 
@@ -167,7 +167,9 @@ def _clip(
         detail = f"has {len(record)} fields, the first line names {len(column)}"
         raise _RowError(where, "a line that is not complete", detail)
     value = {
-        name: record[column[name]].strip() if column.get(name, len(record)) < len(record) else ""
+        name: without_disarming(record[column[name]].strip())
+        if column.get(name, len(record)) < len(record)
+        else ""
         for name in (*REQUIRED, *OPTIONAL)
     }
     for name in REQUIRED:

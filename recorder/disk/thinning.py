@@ -1,9 +1,7 @@
 """Thinning: what old logs hold frame by frame is dropped before they are deleted as a whole."""
 
-import fcntl
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,10 +9,17 @@ from hearthlog.recorder.disk.limits import ThinningDays
 from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, RecordedLog
 from hearthlog.recorder.disk.retention import REVIEWED, is_reviewed, kept_because
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.salvage.recover import lock_abandoned
 from hearthlog.schemas.salvage.thin import thin_log, thinned_step
-from hearthlog.schemas.storage.new_files import locked_folder, sync_file, sync_folder
+from hearthlog.schemas.storage.new_files import (
+    hand_over,
+    locked_folder,
+    sync_file,
+    sync_folder,
+)
 
 _STATISTICS = 1  # the step that lessons do not miss
+_RIGHTS = 0o666  # of a file that nobody runs
 
 
 class Thinned(NamedTuple):
@@ -75,21 +80,20 @@ def thin(log: Path, step: int) -> bool:
         If the copy cannot be written.
     """
     copy = log.with_name(log.name + THINNING_SUFFIX)
-    with copy.open("ab") as held:
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with lock_abandoned(log) as is_ours:
+        if not is_ours:
             return False
         try:
             thin_log(log, copy, step)
-            with suppress(OSError):  # a disk without rights
-                copy.chmod(stat.S_IMODE(log.stat().st_mode))
+            hand_over(copy, stat.S_IMODE(log.stat().st_mode) & _RIGHTS)
             sync_file(copy)
             with locked_folder(log.parent):  # a reviewer that writes a layer holds it
                 if step > _STATISTICS and is_reviewed(log):
+                    copy.unlink(missing_ok=True)
                     return False
-                copy.replace(log)
+                copy.replace(log)  # from here on a copy of this name is another process's
                 sync_folder(log.parent)
-        finally:
+        except BaseException:
             copy.unlink(missing_ok=True)
+            raise
     return True

@@ -13,6 +13,7 @@ from typing import NamedTuple, Self
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import is_node_name
+from hearthlog.schemas.storage.new_files import make_folders, open_lock
 
 # With these a disk may be used again later; the recorder waits for that.
 _PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
@@ -81,10 +82,9 @@ class FolderLock:
             return False
 
     def _hold(self) -> None:
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self._path, flags, 0o600)
+            make_folders(self._folder)
+            descriptor = open_lock(self._path)
         except OSError as error:
             if error.errno in _PASSING:
                 return

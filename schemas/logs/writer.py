@@ -13,7 +13,7 @@ from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.log_stream import Attachment, LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.storage.new_files import sync_folder
+from hearthlog.schemas.storage.new_files import create_file, make_folders, sync_folder
 
 
 class LogWriter:
@@ -188,11 +188,11 @@ class LogWriter:
 
 
 def _create(path: Path, active: Path) -> BinaryIO:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folders(path.parent)
     if path.exists():
         raise LogError(f"{path}: exists already; move it away or record into another folder")
     try:
-        stream = active.open("xb")
+        stream = create_file(active, 0o666)
     except FileExistsError as error:
         raise LogError(
             f"{active}: is being written, or was left by a recorder that was killed"

@@ -19,7 +19,14 @@ from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, TopicRecovery
-from hearthlog.schemas.storage.new_files import check_new, sync_file, sync_folder
+from hearthlog.schemas.storage.new_files import (
+    check_new,
+    create_file,
+    hand_over,
+    readers_of,
+    sync_file,
+    sync_folder,
+)
 from hearthlog.schemas.storage.regular_file import open_regular
 
 
@@ -42,7 +49,7 @@ def recover_log(
     source : Path
         Damaged log, on this machine.
     copy : Path
-        New log, on this machine; overwrites a file of this name.
+        New log, on this machine, in the place of a file of this name.
     name : str
         File name that the copy will have in the end.
     progress : callable, optional
@@ -67,7 +74,8 @@ def recover_log(
     definitions: list[Definition] = []
     profile = ""
     while True:
-        with Salvage(source, definitions) as salvage, copy.open("wb") as stream:
+        copy.unlink(missing_ok=True)
+        with Salvage(source, definitions) as salvage, create_file(copy, 0o666) as stream:
             attempt = SalvagedCopy(stream, salvage, profile, chunk_span)
             attempt.write(name, progress)
         if not attempt.could_be_better():
@@ -128,6 +136,7 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
             raise LogError(f"{log}: is being written; stop the recorder first")
         try:
             recovery = recover_log(log, copy, path.name, progress)
+            hand_over(copy, 0o600 | readers_of(log))
             sync_file(copy)
             _keep(log, kept)
             copy.replace(path)

@@ -14,6 +14,7 @@ from hearthlog.schemas.progress import ignore_progress
 from hearthlog.schemas.salvage.recover import check_copy
 from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.salvaged_copy import SalvagedCopy
+from hearthlog.schemas.storage.new_files import create_file
 from hearthlog.schemas.times import NANOSECONDS
 
 _CHUNK_SPAN = 10 * NANOSECONDS
@@ -93,7 +94,7 @@ def thin_log(source: Path, copy: Path, step: int) -> None:
     source : Path
         A finished log, on this machine.
     copy : Path
-        New file, on this machine; overwrites a file of this name.
+        New file, on this machine, in the place of one of this name.
     step : int
         A place in `STEPS`.
 
@@ -108,7 +109,8 @@ def thin_log(source: Path, copy: Path, step: int) -> None:
         before = [record.get(THINNED_OF, "") for record in provenance_records(file)]
     digests = " ".join([*filter(None, before), log_digest(source)])
     thinning = Thinning(step, {THINNED: STEPS[step], THINNED_OF: digests})
-    with Salvage(source) as salvage, copy.open("wb") as stream:
+    copy.unlink(missing_ok=True)
+    with Salvage(source) as salvage, create_file(copy, 0o666) as stream:
         thinned = SalvagedCopy(stream, salvage, PROFILE, _CHUNK_SPAN, thinning)
         thinned.write(source.name, ignore_progress)
     recovery = thinned.recovery()

@@ -1,9 +1,11 @@
 """New files: whole or not there at all, on this machine and in a store.
 
 They are the account's alone, whatever its umask is: what comes from a home is private. Those that
-belong to a log may be read by whoever may read that log.
+belong to a log may be read by whoever may read that log. What root makes goes to the account that
+the folder belongs to, and no link that this account may have put there is followed.
 """
 
+import errno
 import fcntl
 import os
 import shutil
@@ -13,7 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
@@ -66,32 +68,126 @@ def private_folder(path: Path, *, readers: int = 0) -> None:
     if not path.parent.is_dir():
         private_folder(path.parent, readers=readers)
     path.mkdir(mode=0o700, exist_ok=True)
-    _give(path, 0o700 | readers | readers >> 2)
+    hand_over(path, 0o700 | readers | readers >> 2)
 
 
-def _give(path: Path, mode: int) -> None:
-    """Set the rights of what was made, which root gives to whom the folder around it belongs to."""
+def make_folders(path: Path) -> None:
+    """Make a folder, and those around it, with the rights that the umask leaves.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
+    """
+    if path.is_dir():
+        return
+    if not path.parent.is_dir():
+        make_folders(path.parent)
+    path.mkdir(exist_ok=True)
+    hand_over(path)
+
+
+def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
+    """Create a file of this machine for writing, never one that a link leads to.
+
+    Parameters
+    ----------
+    path : Path
+    mode : int, optional
+        Its rights, of which the umask takes some away.
+
+    Raises
+    ------
+    FileExistsError
+        If something of this name exists, even a link that leads nowhere.
+    OSError
+        If it cannot be created.
+    """
+    descriptor, folder = _open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    _set_owner(descriptor, folder)
+    return os.fdopen(descriptor, "wb")
+
+
+def open_lock(path: Path) -> int:
+    """Open a file to lock it, for reading and writing; make it if it is not there.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine.
+
+    Returns
+    -------
+    int
+        The file's descriptor, for the caller to lock and to close.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened, is a link or no regular file.
+    """
+    descriptor, folder = _open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600)
+    opened = os.fstat(descriptor)
+    # Root writes to no file of others that was linked here.
+    is_linked = opened.st_nlink > 1 and opened.st_uid != folder.st_uid and os.geteuid() == 0
+    if not stat.S_ISREG(opened.st_mode) or is_linked:
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    _set_owner(descriptor, folder)
+    return descriptor
+
+
+def hand_over(path: Path, mode: int | None = None) -> None:
+    """Set the rights of what was made, which root gives to whom the folder around it belongs to.
+
+    Parameters
+    ----------
+    path : Path
+        A file or a folder of this machine; a link is not followed.
+    mode : int, optional
+        Its rights; by default they stay.
+
+    Raises
+    ------
+    OSError
+        If it is not there, or is a link.
+    """
+    descriptor, folder = _open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        if mode is not None and _is_own(os.fstat(descriptor)):
+            with suppress(OSError):  # a disk without rights
+                os.fchmod(descriptor, mode)
+        _set_owner(descriptor, folder)
+    finally:
+        os.close(descriptor)
+
+
+def _open(path: Path, flags: int, mode: int = 0) -> tuple[int, os.stat_result]:
+    """Open what has a name, no link, and return the status of its folder, too."""
     # The folder is opened once: another one may get its name while this runs.
     folder = os.open(path.parent, _LOOKUP | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        descriptor = os.open(
-            path.name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder
-        )
-    except BaseException:
-        os.close(folder)
-        raise
-    try:
-        with suppress(OSError):  # a disk without rights
-            os.fchmod(descriptor, mode)
-        around, made = os.fstat(folder), os.fstat(descriptor)
-        # A file with another name could be one that somebody linked here to be given it.
-        is_ours = stat.S_ISDIR(made.st_mode) or made.st_nlink == 1
-        if os.geteuid() == 0 and around.st_uid != 0 and made.st_uid == 0 and is_ours:
-            with suppress(OSError):
-                os.fchown(descriptor, around.st_uid, around.st_gid)
+        descriptor = os.open(path.name, flags | os.O_NOFOLLOW | os.O_CLOEXEC, mode, dir_fd=folder)
+        return descriptor, os.fstat(folder)
     finally:
-        os.close(descriptor)
         os.close(folder)
+
+
+def _set_owner(descriptor: int, folder: os.stat_result) -> None:
+    made = os.fstat(descriptor)
+    if os.geteuid() == 0 and folder.st_uid != 0 and made.st_uid == 0 and _is_own(made):
+        with suppress(OSError):  # a disk without owners
+            os.fchown(descriptor, folder.st_uid, folder.st_gid)
+
+
+def _is_own(made: os.stat_result) -> bool:
+    """Return whether it has one name; else somebody could have linked it here to be given it."""
+    return stat.S_ISDIR(made.st_mode) or made.st_nlink == 1
 
 
 @contextmanager
@@ -237,9 +333,9 @@ def new_folder(path: Path) -> Iterator[Path]:
     with _temporary(path) as temporary:
         temporary.mkdir(mode=0o700)
         yield temporary
-        _give(temporary, 0o700)  # before the files, which go to whom it belongs to
+        hand_over(temporary, 0o700)  # before the files, which go to whom it belongs to
         for file in temporary.iterdir():
-            _give(file, 0o600)
+            hand_over(file, 0o600)
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             list(pool.map(sync_file, temporary.iterdir()))
         sync_folder(temporary)
@@ -252,7 +348,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 def _put_in_place(path: Path, readers: int, *, new: bool) -> Iterator[Path]:
     with _temporary(path) as temporary:
         yield temporary
-        _give(temporary, 0o600 | readers)
+        hand_over(temporary, 0o600 | readers)
         sync_file(temporary)
         if new:
             _name(temporary, path)

@@ -69,7 +69,8 @@ def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -
     except OSError as reason:
         raise error(f"{path}: cannot be read ({reason.strerror})") from reason
     if len(data) > limit:
-        raise error(f"{path}: larger than {limit >> 20} MB; this is no {what}")
+        most = f"{limit >> 20} MB" if limit >= 1 << 20 else f"{limit / 1000:.3g} kB"
+        raise error(f"{path}: larger than {most}; this is no {what}")
     return data
 
 

@@ -59,7 +59,8 @@ def replay(
     """
     from hearthlog.analyzer.bridge.alerts.evaluate import rings
     from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-    from hearthlog.analyzer.bridge.alerts.rules import history, unknown_class
+    from hearthlog.analyzer.bridge.alerts.rules import history, unknown_class, unknown_microphone
+    from hearthlog.analyzer.bridge.listeners import microphone_of_listener
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
@@ -79,8 +80,11 @@ def replay(
     with share_done("reading what was heard") as progress:
         heard = read_heard(home, settings.node, first - longest, last, losses.append, progress)
     found = {rule.name: rings(rule, heard, first, last, zone)[0] for rule in own.alert}
-    for text in filter(None, (unknown_class(rule, heard.classes) for rule in own.alert)):
-        tell(text)
+    microphones = {microphone_of_listener(name) for name in heard.coverage}
+    for rule in own.alert:
+        text = unknown_microphone(rule, microphones) or unknown_class(rule, heard.classes)
+        if text:
+            tell(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))
     else:

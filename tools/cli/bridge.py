@@ -30,6 +30,7 @@ def bridge(
 
     The recorder takes no notice: only its logs are read. What cannot be told is tried again.
     """
+    from hearthlog.analyzer.bridge.alerts.rules import unknown_microphone
     from hearthlog.analyzer.bridge.home import Home
     from hearthlog.analyzer.bridge.outputs import exposed_files, open_outputs
     from hearthlog.analyzer.bridge.run import Bridge
@@ -54,9 +55,13 @@ def bridge(
         signal.signal(number, lambda *_: stop.set())
     home = Home(logs or settings.output, settings.node, time_zone(settings.timezone))
     say = Saying(tell)
-    for line in [*exposed_files(own), *exposed_passwords(settings, config)]:
+    state = state_folder(own.state, home.folder)
+    for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
         say(line)
-    outputs, since = open_outputs(own, home, state_folder(own.state, home.folder), say)
+    microphones = [] if logs else [each.name for each in settings.microphone]
+    for line in filter(None, (unknown_microphone(rule, microphones) for rule in own.alert)):
+        say(f"alerts: {line}")
+    outputs, since = open_outputs(own, home, state, say)
     if not outputs:
         where = "no --config is given" if config is None else f"{config} has no table of the bridge"
         wrong_use(

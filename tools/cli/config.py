@@ -45,7 +45,8 @@ def check(
     """Check a configuration before a recorder or a bridge is started with it.
 
     Exit status 2: it is wrong; 1: a model, a folder or a file that it names cannot be used; 3:
-    others may read its secrets, or a file may be a credential of the service.
+    others may read its secrets, a file may be a credential of the service, or an alert is of a
+    microphone that is not recorded.
     """
     from hearthlog.analyzer.bridge.outputs import exposed_files, output_problems
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
@@ -55,8 +56,8 @@ def check(
 
     settings, bridge = load_bridge_settings(file)
     errors = recording_problems(with_model(settings))
-    problems, warnings = output_problems(bridge)
-    warnings += [*exposed_passwords(settings, file), *exposed_files(bridge)]
+    problems, warnings = output_problems(bridge, [each.name for each in settings.microphone])
+    warnings += [*exposed_passwords(settings, file), *exposed_files(bridge, file, bridge.state)]
     for line in [*map(str, errors), *problems, *warnings]:
         tell(line)
     if errors or problems:

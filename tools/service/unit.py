@@ -131,7 +131,10 @@ def _has_sound_group() -> bool:
 
 
 def _command(words: Sequence[str]) -> str:
-    return " ".join(_word(word).replace("$", "$$") for word in words)
+    """Return the command of a unit; systemd puts no variable into the path of its program."""
+    literal = [_word(word).replace("$", "$$") for word in words]
+    program = [_word(f"@{words[0]}")] if "$" in words[0] else []  # the next one is its argv[0]
+    return " ".join([*program, *literal])
 
 
 def _word(text: str | Path) -> str:

@@ -19,7 +19,7 @@ from hearthlog.analyzer.bridge.alerts.outbox import UNREAD, Outbox
 from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule, unknown_class
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
+from hearthlog.analyzer.bridge.alerts.settings import NO_LISTENER, DeliverySettings
 from hearthlog.analyzer.bridge.alerts.targets import Addresses, find_targets, replaced_names
 from hearthlog.analyzer.bridge.alerts.watch import AHEAD, RuleWatch
 from hearthlog.analyzer.bridge.errors import BridgeError
@@ -81,10 +81,7 @@ class AlertsOutput:
     ) -> None:
         self._file = delivery.urls_file
         if self._file is None and on_ring is None:
-            raise BridgeError(
-                "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a "
-                "broker in [bridge.mqtt]"
-            )
+            raise BridgeError(NO_LISTENER)
         self._rules = rules
         self._followed = home
         self._say = say

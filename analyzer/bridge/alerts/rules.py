@@ -13,6 +13,7 @@ from hearthlog.analyzer.routine.compare import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.text import listed
 
 ANY_SOUND = ""  # in place of a class: whatever is not silence
 _LONGEST_WINDOW = 7 * DAY
@@ -269,6 +270,24 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
     if not own or any(rule.label in names for names in own):
         return ""
     return f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard"
+
+
+def unknown_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
+    """Say that there is no microphone of the name that a rule has; empty if there is.
+
+    Parameters
+    ----------
+    rule : AlertRule
+    microphones : collection of str
+        Their names; without any nothing is known.
+    """
+    name = rule.microphone if isinstance(rule, _SoundRule) else ""
+    if not name or not microphones or name in microphones:
+        return ""
+    return (
+        f"{rule.name}: there is no microphone {name!r}, so that it hears nothing; there is "
+        f"{listed(sorted(microphones))}"
+    )
 
 
 def live_history(rule: AlertRule) -> int:

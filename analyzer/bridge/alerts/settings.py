@@ -6,6 +6,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from hearthlog.recorder.config import PlainPath
 
+NO_LISTENER = (
+    "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a broker in "
+    "[bridge.mqtt]"
+)
+
 
 def _check_secret_file(value: Any) -> Any:
     if "://" in str(value):  # a secret, which no message may repeat

@@ -15,7 +15,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.mqtt.topics import Place
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import private_folder, replaced_file
+from hearthlog.schemas.storage.new_files import (
+    create_file,
+    open_lock,
+    private_folder,
+    replaced_file,
+)
 from hearthlog.schemas.storage.small_file import read_whole
 
 _PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
@@ -41,7 +46,7 @@ class Announced:
     node : str
         Name of the recorder.
     broker : str
-        Host and port. What another broker was given is forgotten.
+        Host and port.
     is_renamed : callable
         Given the name of another recorder, returns whether it has this name now: what was
         remembered of it is taken over.
@@ -84,8 +89,9 @@ class Announced:
         self._is_changed = bool(self._former)
         self._broker = broker
         self.topics: dict[str, Place] = {}
+        # Of another address of the broker, too: it may be the same one, and else has none of them.
         for each in contents:
-            self.topics |= each.topics if each.broker == broker else {}
+            self.topics |= each.topics
         self._muted = set(content.muted)
         self._last_events = content.last_events
 
@@ -162,9 +168,8 @@ class Announced:
             )
             self._is_changed = self.is_new = False
             try:
-                with replaced_file(self.path) as temporary:
-                    temporary.touch(0o600)
-                    temporary.write_text(content.model_dump_json(), "utf-8")
+                with replaced_file(self.path) as temporary, create_file(temporary) as stream:
+                    stream.write(content.model_dump_json().encode())
                 for path in self._former:
                     path.unlink(missing_ok=True)
             except (LogError, OSError) as error:
@@ -180,9 +185,7 @@ class Announced:
     def _take_lock(self, folder: Path) -> int | None:
         try:
             private_folder(folder)
-            descriptor = os.open(
-                _lock_path(self.path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
-            )
+            descriptor = open_lock(_lock_path(self.path))
         except OSError as error:
             self._say(f"mqtt: {folder}: cannot be used ({error.strerror}); nothing is remembered")
             return None

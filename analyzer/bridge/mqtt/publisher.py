@@ -3,7 +3,7 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +40,7 @@ _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
 _BORN = b"online"  # of Home Assistant
 _MOST_ASKED = 20  # commands that wait
+_MOST_OFF = 1000  # classes that the broker says it is not told of
 _MOST_BEGUN = 1000
 
 
@@ -86,6 +87,7 @@ class MqttPublisher:
         # Earlier versions left it to the broker to remember what it keeps, and is not told of.
         self._is_new = self._announced.is_new
         self._reads_back = settings.commands and self._is_new
+        self._off: set[str] = set()  # classes that the broker says it is not told of
         self._was_ready = False
         if settings.commands:
             subscriptions.append(self._command_topic)
@@ -118,6 +120,7 @@ class MqttPublisher:
                 continue
             if each.classes != self._classes.get(each.name, []):
                 self._describe(each)
+            self._leave_out_again(each.classes)
             self._say_state(each, news)
             if each.name in news.state.microphones:
                 self._say_problem(each, news.state)
@@ -217,12 +220,18 @@ class MqttPublisher:
                 self._asked.append(bytes(message.payload))
         elif self._reads_back and message.retain and message.payload == b"OFF":
             place = self._topics.parse(message.topic)
-            if place is not None and place.kind == TOLD:
-                self._announced.switch(place.label, is_told=False)
-                self._has_said_muted = False
+            if place is not None and place.kind == TOLD and len(self._off) < _MOST_OFF:
+                self._off.add(place.label)
         elif self._is_new and message.retain:
             for place in described(self._topics, bytes(message.payload)):
                 self._announced.add(self._topic(place), place)
+
+    def _leave_out_again(self, classes: Iterable[str]) -> None:
+        """Tell no more of the classes of a model that the broker was not told of before."""
+        for label in self._off.intersection(classes):
+            self._off.discard(label)
+            self._announced.switch(label, is_told=False)
+            self._has_said_muted = False
 
     def _discovery_topic(self, device: str) -> str:
         return f"{self._settings.discovery_topic}/device/{device}/config"

@@ -1,13 +1,13 @@
 """Secrets of a server: a token in a file, given or made once, and what is made of it."""
 
-import os
 import re
 import secrets
 from pathlib import Path
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.schemas.storage.new_files import private_folder
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.storage.new_files import create_file, private_folder, replaced_file
 from hearthlog.schemas.storage.small_file import read_whole
 
 _TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
@@ -47,6 +47,11 @@ def cookie_key(state: Path) -> bytes:
         If it cannot be read or made.
     """
     return _kept(state / _COOKIES).encode()
+
+
+def page_secrets(state: Path) -> list[Path]:
+    """Name the files of secrets that the page keeps in a folder."""
+    return [state / name for name in (_TOKEN, _COOKIES, _ADDRESS)]
 
 
 def keep_address(address: str, state: Path) -> Path:
@@ -103,16 +108,12 @@ def _kept(path: Path) -> str:
 
 
 def _write(path: Path, line: str) -> None:
-    temporary = path.with_name(f".{path.name}-{os.getpid()}")
     try:
         private_folder(path.parent)
-        temporary.unlink(missing_ok=True)
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w") as stream:
-            stream.write(f"{line}\n")
-        temporary.replace(path)
-    except OSError as error:
-        raise BridgeError(
-            f"{path}: cannot be written ({error.strerror}); name another folder with `state` in "
-            "[bridge]"
-        ) from error
+        with replaced_file(path, readers=0) as temporary, create_file(temporary) as stream:
+            stream.write(f"{line}\n".encode())
+    except (LogError, OSError) as error:
+        text = (
+            f"{path}: cannot be written ({error.strerror})" if isinstance(error, OSError) else error
+        )
+        raise BridgeError(f"{text}; name another folder with `state` in [bridge]") from error
