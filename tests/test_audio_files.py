@@ -129,7 +129,7 @@ def test_the_name_of_a_file_says_when_it_begins(wav, name, begin):
 @pytest.mark.parametrize(
     ("name", "doubt"),
     [
-        ("20260301_070000-0900.wav", "are taken for a number; if they are a zone, say"),
+        ("20260301_070000-0900.wav", "are taken for a number (a zone is read by --start-pattern"),
         ("20260301_070000-0015.wav", ""),
         ("20260301_070000-0001.wav", ""),
         ("20260301_070000-0930_kitchen.wav", "are taken for a number"),
@@ -629,3 +629,23 @@ def test_hidden_files_and_folders_are_not_looked_at(wav, tmp_path):
     (tmp_path / "b" / "loop").symlink_to(tmp_path / "b")
     assert find_audio([tmp_path / "b"]) == ([kept], [])
     assert find_audio([kept, Path("none.wav")]) == ([kept, Path("none.wav")], [])
+
+
+@needs_ffmpeg
+def test_a_folder_has_the_files_of_all_formats_that_are_read(wav, tmp_path):
+    path = wav("source.wav")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for suffix in ("flv", "eac3", "mpg", "ts", "vob", "m2ts", "wv"):
+        converted(path, folder / f"a.{suffix}", "-ar", "44100")
+    samples, rate = soundfile.read(path)
+    for name, suffix in (("WAV", "wave"), ("W64", "w64"), ("NIST", "sph"), ("PAF", "paf")):
+        soundfile.write(folder / f"b.{suffix}", samples, rate, format=name, subtype="PCM_16")
+    (folder / "notes.txt").write_text("no sound")
+    found, refused = find_audio([folder])
+    assert [file.name for file in found] == sorted(
+        file.name for file in folder.iterdir() if file.suffix != ".txt"
+    )
+    assert not refused
+    for file in found:
+        assert len(heard(file)) > RATE

@@ -250,8 +250,8 @@ def _doubt(path: Path, has_zone: bool | None) -> str:  # noqa: FBT001
     """Say why the time in a name may be read wrongly; empty if nothing speaks for that."""
     if has_zone is None and _offset(_dash_digits(path)) is not None:
         return (
-            "the digits behind the time in its name are taken for a number; if they are a zone, "
-            "say --start-pattern with %z"
+            "the digits behind the time in its name are taken for a number "
+            "(a zone is read by --start-pattern with %z)"
         )
     found = _IN_NAME.search(path.name)
     if (
