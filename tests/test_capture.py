@@ -221,11 +221,19 @@ def test_a_microphone_at_another_rate_is_resampled(labmic, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("offset", "what"), [(0, "digital silence"), (-655, "nothing but an offset")]
+    ("offset", "rate", "what"),
+    [
+        (0, RATE, "digital silence"),
+        (-655, RATE, "nothing but an offset"),
+        (-655, 48_000, "nothing but an offset"),
+        (400, 44_100, "nothing but an offset"),
+    ],
 )
-def test_a_dead_microphone_is_reported_and_an_offset_is_no_level(labmic, tmp_path, offset, what):
-    noise = np.random.default_rng(1).integers(-1, 2, RATE) if offset else 0
-    labmic.configure(data=(offset + noise * np.ones(RATE)).astype(np.int16))
+def test_a_dead_microphone_is_reported_and_an_offset_is_no_level(
+    labmic, tmp_path, offset, rate, what
+):
+    noise = np.random.default_rng(1).integers(-1, 2, rate) if offset else 0
+    labmic.configure(rate, data=(offset + noise * np.ones(rate)).astype(np.int16))
     with recording(labmic, tmp_path / "logs"):
         wait_for_frames(tmp_path / "logs", 220)
     found = [s for m in read(tmp_path / "logs", "diagnostics") for s in m.status]
@@ -233,6 +241,15 @@ def test_a_dead_microphone_is_reported_and_an_offset_is_no_level(labmic, tmp_pat
     assert dead.message == f"the microphone gives {what}: is it muted or dead?"
     values = {pair.key: pair.value for pair in dead.values}
     assert float(values["level_dbfs"]) == -70.0
+
+
+@pytest.mark.parametrize("rate", [RATE, 48_000])
+def test_a_faint_room_with_an_offset_is_not_dead(labmic, tmp_path, rate):
+    room = np.random.default_rng(2).normal(0, 0.8, 3 * rate)  # steps of 16 bits: -92 dBFS
+    labmic.configure(rate, data=np.rint(655 + room).astype(np.int16))
+    with recording(labmic, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", 240)
+    assert "dead" not in process.errors
 
 
 def test_sound_of_pulseaudio_is_heard_to_the_last_sample(pulse_microphone, tmp_path):

@@ -250,7 +250,7 @@ def test_holes_at_both_ends_are_gaps_and_a_file_of_nothing_else_is_refused(tmp_p
     path = written(tmp_path / "none.wav", noise(0.1) * np.nan)
     with pytest.raises(SourceError, match=r"none.wav: the samples are no numbers"):
         events_of(path)
-    with pytest.raises(SourceError, match=r"none.wav: samples of it are no numbers"):
+    with pytest.raises(SourceError, match=r"none.wav: the samples are no numbers"):
         clip_frames(LabelledClip(path, "speech", "a", "b", "c"))
     with pytest.raises(SourceError, match="the sound is no numbers"):
         extract_features(noise(0.1) * np.nan, RATE)

@@ -8,6 +8,7 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
+import soundfile
 from mcap.reader import make_reader
 from spliced import run
 
@@ -163,6 +164,33 @@ def test_logs_from_the_middle_of_a_recording_leave_no_segment_twice(relabelled, 
     is_sound(capfd, tmp_path / "logs")
     done = run(capfd, "relabel", tmp_path / "logs", "--model", MODEL)
     assert "3 layers there already" in done.stdout + done.stderr
+
+
+def test_a_log_that_begins_behind_two_segments_leaves_none_of_them_twice(
+    recording, day, tmp_path, capfd
+):
+    # The last minute of a recording, which begins behind the end of a segment decided in it.
+    known = read_columns(logs_in(recording)[:2], ["/mic/segment"])["/mic/segment"]
+    ends = known["header.stamp"] + known["duration"]
+    is_late = known.log_times - ends > NANOSECONDS // 2
+    begins = int(ends[1:][is_late[1:]][0]) + NANOSECONDS // 10 - START
+    samples, rate = soundfile.read(day)
+    cut = tmp_path / "cut.wav"
+    soundfile.write(cut, samples[: (begins + MINUTE * NANOSECONDS) * rate // NANOSECONDS], rate)
+    earlier = START - begins % (MINUTE * NANOSECONDS)
+    settings = Settings(output=tmp_path / "other", model=MODEL, max_bag_duration=MINUTE)
+    record(settings, FileSource([cut], earlier), Flag())
+    middle = part(tmp_path / "other", tmp_path / "middle", (-1,))
+    starts, ends = segments(middle)
+    first = earlier + begins
+    assert ends[0] < first
+    assert starts[1] < first
+    copy_logs(middle, tmp_path / "logs", 3, MINUTE)
+    of_copies = segments(tmp_path / "logs")
+    assert len(of_copies[0]) == len(starts) + 2 * (ends > first).sum()
+    assert (of_copies[0][1:] >= of_copies[1][:-1]).all()
+    assert (of_copies[1] > of_copies[0]).all()
+    is_sound(capfd, tmp_path / "logs")
 
 
 def test_where_a_recorder_begins_every_copy_does(recording, tmp_path, capfd):

@@ -75,6 +75,15 @@ def test_four_samples_of_a_frame_at_full_scale_are_clipped_however_faint_the_res
     assert watch.problem() == problem
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_sample_of_any_size_is_clipped_without_a_warning_of_numpy():
+    watch = SoundWatch()
+    frames = noise(2, 0.05).reshape(-1, FRAME_SAMPLES)
+    frames[:, ::100] = 3e38
+    listen(watch, InfrasoundFilter()(frames.astype(np.float32)))
+    assert watch.problem() == CLIPS
+
+
 @pytest.mark.parametrize("frequency", [50, 60, 50.1])
 def test_mains_for_half_an_hour_are_a_hum(frequency):
     watch = SoundWatch()

@@ -176,6 +176,30 @@ def test_clips_that_cannot_be_read_are_left_out_and_named(tmp_path, monkeypatch)
         dataset(bad[0], good[1])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_clip_with_samples_that_are_no_numbers_is_learned_from_around_them(tmp_path, value):
+    whole = sound("speech", 6)
+    broken = whole.astype(np.float32)
+    broken[int(2.5 * RATE) : 3 * RATE] = value
+    broken[-1] = value  # and so the last frame
+    path = tmp_path / "broken.wav"
+    soundfile.write(path, broken, RATE, subtype="FLOAT")
+    holed = LabelledClip(path, "speech", "g", "", "")
+    parts = [dataclasses.replace(holed, end=2.5), dataclasses.replace(holed, start=3.0, end=5.95)]
+    music = clip(tmp_path, "music", sound("music", 3), "other")
+    data = dataset(holed, music)
+    np.testing.assert_array_equal(data.windows, dataset(*parts, music).windows)
+    assert np.isfinite(data.windows).all()
+    assert not data.skipped
+    (left,) = data.left_out
+    assert left.clip == f"0.55 s of {path}"
+    assert left.reason == "parts of clips, in which the samples are no numbers (NaN or infinity)"
+    broken[::RATE] = value
+    soundfile.write(path, broken, RATE, subtype="FLOAT")
+    with pytest.raises(DataError, match=r"class speech has no segments.*0\.85 s of .*broken\.wav"):
+        dataset(holed, music)
+
+
 def test_a_training_goes_on_without_what_it_cannot_read_and_says_so(home):
     manifest = home / "manifest.csv"
     (home / "bad.wav").write_text("no sound")

@@ -1,5 +1,8 @@
 """The sound of labelled clips."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from hearthlog.analyzer.training.manifest import LabelledClip
@@ -10,26 +13,45 @@ from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 
+NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
 MOST_SECONDS = 3600.0  # of a clip, which is held in memory
 
 
+class ClipSound(NamedTuple):
+    """The sound of a clip, without the frames that hold samples that are no numbers.
+
+    Attributes
+    ----------
+    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
+        of the file.
+    breaks : sequence of int
+        Frames that do not follow the one before them.
+    lost : int
+        Frames that were left out.
+    """
+
+    frames: Float32
+    breaks: Sequence[int] = ()
+    lost: int = 0
+
+
 def clip_frames(clip: LabelledClip) -> Float32:
+    """Read the frames of a clip, as of `read_clip`."""
+    return read_clip(clip).frames
+
+
+def read_clip(clip: LabelledClip) -> ClipSound:
     """Read a clip.
 
     Parameters
     ----------
     clip : LabelledClip
 
-    Returns
-    -------
-    np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
-        of the file.
-
     Raises
     ------
     SourceError
-        If the clip cannot be read completely, is longer than an hour, or if samples of it are not
+        If the clip cannot be read completely, is longer than an hour, or has no sample that is
         finite.
     """
     cutter = FrameCutter()
@@ -46,6 +68,12 @@ def clip_frames(clip: LabelledClip) -> Float32:
     if faults:
         raise SourceError(faults[0])
     frames = np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
-    if not np.isfinite(frames).all():
-        raise SourceError(f"{clip.path}: samples of it are no numbers (NaN or infinity)")
-    return InfrasoundFilter()(frames)
+    is_finite = np.isfinite(frames).all(axis=1)
+    if is_finite.all():
+        return ClipSound(InfrasoundFilter()(frames))
+    if not is_finite.any():
+        raise SourceError(f"{clip.path}: {NO_NUMBERS}")
+    runs = np.split(np.arange(len(frames)), np.flatnonzero(np.diff(is_finite)) + 1)
+    sounds = [InfrasoundFilter()(frames[run]) for run in runs if is_finite[run[0]]]
+    breaks = np.cumsum([len(sound) for sound in sounds])[:-1]
+    return ClipSound(np.concatenate(sounds), breaks.tolist(), int((~is_finite).sum()))

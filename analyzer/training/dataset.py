@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.clip_sound import NO_NUMBERS, ClipSound, read_clip
 from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.rooms import RoomCopy, in_room
 from hearthlog.analyzer.training.scenario import Scenario
@@ -56,6 +56,10 @@ class Recording(NamedTuple):
         Whence it came, if that is known.
     fault : str
         Why it could not be read; empty if it could.
+    breaks : sequence of int
+        Frames that do not follow the one before them.
+    hole : str
+        What is missing there; empty if nothing is.
     """
 
     label: str
@@ -70,6 +74,8 @@ class Recording(NamedTuple):
     span: tuple[int, int] | None = None
     sighting: Sighting | None = None
     fault: str = ""
+    breaks: Sequence[int] = ()
+    hole: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ class Dataset:
     sightings : sequence of (Sighting or None)
         Whence the recording of each segment came, if that is known; empty if it is of none.
     left_out : sequence of LeftOut
-        Recordings that could not be read, which `skipped` counts too.
+        Recordings that could not be read, which `skipped` counts too, and parts of others.
     """
 
     windows: Float32
@@ -228,14 +234,14 @@ def clip_recordings(
     """
     for number, clip in enumerate(clips):
         progress(number / len(clips))
-        frames, fault = np.empty((0, FRAME_SAMPLES), np.float32), ""
+        sound, fault = ClipSound(np.empty((0, FRAME_SAMPLES), np.float32)), ""
         if scenario.find(clip.label) is not None:
             try:
-                frames = clip_frames(clip)
+                sound = read_clip(clip)
             except SourceError as error:
                 fault = str(error)
         rng = np.random.default_rng([_SEED, number])
-        yield _recording(clip, frames, features, rooms, rng)._replace(fault=fault)
+        yield _recording(clip, sound, features, rooms, rng)._replace(fault=fault)
     progress(1.0)
 
 
@@ -282,6 +288,8 @@ def cut_recordings(
         reason, starts = _segments(item, features)
         if item.fault:
             left_out.append(LeftOut(reason, item.fault))
+        if item.hole:
+            left_out.append(LeftOut(f"parts of clips, in which {NO_NUMBERS}", item.hole))
         if reason:
             skipped[reason] += 1
             continue
@@ -347,13 +355,16 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
 
 def _recording(
     clip: LabelledClip,
-    frames: Float32,
+    sound: ClipSound,
     features: FeatureSet,
     rooms: int,
     rng: np.random.Generator,
 ) -> Recording:
     """Compute the features of a clip, and of its copies in other rooms."""
-    values, copies, floor = features.extractor()(frames), [], None
+    frames, lost = sound.frames, sound.lost * FRAME_SECONDS
+    runs = np.split(frames, sound.breaks)
+    values = np.concatenate([features.extractor()(run) for run in runs])
+    copies, floor = [], None
     silence = class_name(clip.label) == SILENCE
     if len(values) >= features.window_frames and features.band_powers is not None:
         copies = [in_room(frames, features, rng, silence=silence) for _ in range(rooms)]
@@ -367,6 +378,8 @@ def _recording(
         values,
         floor=floor,
         copies=copies,
+        breaks=sound.breaks,
+        hole=f"{lost:.2f} s of {clip.path}" if lost else "",
     )
 
 
@@ -381,6 +394,10 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]
     if len(values) < window:
         return f"shorter than {features.window_seconds:g} s", nothing
     starts = np.arange(0, len(values) - window + 1, HOP_FRAMES)
+    for place in recording.breaks:
+        starts = starts[(starts + window <= place) | (starts >= place)]
+    if not len(starts):
+        return f"shorter than {features.window_seconds:g} s", nothing
     if class_name(recording.label) == SILENCE:
         return "", spread(starts, recording.most)
     power = features.power(values)

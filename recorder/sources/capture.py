@@ -31,7 +31,8 @@ BLOCK_SECONDS = 0.6  # each wake-up costs more than the samples it brings
 LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
 LONG_LATENCY_SECONDS = 8.0  # for devices that give their sound in long pieces
 _MOST_CHANNELS = 8  # to choose one of; a sound server offers any number, and mixes them itself
-_QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
+_QUEUE_BLOCKS = 300  # three minutes, beyond what the pipe holds
+_LEAST_QUEUE_BLOCKS = 60  # where each has many channels
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,9 @@ def _capture(  # noqa: PLR0913, PLR0917
     latency: float,
     output: Any,
 ) -> None:
-    blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(_QUEUE_BLOCKS)
+    chooses = not channel and not places and 1 < device.channels <= _MOST_CHANNELS
+    held = _QUEUE_BLOCKS // device.channels if chooses else _QUEUE_BLOCKS
+    blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(max(held, _LEAST_QUEUE_BLOCKS))
     index = 0
 
     def enqueue(samples: Any, count: int, times: Any, status: Any) -> None:
@@ -101,7 +104,6 @@ def _capture(  # noqa: PLR0913, PLR0917
 
     _check_channels(device, places, channel)
     wanted = range(channel - 1, channel) if channel else range(places or 1)
-    chooses = not channel and not places and 1 < device.channels <= _MOST_CHANNELS
     counts = [device.channels] if chooses else []
     stream, rate, channels = _open(
         sounddevice, device, [*counts, wanted.stop, device.channels], latency, enqueue

@@ -32,7 +32,7 @@ from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkP
 from hearthlog.recorder.sources.return_watch import ReturnWatch
 from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
-from hearthlog.recorder.stream.sound_watch import is_offset_only
+from hearthlog.recorder.stream.sound_watch import DEAD_STEPS
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -233,8 +233,10 @@ class MicrophoneSource:
         self._device_heard.add(block)
         if self._mixer is not None:
             block = replace(block, samples=self._mixer(block.samples, rate))
+        # Before it is resampled: noise of one step becomes more, as noise of a quiet room is.
+        is_flat = int(block.samples.max()) - int(block.samples.min()) <= DEAD_STEPS
         for event in self._framer.add(block):
-            self._watch(event)
+            self._watch(event, is_flat=is_flat)
             yield event
 
     def _tell_channel(self) -> None:
@@ -319,14 +321,15 @@ class MicrophoneSource:
         self._return = ReturnWatch(lambda stop: self._open(self._own, stop))
         return True
 
-    def _watch(self, event: Frames | Gap) -> None:
+    def _watch(self, event: Frames | Gap, *, is_flat: bool) -> None:
         if isinstance(event, Gap):
             self._frames_lost += event.frames_lost
             self._infrasound.restart()
             return
         filtered = self._infrasound(event.samples)
         self._level.add(filtered)
-        is_dead = ~event.samples.any(axis=1) | is_offset_only(event.samples, filtered)
+        has_offset = (filtered != event.samples).any(axis=1)
+        is_dead = ~event.samples.any(axis=1) | (is_flat & has_offset)
         sounding = np.flatnonzero(~is_dead)
         zeros = len(event.samples) - 1 - sounding[-1] if len(sounding) else len(event.samples)
         self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)

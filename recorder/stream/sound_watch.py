@@ -20,7 +20,8 @@ _STUCK_FRAMES = round(10.0 / FRAME_SECONDS)
 _INFRASOUND_FRAMES = round(20.0 / FRAME_SECONDS)
 _INFRASOUND_SHARE = 0.8  # of them
 _INFRASOUND_POWER = 1e-5  # -50 dBFS
-_DEAD_RANGE = 2 / 32768  # of the noise of a converter
+DEAD_STEPS = 2  # of 16 bits, between which the noise of a converter alone lies
+_DEAD_RANGE = DEAD_STEPS / 32768
 _DAY_MINUTES = 1440
 _FALL = 1000.0  # 30 dB
 _SECOND = round(1.0 / FRAME_SECONDS)
@@ -79,12 +80,12 @@ class SoundWatch:
         moving = (samples[:, :_LOOKED_AT] != samples[:, :1]).any(axis=1) | (samples[:, 0] == 0.0)
         still = np.flatnonzero(~moving)
         moving[still] = np.ptp(samples[still], axis=1) > 0
-        moving = np.flatnonzero(moving & ~is_offset_only(samples, filtered))
+        moving = np.flatnonzero(moving & ~_is_offset_only(samples, filtered))
         last = int(moving[-1]) if len(moving) else -1
         self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore"):  # floats of a file may be of any size
             powers = np.square(samples).mean(axis=1)
-        self._level.add(np.minimum(powers, np.float32(1.0)))  # a file of floats may be beyond
+        self._level.add(np.minimum(powers, np.float32(1.0)))
         self._hum.add(samples)
 
     def add_floor(self, powers: Float64) -> None:
@@ -152,15 +153,8 @@ class ClipWatch:
         return ""
 
 
-def is_offset_only(samples: Float32, filtered: Float32) -> Bool:
-    """Tell in which frames there is no more than an offset: a dead microphone.
-
-    Parameters
-    ----------
-    samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-    filtered : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        The same by `InfrasoundFilter`.
-    """
+def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
+    """Find the frames in which there is no more than an offset: a dead microphone."""
     if filtered is samples:
         return np.zeros(len(samples), bool)
     is_flat: Bool = np.ptp(samples, axis=1) <= _DEAD_RANGE

@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -259,20 +259,25 @@ class _Edit:
         self._copy = copy
         self._digests = digests  # of the copied logs, by those of the originals
 
-    def __call__(self, record: Metadata) -> dict[str, str]:
-        """Edit one record."""
-        edits = {rosbag2.METADATA: self._rosbag2, provenance.METADATA: self._provenance}
-        edit: Callable[[Mapping[str, str]], dict[str, str]] = edits.get(record.name, dict)
+    def __call__(self, record: Metadata, fewer: Mapping[str, int]) -> dict[str, str]:
+        """Edit one record, of a copy that has so many messages of each topic less."""
         try:
-            return edit(record.metadata)
+            if record.name == rosbag2.METADATA:
+                return self._rosbag2(record.metadata, fewer)
+            if record.name == provenance.METADATA:
+                return self._provenance(record.metadata)
+            return dict(record.metadata)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise LogError(f"{self._path}: its record {record.name!r} is not ours") from error
 
-    def _rosbag2(self, record: Mapping[str, str]) -> dict[str, str]:
+    def _rosbag2(self, record: Mapping[str, str], fewer: Mapping[str, int]) -> dict[str, str]:
         key, time = "serialized_metadata", self._copy.seconds * NANOSECONDS
         information = json.loads(record[key])
         for times in (information, *information["files"]):
             times["starting_time"]["nanoseconds_since_epoch"] += time
+            times["message_count"] -= sum(fewer.values())
+        for topic in information["topics_with_message_count"]:
+            topic["message_count"] -= fewer.get(topic["topic_metadata"]["name"], 0)
         for file in information["files"]:
             file["path"] = self._copy.moved(file["path"])
         information["relative_file_paths"] = [file["path"] for file in information["files"]]

@@ -1,7 +1,7 @@
 """A log moved in time: its stamps, log times and frame numbers, all at once."""
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
-from hearthlog.schemas.arrays import Bytes, Int64, scatter
+from hearthlog.schemas.arrays import Bool, Bytes, Indices, Int64, scatter
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
@@ -37,7 +37,8 @@ _FRAMED = {
     message_types.DIRECTION,
 }
 
-Edit = Callable[[Metadata], dict[str, str]]  # what a metadata record says in the copy
+# What a metadata record says in the copy, which has so many messages of each topic less.
+Edit = Callable[[Metadata, Mapping[str, int]], dict[str, str]]
 
 
 class Shift(NamedTuple):
@@ -49,7 +50,8 @@ class Shift(NamedTuple):
     frames : mapping of str to int
         By microphone: what is added to frame numbers.
     not_before : mapping of str to int
-        By topic of segments: nanoseconds of UTC before which none begins in the copy.
+        By topic of segments: nanoseconds of UTC before which none begins in the copy; those that
+        end before it are left out.
     """
 
     seconds: int
@@ -69,20 +71,36 @@ class _Numbers(NamedTuple):
         scatter(rows, buffer, self.offsets)
 
 
+class _Records(NamedTuple):
+    """Records of messages: the bytes of a buffer at which they begin, and their lengths."""
+
+    offsets: Int64
+    sizes: Int64
+
+    def only(self, rows: Bool | Indices) -> "_Records":
+        return _Records(self.offsets[rows], self.sizes[rows])
+
+
 class _Segments(NamedTuple):
     """Segments of one topic: places and values of their starts and durations (`_SPAN`)."""
 
     topic: str
+    records: _Records
     starts: _Numbers
     durations: _Numbers
 
-    def put(self, shift: Shift, buffer: Bytes) -> None:
-        """Move the segments, and cut off what lies before the time that the shift names."""
+    def put(self, shift: Shift, buffer: Bytes) -> _Records:
+        """Move the segments, and cut off what lies before the time that the shift names.
+
+        Returns the records of those that lie before it.
+        """
         starts, durations = (_nanoseconds(each.values) for each in (self.starts, self.durations))
         starts = starts + shift.seconds * NANOSECONDS
-        begins = np.maximum(starts, shift.not_before.get(self.topic, 0))
+        first = shift.not_before.get(self.topic, 0)
+        begins = np.minimum(np.maximum(starts, first), starts + durations)
         self.starts.put(_spans(begins), buffer)
         self.durations.put(_spans(durations + starts - begins), buffer)
+        return self.records.only((starts < first) & (starts + durations <= first))
 
 
 class ShiftedLog:
@@ -123,9 +141,10 @@ class ShiftedLog:
             self._find_numbers(path, number, channel)
         del self._starts
         self.first_starts: dict[str, int] = {}
-        for topic, starts, _ in self._segments:
-            first = int(_nanoseconds(starts.values).min())
-            self.first_starts[topic] = min(first, self.first_starts.get(topic, first))
+        for segments in self._segments:
+            first = int(_nanoseconds(segments.starts.values).min())
+            known = self.first_starts.get(segments.topic, first)
+            self.first_starts[segments.topic] = min(first, known)
 
     def write(self, path: Path, shift: Shift, edit: Edit) -> None:
         """Write a copy.
@@ -136,7 +155,8 @@ class ShiftedLog:
             Must not exist.
         shift : Shift
         edit : callable
-            Told a metadata record; returns what it says in the copy.
+            Told a metadata record, and by topic how many messages are left out; returns what it
+            says in the copy.
 
         Raises
         ------
@@ -150,11 +170,13 @@ class ShiftedLog:
             numbers.put(numbers.values + shift.seconds, buffer)
         for microphone, numbers in self._frames:
             numbers.put(numbers.values + shift.frames.get(microphone, 0), buffer)
-        for segments in self._segments:
-            segments.put(shift, buffer)
+        dropped = [segments.put(shift, buffer) for segments in self._segments]
+        fewer: Counter[str] = Counter()
+        for segments, records in zip(self._segments, dropped, strict=True):
+            fewer[segments.topic] += len(records.offsets)
         entries = self._entries.copy()
         entries["time"] += time
-        chunks = self._moved_chunks(buffer, entries.view(np.uint8).data, time)
+        chunks = self._moved_chunks(buffer, entries.view(np.uint8).data, time, _joined(dropped))
         with path.open("xb") as stream:
             writer = CountedWriter(stream, self._definitions)
             writer.start(self._profile, self._library)
@@ -164,7 +186,7 @@ class ShiftedLog:
                     self._define(writer, piece, defined)
                     writer.copy_chunk(next(chunks))
                 elif isinstance(piece, Metadata):
-                    writer.add_metadata(piece.name, edit(piece))
+                    writer.add_metadata(piece.name, edit(piece, fewer))
                 elif isinstance(piece, WholeAttachment):
                     _copy_attachment(writer, piece, time)
             if self._complete:
@@ -219,9 +241,13 @@ class ShiftedLog:
         kind = message_type(schema.name, schema.encoding, schema.data)
         parts = parse_topic(channel.topic)
         if schema.name == message_types.SEGMENT and parts and not is_review(parts.labelling):
-            names = ("header.stamp", "duration")
-            spans = zip(*(self._numbers(kind, offsets, sizes, name) for name in names), strict=True)
-            self._segments += (_Segments(channel.topic, *span) for span in spans)
+            records = _Records(starts, heads["length"] + HEAD.size)
+            for layout, rows, block in rows_by_layout(kind, self._buffer, offsets, sizes):
+                spans = (
+                    _Numbers(offsets[rows] + _place(layout.dtype, name), block[name].copy())
+                    for name in ("header.stamp", "duration")
+                )
+                self._segments.append(_Segments(channel.topic, records.only(rows), *spans))
             return
         for name in _time_fields(kind.types, kind.name):
             for numbers in self._numbers(kind, offsets, sizes, name):
@@ -239,12 +265,23 @@ class ShiftedLog:
         for layout, rows, block in rows_by_layout(kind, self._buffer, offsets, sizes):
             yield _Numbers(offsets[rows] + _place(layout.dtype, name), block[name].copy())
 
-    def _moved_chunks(self, buffer: Bytes, entries: memoryview, time: int) -> Iterator[StoredChunk]:
-        content = buffer.data
+    def _moved_chunks(
+        self, buffer: Bytes, entries: memoryview, time: int, dropped: _Records
+    ) -> Iterator[StoredChunk]:
         for stored, base, places in self._chunks:
             index = {channel: entries[first:last] for channel, (first, last) in places.items()}
             span = stored.start + time, stored.end + time
-            yield compress_chunk(content[base : base + stored.size], span, index)
+            content = buffer[base : base + stored.size]
+            inside = (dropped.offsets >= base) & (dropped.offsets < base + stored.size)
+            if inside.any():
+                here = dropped.only(inside)
+                content, index = _without(
+                    content, index, here._replace(offsets=here.offsets - base)
+                )
+                times = [np.frombuffer(each, INDEX_ENTRIES)["time"] for each in index.values()]
+                if times:
+                    span = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+            yield compress_chunk(content.data, span, index)
 
     def _define(
         self, writer: CountedWriter, piece: WholeChunk, defined: set[tuple[type, int]]
@@ -258,6 +295,31 @@ class ShiftedLog:
                 if (type(record), record.id) not in defined:
                     writer.write_definition(record)
                     defined.add((type(record), record.id))
+
+
+def _joined(records: Sequence[_Records]) -> _Records:
+    nothing = np.empty(0, np.int64)
+    offsets = np.concatenate([nothing, *(each.offsets for each in records)])
+    sizes = np.concatenate([nothing, *(each.sizes for each in records)])
+    return _Records(offsets, sizes).only(np.argsort(offsets))
+
+
+def _without(
+    content: Bytes, index: Mapping[int, memoryview], dropped: _Records
+) -> tuple[Bytes, dict[int, memoryview]]:
+    """Return a chunk and its message index without some records, in the order of their places."""
+    keeps = np.ones(len(content), bool)
+    for offset, size in zip(dropped.offsets.tolist(), dropped.sizes.tolist(), strict=True):
+        keeps[offset : offset + size] = False
+    kept: dict[int, memoryview] = {}
+    before = np.concatenate([[0], np.cumsum(dropped.sizes)])
+    for channel, rows in index.items():
+        entries = np.frombuffer(rows, INDEX_ENTRIES)
+        entries = entries[~np.isin(entries["offset"], dropped.offsets)]
+        entries["offset"] -= before[np.searchsorted(dropped.offsets, entries["offset"])]
+        if len(entries):
+            kept[channel] = entries.view(np.uint8).data
+    return content[keeps], kept
 
 
 def _place(dtype: np.dtype[Any], name: str) -> int:
