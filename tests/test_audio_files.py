@@ -30,6 +30,7 @@ from hearthlog.recorder.sources.file_times import (
     FileTime,
     arrange,
     check_pattern,
+    doubts,
     file_time,
 )
 from hearthlog.recorder.sources.open_audio import _mp3_frame, audio_seconds, is_audio
@@ -106,6 +107,16 @@ def started(path, zone=UTC, pattern=""):
         ("Eurasian_Wren-85-2026-03-01-birdnet-RTSP_1-07:00:00.mp3", "2026-03-01T06:00:00"),
         ("turdus_merula_85p_20260301T070000Z.wav", "2026-03-01T07:00:00"),
         ("WhatsApp Audio 2026-03-01 at 7.00.00 PM.ogg", "2026-03-01T18:00:00"),
+        ("Recording 2026-03-01 at 7.00.00 p.m..wav", "2026-03-01T18:00:00"),
+        ("2026-03-01 07.00.00 p. m..wav", "2026-03-01T18:00:00"),
+        ("2026-03-01 12.00.00 a.m.wav", "2026-02-28T23:00:00"),
+        ("2026-03-01 07.00.00\u202fp.\u00a0m. kitchen.wav", "2026-03-01T18:00:00"),
+        ("20260301_070000-0015.wav", "2026-03-01T06:00:00"),
+        ("20260301_070000-0100.wav", "2026-03-01T06:00:00"),
+        ("2026-03-01_07-00-00-0930_kitchen.wav", "2026-03-01T06:00:00"),
+        ("20260301T070000-0500.wav", "2026-03-01T12:00:00"),
+        ("2026-03-01 07:00:00-0500.wav", "2026-03-01T12:00:00"),
+        ("20260301_070000_UTC-05.wav", "2026-03-01T12:00:00"),
         ("5E90A4D4.WAV", "2020-04-10T16:54:44"),
         ("12345678_20260301_070000.wav", "2026-03-01T06:00:00"),
         ("20260329_033000.wav", "2026-03-29T01:30:00"),
@@ -113,6 +124,39 @@ def started(path, zone=UTC, pattern=""):
 )
 def test_the_name_of_a_file_says_when_it_begins(wav, name, begin):
     assert started(wav(name), BERLIN) == (f"{begin}+00:00", NAME)
+
+
+@pytest.mark.parametrize(
+    ("name", "doubt"),
+    [
+        ("20260301_070000-0900.wav", "are taken for a number (a zone is read by --start-pattern"),
+        ("20260301_070000-0015.wav", ""),
+        ("20260301_070000-0001.wav", ""),
+        ("20260301_070000-0930_kitchen.wav", "are taken for a number"),
+        ("20260301 070000 nachm.wav", "may be a half of the day"),
+        ("2026-03-01_07-00-00_PM2.wav", "may be a half of the day"),
+        ("2026-03-01 07.00.00 下午.wav", "may be a half of the day"),
+        ("2026-03-01 19.00.00 PM2.wav", ""),
+        ("2026-03-01 07.00.00 amber.wav", ""),
+        ("2026-03-01 07.00.00 p.m..wav", ""),
+        ("5E90A4D4.WAV", "of old AudioMoths"),
+    ],
+)
+def test_a_time_in_a_name_that_may_be_read_wrongly_is_doubted(wav, name, doubt):
+    path = wav(name)
+    lines = doubts(*arrange([path], BERLIN))
+    assert [doubt in line for line in lines] == ([True] if doubt else [])
+
+
+def test_four_digits_behind_the_times_are_a_zone_if_all_files_have_the_same(wav):
+    def starts(*names):
+        _, times = arrange([wav(name) for name in names], BERLIN)
+        assert not any(time.remark for time in times)
+        return [datetime.fromtimestamp(time.start / NANOSECONDS, UTC).hour for time in times]
+
+    assert starts("20260301_070000-0500.wav", "20260301_080000-0500.wav") == [12, 13]
+    assert starts("20260301_070000-0500.wav", "20260301_080000-0600.wav") == [6, 7]
+    assert starts("20260301_070000-0500.wav", "20260301_080000.wav") == [6, 7]
 
 
 @pytest.mark.parametrize(
@@ -585,3 +629,23 @@ def test_hidden_files_and_folders_are_not_looked_at(wav, tmp_path):
     (tmp_path / "b" / "loop").symlink_to(tmp_path / "b")
     assert find_audio([tmp_path / "b"]) == ([kept], [])
     assert find_audio([kept, Path("none.wav")]) == ([kept, Path("none.wav")], [])
+
+
+@needs_ffmpeg
+def test_a_folder_has_the_files_of_all_formats_that_are_read(wav, tmp_path):
+    path = wav("source.wav")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for suffix in ("flv", "eac3", "mpg", "ts", "vob", "m2ts", "wv"):
+        converted(path, folder / f"a.{suffix}", "-ar", "44100")
+    samples, rate = soundfile.read(path)
+    for name, suffix in (("WAV", "wave"), ("W64", "w64"), ("NIST", "sph"), ("PAF", "paf")):
+        soundfile.write(folder / f"b.{suffix}", samples, rate, format=name, subtype="PCM_16")
+    (folder / "notes.txt").write_text("no sound")
+    found, refused = find_audio([folder])
+    assert [file.name for file in found] == sorted(
+        file.name for file in folder.iterdir() if file.suffix != ".txt"
+    )
+    assert not refused
+    for file in found:
+        assert len(heard(file)) > RATE

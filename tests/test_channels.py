@@ -267,3 +267,103 @@ def test_the_api_labels_what_is_there_as_a_recorder_does_around_a_gap(tmp_path):
     recorded = np.array([m.probabilities for m in logged])
     np.testing.assert_array_equal(recorded, labels.probabilities)
     assert np.diff(labels.times).max() > 2_000_000_000
+
+
+def talking(is_on, seconds=40):
+    """Sound in bursts of an eighth of a second while a talker talks, in a quiet room."""
+    times = np.arange(seconds * RATE) / RATE
+    rng = np.random.default_rng(int(1e6 * is_on(times).mean()) + seconds)
+    bursts = np.abs(np.sin(4 * np.pi * times)) * is_on(times)
+    return rng.normal(0, 0.05, len(times)) * bursts + rng.normal(0, 3e-4, len(times))
+
+
+TALK = talking(np.ones_like)
+SECONDS = np.arange(len(TALK)) / RATE
+QUIET = RNG.normal(0, 3e-4, len(TALK))
+CHANGES = {  # what two channels hold, whether the first one is usual, and how often it changes
+    "a wire of two with opposite phase breaks": (TALK * (SECONDS < 20) + QUIET, -TALK, False, 2),
+    "the first one dies": (TALK * (SECONDS < 20), TALK, True, 1),
+    "the first one fades": (TALK * np.clip(2 - SECONDS / 15, 0, 1) + QUIET, -TALK, True, 1),
+    "the first one fades to noise": (
+        TALK * (SECONDS < 20) + RNG.normal(0, 2e-3, len(TALK)),
+        TALK,
+        True,
+        1,
+    ),
+    "talkers in turn, each at one": (
+        talking(lambda times: times % 2 < 1),
+        talking(lambda times: times % 2 >= 1.001),
+        True,
+        2,
+    ),
+    "talkers in long turns": (
+        talking(lambda times: times % 14 < 7),
+        talking(lambda times: times % 14 >= 7.001),
+        True,
+        2,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_sound_in_one_channel_alone_is_heard_within_a_second_and_seldom_changes_it(case):
+    *channels, takes_first, most = CHANGES[case]
+    sound = np.round(np.stack(channels, axis=1) * 32767).astype(np.int16)
+    streams, news = [], []
+    for size in (9600, 997, len(sound)):
+        mixer, mixed = StreamMixer(takes_first=takes_first), []
+        for first in range(0, len(sound), size):
+            mixed.append(mixer(sound[first : first + size], RATE))
+            news, mixer.news = [*news, mixer.news], ""
+        streams.append(np.concatenate(mixed))
+        if size == 9600:
+            changes = [each for each in news if each]
+    assert 1 <= len(changes) <= most
+    for other in streams[1:]:
+        np.testing.assert_array_equal(other, streams[0])
+    assert longest_deafness(sound, streams[0]) <= 0.8
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_of_a_file_sound_in_one_channel_alone_is_heard_from_its_beginning(case, tmp_path):
+    channels = CHANGES[case][:2]
+    told = []
+    samples = heard(written(tmp_path / "two.wav", *channels), chosen=told.append)
+    assert len(told) <= 2
+    assert longest_deafness(np.stack(channels, axis=1) * 32767, samples * 32767) <= 0.1
+
+
+def longest_deafness(sound, mixed):
+    """Return for how many seconds at most a mix is 12 dB fainter than the loudest channel."""
+    powers = sound.reshape(-1, RATE // 10, 2).astype(float).var(axis=1).max(axis=1)
+    is_deaf = (mixed.reshape(-1, RATE // 10).astype(float).var(axis=1) * 16 < powers) & (
+        powers > (0.005 * 32767) ** 2
+    )
+    return max(len(run) for run in "".join(" x"[int(deaf)] for deaf in is_deaf).split(" ")) / 10
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("other", ["noise", "the sound", "nothing"])
+def test_one_sample_that_is_no_number_makes_no_channel_deaf(other, value, tmp_path):
+    sound = TALK.copy()
+    sound[12 * RATE] = value
+    channels = {"noise": QUIET, "the sound": TALK * 0.8, "nothing": QUIET * 0}
+    told = []
+    samples = heard(written(tmp_path / "hole.wav", sound, channels[other]), chosen=told.append)
+    assert told == []
+    assert np.isnan(samples).sum() == (other != "the sound")
+    assert longest_deafness(np.stack([TALK, TALK], axis=1), np.nan_to_num(samples) * 2) == 0
+
+
+def test_a_microphone_goes_to_the_channel_that_holds_the_sound_and_says_so_live(labmic, tmp_path):
+    turn = RATE * 4
+    sound = np.round(TALK[: 2 * turn] * 32767).astype(np.int16)
+    left, right = sound.copy(), sound.copy()
+    left[turn:], right[:turn] = 0, 0
+    labmic.configure(data=np.stack([left, right], axis=1))
+    with recording(labmic, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", 120)
+    told = "mic: channel 2 of 2 is heard alone: the first one is much fainter"
+    assert process.errors.count(told) == 1
+    states = [status for m in read(tmp_path / "logs", "diagnostics") for status in m.status]
+    assert told.removeprefix("mic: ") in {s.message for s in states if s.level == WARNING}

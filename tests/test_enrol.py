@@ -318,3 +318,28 @@ def test_a_microphone_is_listened_to_for_so_long(labmic, home):
     assert (result.returncode, result.stdout) == (0, f"{log}: 2.00 s of running_water\n")
     assert len(values(log)) == 40
     check_marked(log, "running_water", 2)
+
+
+CLIP_SECONDS = np.arange(4 * RATE) / RATE
+UNFIT = {
+    "integers as floats": (lambda cough: cough * 32768, "the file clips"),
+    "far beyond full scale": (lambda cough: cough * 1e30, "the file clips"),
+    "the mains": (lambda _: 0.1 * np.sin(2 * np.pi * 50 * CLIP_SECONDS), "hums at 50 Hz"),
+    "an offset that steps": (lambda _: 0.02 * (CLIP_SECONDS // 1 % 2), "gives one value only"),
+    "an offset, and silence": (lambda _: -0.1 * (CLIP_SECONDS > 3), "gives one value only"),
+    "a cough and silence": (lambda cough: cough * (CLIP_SECONDS < 1), ""),
+    "a cough that reaches full scale once": (lambda cough: np.clip(cough * 1.02, -1, 1), ""),
+}
+
+
+@pytest.mark.parametrize("case", UNFIT)
+@pytest.mark.filterwarnings("error")
+def test_what_is_wrong_with_an_enrolled_sound_is_said(case, cough, home, tmp_path):
+    make, problem = UNFIT[case]
+    samples = np.resize(soundfile.read(cough)[0], len(CLIP_SECONDS))
+    path = tmp_path / "unfit.wav"
+    sound = make(samples / np.abs(samples).max()).astype(np.float32)
+    soundfile.write(path, sound, RATE, subtype="FLOAT")
+    (log,) = enrol_file(home, "coughing", path)
+    assert problem in log.warning
+    assert log.warning.startswith(f"{path}: ") if problem else not log.warning

@@ -118,3 +118,12 @@ def test_a_day_that_is_30_decibels_fainter_is_noticed_and_a_silent_night_is_not(
         assert watch.problem() == FAINT
     listen(watch, np.concatenate([noise(60, 0.1), noise(180, 0.0002)]))
     assert watch.problem() == ""
+
+
+@pytest.mark.parametrize("level", [1e19, 1e30, 3e38])
+def test_samples_far_beyond_full_scale_clip_and_make_no_later_day_faint(level, recwarn):
+    watch = SoundWatch()
+    listen(watch, np.full(MINUTE, level) * np.resize([1, -1], MINUTE))
+    assert watch.problem() == CLIPS
+    assert not recwarn.list
+    assert watch._level._minutes == [1.0]

@@ -29,6 +29,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.file_times import GUESS, file_time
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.open_audio import audio_seconds
+from hearthlog.recorder.stream.sound_watch import ClipWatch, problem_of_file
 from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -52,7 +53,7 @@ class Enrolled:
 
     log: Path
     seconds: float
-    warning: str = ""  # what is missing of the file
+    warning: str = ""  # what is missing of the file, or wrong with the sound
 
 
 def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
@@ -95,8 +96,9 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     if moment.origin != GUESS:
         end = moment.start + int(length * NANOSECONDS)
     source = FileSource([audio], _free_start(home, label, length, end))
-    enrolled = _enrol(home, label, source, length, threading.Event())
-    warning = "; ".join(source.warnings)
+    enrolled, problem = _enrol(home, label, source, length, threading.Event())
+    problems = [f"{audio}: {problem_of_file(problem)}"] if problem else []
+    warning = "; ".join([*source.warnings, *problems])
     return [replace(each, warning=warning) for each in enrolled]
 
 
@@ -144,7 +146,8 @@ def enrol_microphone(
         timer = threading.Timer(seconds + _PATIENCE, stop.set)
         timer.start()
         try:
-            return _enrol(home, label, source, seconds, stop)
+            enrolled, problem = _enrol(home, label, source, seconds, stop)
+            return [replace(each, warning=problem) for each in enrolled]
         finally:
             timer.cancel()
 
@@ -213,12 +216,14 @@ class _First:
         self.device = source.device
         self._source = source
         self._left = round(seconds * NANOSECONDS / FRAME_NANOSECONDS)
+        self.watch = ClipWatch()
 
     def events(self, stop: threading.Event) -> Iterator[Event]:
         for event in self._source.events(stop):
             if isinstance(event, Frames):
                 samples, stamps = event.samples[: self._left], event.stamps[: self._left]
                 self._left -= len(stamps)
+                self.watch.add_samples(samples)
                 yield Frames(event.first, samples, stamps)
             else:
                 yield event
@@ -228,8 +233,11 @@ class _First:
 
 def _enrol(
     home: Path, label: str, source: SoundSource, seconds: float, stop: threading.Event
-) -> list[Enrolled]:
-    """Record to a temporary folder, and copy the logs to the training set if they have sound."""
+) -> tuple[list[Enrolled], str]:
+    """Record to a temporary folder, and copy the logs to the training set if they have sound.
+
+    Return them, and what is wrong with the sound.
+    """
     microphone = MicrophoneSettings()
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
         options = {
@@ -239,7 +247,8 @@ def _enrol(
             "max_bag_duration": 86_400,
         } | _feature_set(home)
         settings = load_settings(None, options, microphone.model_dump())
-        logs = record(settings, _First(source, seconds), stop).logs
+        first = _First(source, seconds)
+        logs = record(settings, first, stop).logs
         frames = {log: _frames([log], microphone.name) for log in logs}
         _check_sound(label, np.concatenate([np.empty(0), *(e for _, e in frames.values())]))
         enrolled = []
@@ -251,7 +260,7 @@ def _enrol(
             with new_file(path) as temporary:
                 shutil.copyfile(log, temporary)
             enrolled.append(_marked(path, microphone.name, label, stamps))
-    return enrolled
+    return enrolled, first.watch.problem()
 
 
 def _feature_set(home: Path) -> dict[str, str]:

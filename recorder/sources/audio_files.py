@@ -95,6 +95,7 @@ class FileSource:
         self._channels = channels
         self._channel = channel
         self._problem = ""
+        self._changes: list[str] = []  # of the problem since it was reported
         self._progress = progress
 
     @property
@@ -155,8 +156,10 @@ class FileSource:
             if stop.is_set():
                 return
             if self.frames >= report:
-                health = (WARNING, self._problem) if self._problem else (OK, READING)
-                yield SourceHealth(int(stamps[0]), *health, {"device": self.device})
+                for problem in self._changes or [self._problem]:
+                    health = (WARNING, problem) if problem else (OK, READING)
+                    yield SourceHealth(int(stamps[0]), *health, {"device": self.device})
+                self._changes = []
                 report = self.frames + _HEALTH_FRAMES
             yield frames
             next_frame += len(item)
@@ -203,9 +206,10 @@ class FileSource:
             yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
 
     def _choose(self, path: Path, sentence: str) -> None:
-        """Note that a channel of a file is heard alone."""
+        """Note which channels of a file are heard, if it is not all of them."""
         self._problem = sentence
-        if (choice := f"{path}: {sentence}") not in self._choices:
+        self._changes.append(sentence)
+        if sentence and (choice := f"{path}: {sentence}") not in self._choices:
             self._choices.append(choice)
 
     def _is_later(self, path: Path, moment: FileTime, end: int) -> bool:

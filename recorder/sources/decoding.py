@@ -43,7 +43,8 @@ def read_audio(  # noqa: PLR0913
     incomplete : callable
         Told at the end that the file is damaged or cut short, if it is; what is there was yielded.
     chosen : callable
-        Told in a sentence which channel is heard alone and why, whenever another one is.
+        Told in a sentence which channels are heard and why, whenever others are; in an empty one,
+        when all are heard again.
 
     Yields
     ------

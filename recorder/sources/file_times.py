@@ -26,12 +26,17 @@ _IN_NAME = re.compile(
       |h(?P<minute_h>\d\d)m(?P<second_h>\d\d)s?)
     (?!\d)
     (?:[.,](?P<fraction>\d{1,9})(?![0-9A-Za-z]|$)|[.,](?P<fraction_z>\d{1,9})(?=Z|$))?
-    (?:[ _\u202f]?(?P<half>[AaPp])[Mm](?![0-9A-Za-z])
+    (?:[ _\u00a0\u202f]?(?P<half>[AaPp])(?:[Mm]|\.[ _\u00a0\u202f]?[Mm]\.?)(?![0-9A-Za-z])
       |(?P<zone>Z|[ _]?(?:UTC|GMT)(?:[+-]\d\d?(?::?\d\d)?)?|[+-]\d\d:?\d\d|\+\d\d)
        (?![0-9A-Za-z]))?
     """,
     re.VERBOSE | re.ASCII,
 )
+_HALF = re.compile(  # of the day, as other languages and programs have it
+    r"[ _\u00a0\u202f-]{0,2}(?:[AaPp]\.? ?[Mm](?![A-Za-z])|nachm|vorm|[μπ]\.?μ"
+    r"|上午|下午|午前|午後|오전|오후)",
+)
+_DASH_DIGITS = re.compile(r"-\d{4}")
 _HEXADECIMAL = re.compile(r"[0-9A-F]{8}")  # of old AudioMoths: seconds since 1970
 _AUDIOMOTH = re.compile(
     r"Recorded at (\d\d:\d\d:\d\d(?:\.\d{3})?) (\d\d)/(\d\d)/(\d{4}) "
@@ -91,7 +96,9 @@ class _Moment(NamedTuple):
     step: int  # ns
 
 
-def file_time(path: Path, zone: tzinfo, pattern: str = "") -> FileTime:
+def file_time(
+    path: Path, zone: tzinfo, pattern: str = "", *, has_zone: bool | None = None
+) -> FileTime:
     """Find out when an audio file begins.
 
     By the name of the file, else by its metadata (AudioMoth's comment, GUANO, Broadcast Wave), else
@@ -104,6 +111,9 @@ def file_time(path: Path, zone: tzinfo, pattern: str = "") -> FileTime:
         Of the times that say none.
     pattern : str
         How the name says it, as of `strptime`; empty for the ways that are known.
+    has_zone : bool or None
+        Whether a dash and four digits behind a time are a zone, where nothing else says so; None:
+        that is not known, and they are a number.
 
     Raises
     ------
@@ -115,9 +125,10 @@ def file_time(path: Path, zone: tzinfo, pattern: str = "") -> FileTime:
     if pattern:
         return _placed(path, _by_pattern(path, pattern), zone, NAME)
     refused: list[str] = []
-    moments = _in_name(path, refused)
+    moments = _in_name(path, refused, has_zone=has_zone is True)
     if moments:
-        return _by_name(path, moments, zone)
+        found = _by_name(path, moments, zone)
+        return found._replace(remark=found.remark or _doubt(path, has_zone))
     for moment in _in_metadata(path):
         if reason := _implausible(path, moment.time):
             refused.append(f"{moment.time:%Y-%m-%d %H:%M:%S} in its metadata {reason}")
@@ -159,8 +170,10 @@ def arrange(
     placed: list[tuple[FileTime, list[Path]]] = []
     if start is not None and len(paths) == 1:
         return list(paths), [FileTime(start, 0, GUESS)]
+    numbers = {_dash_digits(path) for path in paths}
+    has_zone = len(numbers) == 1 and numbers != {""} if len(paths) > 1 else None
     for path in paths:
-        found = file_time(path, zone, pattern)
+        found = file_time(path, zone, pattern, has_zone=has_zone)
         if found.origin == GUESS and placed:
             placed[-1][1].append(path)  # it follows the one that was named before it
         else:
@@ -224,7 +237,34 @@ def _by_pattern(path: Path, pattern: str) -> _Moment:
     return _Moment(moment, 1_000_000 if "%f" in pattern else step)
 
 
-def _in_name(path: Path, refused: list[str]) -> list[_Moment]:
+def _dash_digits(path: Path) -> str:
+    """Return a dash and four digits behind the time in a name, a zone or the number of a part."""
+    for found in _IN_NAME.finditer(path.name):
+        is_iso = found["between"] == "T" or found["colon"] == ":"
+        if not is_iso and _DASH_DIGITS.fullmatch(found["zone"] or ""):
+            return found["zone"]
+    return ""
+
+
+def _doubt(path: Path, has_zone: bool | None) -> str:  # noqa: FBT001
+    """Say why the time in a name may be read wrongly; empty if nothing speaks for that."""
+    if has_zone is None and _offset(_dash_digits(path)) is not None:
+        return (
+            "the digits behind the time in its name are taken for a number "
+            "(a zone is read by --start-pattern with %z)"
+        )
+    found = _IN_NAME.search(path.name)
+    if (
+        found
+        and not found["half"]
+        and int(found["hour"]) <= 12
+        and _HALF.match(path.name, found.end())
+    ):
+        return "what follows the time in its name may be a half of the day, and was not read"
+    return ""
+
+
+def _in_name(path: Path, refused: list[str], *, has_zone: bool) -> list[_Moment]:
     """Read the different times in a name; what looks like one, and is none, is refused."""
     moments: list[_Moment] = []
     for found in _IN_NAME.finditer(path.name):
@@ -232,7 +272,8 @@ def _in_name(path: Path, refused: list[str]) -> list[_Moment]:
         if not with_seconds and found["between"] != "T" and found["colon"] != ":":
             refused.append(f"{found.group()!r} in its name may be a time, or a number")
             continue
-        moment = _moment(found)
+        is_number = not has_zone and (found["zone"] or "?") == _dash_digits(path)
+        moment = _moment(found, zone=None if is_number else found["zone"])
         reason = "is no date" if moment is None else _implausible(path, moment.time)
         if moment is None or reason:
             refused.append(f"{found.group()!r} in its name {reason}")
@@ -246,7 +287,7 @@ def _in_name(path: Path, refused: list[str]) -> list[_Moment]:
     return moments
 
 
-def _moment(found: re.Match[str]) -> _Moment | None:
+def _moment(found: re.Match[str], zone: str | None) -> _Moment | None:
     """Return the time that was found; None if no calendar and no clock has it."""
     hour = int(found["hour"])
     if half := found["half"]:
@@ -269,7 +310,7 @@ def _moment(found: re.Match[str]) -> _Moment | None:
     except ValueError:
         return None
     step = NANOSECONDS // 10 ** len(fraction) if second else 60 * NANOSECONDS
-    return _Moment(moment.replace(tzinfo=_offset(found["zone"])), step)
+    return _Moment(moment.replace(tzinfo=_offset(zone)), step)
 
 
 def _offset(text: str | None) -> tzinfo | None:
@@ -280,7 +321,7 @@ def _offset(text: str | None) -> tzinfo | None:
     if found is None:
         return UTC
     minutes = int(found[2]) * 60 + int(found[3] or 0)
-    if minutes > 14 * 60 or minutes % 15:
+    if minutes > 14 * 60 or 0 < minutes < 60 or minutes % 60 not in {0, 30, 45}:
         return None
     return timezone(timedelta(minutes=-minutes if found[1] == "-" else minutes))
 

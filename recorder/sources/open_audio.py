@@ -26,10 +26,27 @@ BLOCK_SECONDS = 10.0
 RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
 
 _SUFFIXES = frozenset(
-    {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf"}
-    | {".w64", ".rf64", ".voc"}
+    {
+        ".wav",
+        ".wave",
+        ".bwf",
+        ".flac",
+        ".ogg",
+        ".oga",
+        ".opus",
+        ".mp3",
+        ".aif",
+        ".aiff",
+        ".aifc",
+        ".au",
+        ".caf",
+    }
+    | {".w64", ".rf64", ".voc", ".snd", ".paf", ".svx", ".nist", ".sph", ".ircam", ".sf", ".pvf"}
+    | {".htk", ".sds", ".avr", ".sd2", ".wve"}
     | {".m4a", ".m4b", ".aac", ".mp4", ".m4v", ".mov", ".3gp", ".3g2", ".amr", ".awb", ".webm"}
     | {".mka", ".mkv", ".wma", ".wmv", ".asf", ".avi", ".mp2", ".mpga", ".ac3", ".wv", ".tta"}
+    | {".eac3", ".ec3", ".flv", ".f4v", ".mpg", ".mpeg", ".vob", ".ts", ".mts", ".m2ts", ".3gpp"}
+    | {".ape", ".dsf"}
 )
 _NO_LENGTH = 1 << 62  # libsndfile says more frames where a header has no length
 _MOST_BYTES = 0x7FFF_0000  # a header that claims more has no length

@@ -114,6 +114,45 @@ class SoundWatch:
         return FAINT if self._level.has_fallen else ""
 
 
+class ClipWatch:
+    """Watches a sound of seconds, which is too short for a `SoundWatch`."""
+
+    def __init__(self) -> None:
+        self._frames = self._clipped = self._still = self._zero = 0
+        self._held: Float32 = np.empty((0, FRAME_SAMPLES), np.float32)  # less than a second
+        self._seconds: list[int] = []  # the mains that each hums with
+
+    def add_samples(self, samples: Float32) -> None:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+            In full scale, -1 to 1.
+        """
+        self._frames += len(samples)
+        self._clipped += int(_are_clipped(samples).sum())
+        is_flat = np.ptp(samples, axis=1) <= _DEAD_RANGE
+        is_still = is_flat & (np.abs(samples[:, 0]) > _DEAD_RANGE)
+        self._still += int(is_still.sum())
+        self._zero += int((is_flat & ~is_still).sum())  # silence in a file
+        held = np.concatenate([self._held, samples])
+        whole = len(held) - len(held) % _SECOND
+        seconds, self._held = np.split(held, [whole])
+        self._seconds += map(_hum_of, seconds.reshape(-1, SAMPLE_RATE))
+
+    def problem(self) -> str:
+        """Return what is wrong and what to do; empty if nothing is."""
+        if 2 * self._still > self._frames - self._zero:
+            return STUCK
+        if self._clipped >= _CLIPPED_FRAMES or 2 * self._clipped > self._frames:
+            return CLIPS
+        for frequency in _MAINS:
+            if 2 * self._seconds.count(frequency) > len(self._seconds):
+                return HUMS.format(frequency)
+        return ""
+
+
 def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
     """Find the frames in which there is no more than an offset: a dead microphone."""
     if filtered is samples:
