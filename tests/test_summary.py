@@ -199,15 +199,20 @@ def test_an_unfinished_log_counts_as_far_as_it_goes(logs, tmp_path):
     assert summary.metadata == {"hearthlog"}
 
 
-def test_a_damaged_log_is_named_and_nothing_of_it_is_counted(logs, tmp_path):
+def test_of_a_damaged_log_the_rest_is_counted_and_of_what_is_no_log_nothing(logs, tmp_path):
     bad = damaged(logs[1], tmp_path)
     nothing = tmp_path / "nothing.mcap"
     nothing.write_bytes(b"no log")
-    summary = summarise([logs[0], bad, nothing, logs[2]])
-    assert list(summary.damaged) == [bad, nothing]
+    with pytest.warns(HearthlogWarning, match="damaged at byte .* left out up to byte"):
+        summary = summarise([logs[0], bad, nothing, logs[2]])
+    assert list(summary.damaged) == [nothing]
     assert all(error.startswith(f"{path}: ") for path, error in summary.damaged.items())
-    assert summary.files == [logs[0], logs[2]]
-    assert figures(summary) == counted([logs[0], logs[2]])
+    assert summary.files == [logs[0], bad, logs[2]]
+    found, sound, all_ = figures(summary), counted([logs[0], logs[2]]), counted(logs)
+    for topic, (messages, *_) in all_.items():
+        assert sound.get(topic, (0,))[0] <= found[topic][0] <= messages
+    assert found != sound
+    assert found != all_
 
 
 def test_a_ros_bag_is_counted_by_its_index(tmp_path):
