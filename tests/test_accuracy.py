@@ -99,6 +99,15 @@ def test_a_mark_that_says_nothing_is_known_says_nothing(tmp_path):
     assert checked(tmp_path).check("coughing") == (0, 0, 0, 0, 0)
 
 
+def test_what_nobody_could_tell_makes_nothing_beside_it_right_or_found(tmp_path):
+    long = [(at("10:00:05"), 20, "coughing", 0.9), (at("12:00:20"), 10, "coughing", 0.9)]
+    logs = write_day(tmp_path, DAY, long)
+    check(logs, at("10:00"), [(5, 20, "music"), (20, 25, "unknown")])
+    assert checked(tmp_path).check("coughing") == (1, 0, 0, 0, 0)
+    check(logs, at("12:00"), [(5, 15, "coughing"), (20, 30, "unknown")])
+    assert checked(tmp_path).check("coughing") == (1, 0, 1, 1, 0)
+
+
 def _runs(labels, name, pause):
     """Return first and last second of the runs of a label with at most so much between them."""
     seconds = np.flatnonzero(labels == name)
@@ -109,12 +118,15 @@ def _runs(labels, name, pause):
 def _begun(minutes, events, others, untold):
     """Count the events that begin in minutes, and those with a part in it that others have too."""
     begun = hit = 0
+    there = np.zeros(len(untold), bool)
+    for first, last in others:
+        there[first : last + 1] = True
     for begin, inside in minutes.items():
         for first, last in events:
             end = min(last, begin + 59)
             if first in inside and not untold[first : end + 1].all():
                 begun += 1
-                hit += any(max(first, a) <= min(end, b) for a, b in others)
+                hit += (there & ~untold)[first : end + 1].any()
     return begun, hit
 
 

@@ -543,6 +543,8 @@ def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refus
     many = {("music", "music", "music"): 40, ("speech", "speech", "hum"): 3}
     (said,) = reasons(marks | many)
     assert said.startswith("hum takes 3 of 3 sounds of talking that one had right")
+    unsure = {("unknown", "unknown", "unknown"): 6, ("unknown", "unknown", "hum"): 4}
+    assert reasons(marks | unsure) == [], "what nobody was sure of was not right"
     (said,) = reasons(marks | {("silence", "silence", "hum"): 3})
     assert said.startswith("hum takes 3 of 3 silences that one had right")
 

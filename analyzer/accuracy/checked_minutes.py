@@ -229,12 +229,13 @@ def _events(minute: ReviewedLabels, name: str) -> list[int]:
     """Count the events that begin in a minute: labelled, right, true and missed ones.
 
     Of what outlasts the minute only the part in it was looked at, and says whether it is right.
-    Where nobody could tell what sounds, no event is counted.
+    Where nobody could tell what sounds, no event is counted, and none makes another one right.
     """
+    start, end = minute.span.start, minute.span.end
     labelled, true = events_of(minute.labels, name), events_of(minute.true, name)
     own, others = _begun(labelled, minute), _begun(true, minute)
-    right = overlapping(own, cut(true, minute.span.start, minute.span.end))
-    found = overlapping(others, cut(labelled, minute.span.start, minute.span.end))
+    right = overlapping(own, without(cut(true, start, end), minute.untold))
+    found = overlapping(others, without(cut(labelled, start, end), minute.untold))
     return [len(own.starts), int(right.sum()), len(others.starts), int((~found).sum())]
 
 

@@ -1,6 +1,6 @@
 """What is known of the sounds of a home: marks, and what was looked at and left as it was."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from hearthlog.schemas.messages.topics import LIVE, relabelling
 from hearthlog.schemas.times import NANOSECONDS
 
 _SHORTEST = NANOSECONDS // 2  # sound that counts
+_REMAINS = 2 * NANOSECONDS  # what is shorter beside a mark is the marked sound, not cut exactly
 _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
@@ -82,7 +83,7 @@ def left_alone(log: Path) -> list[Sound]:
     Returns
     -------
     list of Sound
-        Of half a second or more; none of what cannot be read.
+        Of half a second or more, and of two beside a mark; none of what cannot be read.
     """
     sounds: list[Sound] = []
     with suppress(DataError, LogError):
@@ -92,12 +93,19 @@ def left_alone(log: Path) -> list[Sound]:
         for span in spans:
             with suppress(DataError, LogError):
                 marked = {(mark.start, mark.end) for mark in marks}
+                edges = {edge for mark in marked for edge in mark}
                 sounds += [
                     sound._replace(random=False)
                     for sound in _parts(labellings, span, marks)
                     if (sound.start, sound.end) not in marked
+                    and sound.end - sound.start >= _least(sound, edges)
                 ]
-    return [sound for sound in sounds if sound.end - sound.start >= _SHORTEST]
+    return sounds
+
+
+def _least(sound: Sound, edges: Set[int]) -> int:
+    """Return how long a sound has to be to count."""
+    return _SHORTEST if edges.isdisjoint((sound.start, sound.end)) else _REMAINS
 
 
 def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hearthlog.analyzer.gate.changes import class_words, time_words
 from hearthlog.analyzer.gate.evidence import Evidence, Right
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64
 
 LEAST_MINUTES = 10.0  # of sound to judge by
@@ -176,7 +176,8 @@ def _swallowed(evidence: Evidence, champion: str) -> Iterator[str]:
             silence = float(column[changes.classes.index(SILENCE)])
             yield (
                 f"{changes.words(silence)} of {name} is silence for {champion}: if that is the "
-                "sound of the room, delete its marks, else review some silence that is none"
+                "sound of the room, delete its marks; else go through some real silence in "
+                    "`hearthlog review --queue`, leave it as it is, and train again"
             )
 
 
@@ -202,7 +203,7 @@ def _taken(evidence: Evidence, new: str) -> Iterator[tuple[str, int, int]]:
                 if true == before == name
             }
         )
-        for name in sorted({true for true, _, _ in evidence.known} - {new})
+        for name in sorted({true for true, _, _ in evidence.known} - {new, UNKNOWN})
     }
     sounds = [counts for name, counts in right.items() if name != SILENCE]
     yield "sounds of other classes", sum(c.total() for c in sounds), sum(c[new] for c in sounds)

@@ -22,6 +22,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import CUT
 from hearthlog.schemas.times import NANOSECONDS
 
+_DAY = 86_400 * NANOSECONDS
 HOME_WEIGHT = 3.0  # of a segment of the home; others have 1
 MOST_OF_MARK = 6  # segments, so that a mark of minutes is not more than a few of seconds
 HOME = "this home"
@@ -216,8 +217,16 @@ def recording_of(
 
 
 def _group(sound: HomeSound, start: int) -> str:
-    """Name the source of a recording: its day, or what was enrolled, the same sound only once."""
+    """Name the source of a recording: its day, or what was enrolled, the same sound only once.
+
+    A recording that was enrolled at midnight is in two logs, and named by that midnight.
+    """
     if sound.enrolled and not sound.log.stem.endswith(CUT):
+        edges = int(sound.stamps[0]), int(sound.stamps[-1]) + FRAME_NANOSECONDS
+        for edge in edges:
+            night = round(edge / _DAY)
+            if abs(edge - night * _DAY) < FRAME_NANOSECONDS:
+                return f"{HOME} night {night}"
         return f"{HOME} {hashlib.sha256(sound.values.tobytes()).hexdigest()}"
     day = np.datetime64(start // NANOSECONDS, "s").astype("datetime64[D]")
     return f"{HOME} {day}"
