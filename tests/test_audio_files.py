@@ -149,14 +149,15 @@ def test_a_time_in_a_name_that_may_be_read_wrongly_is_doubted(wav, name, doubt):
 
 
 def test_four_digits_behind_the_times_are_a_zone_if_all_files_have_the_same(wav):
-    def starts(*names):
+    def starts(*names, doubted=0):
         _, times = arrange([wav(name) for name in names], BERLIN)
-        assert not any(time.remark for time in times)
+        assert sum(bool(time.remark) for time in times) == doubted
         return [datetime.fromtimestamp(time.start / NANOSECONDS, UTC).hour for time in times]
 
     assert starts("20260301_070000-0500.wav", "20260301_080000-0500.wav") == [12, 13]
-    assert starts("20260301_070000-0500.wav", "20260301_080000-0600.wav") == [6, 7]
-    assert starts("20260301_070000-0500.wav", "20260301_080000.wav") == [6, 7]
+    assert starts("20260301_070000-0500.wav", "20260301_080000-0900.wav", doubted=2) == [6, 7]
+    assert starts("20261101_013000-0400.wav", "20261101_013000-0500.wav") == [5, 6]
+    assert starts("20260301_070000-0500.wav", "20260301_080000.wav", doubted=1) == [6, 7]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """What is known of the sounds of a home: marks, and what was looked at and left as it was."""
 
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -103,7 +104,7 @@ def left_alone(log: Path) -> list[Sound]:
     return sounds
 
 
-def _least(sound: Sound, edges: Set[int]) -> int:
+def _least(sound: Sound, edges: AbstractSet[int]) -> int:
     """Return how long a sound has to be to count."""
     return _SHORTEST if edges.isdisjoint((sound.start, sound.end)) else _REMAINS
 

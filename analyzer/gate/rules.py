@@ -177,7 +177,7 @@ def _swallowed(evidence: Evidence, champion: str) -> Iterator[str]:
             yield (
                 f"{changes.words(silence)} of {name} is silence for {champion}: if that is the "
                 "sound of the room, delete its marks; else go through some real silence in "
-                    "`hearthlog review --queue`, leave it as it is, and train again"
+                "`hearthlog review --queue`, leave it as it is, and train again"
             )
 
 

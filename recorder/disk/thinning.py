@@ -91,9 +91,9 @@ def thin(log: Path, step: int) -> bool:
                 if step > _STATISTICS and is_reviewed(log):
                     copy.unlink(missing_ok=True)
                     return False
-                copy.replace(log)  # from here on a copy of this name is another process's
-                sync_folder(log.parent)
+                copy.replace(log)
         except BaseException:
             copy.unlink(missing_ok=True)
             raise
+        sync_folder(log.parent)  # where it fails, a copy of this name is another process's
     return True

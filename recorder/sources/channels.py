@@ -91,7 +91,6 @@ class ChannelMixer:
         if not size:
             return self._choice.mix(block)
         starts = [*range(0, size * _PIECES, size), len(block)]
-        starts[-2:] = starts[-1:]  # the last piece has the rest
         pieces = [block[start:end] for start, end in pairwise(starts)]
         mixed = []
         for piece in pieces:

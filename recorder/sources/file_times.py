@@ -170,8 +170,7 @@ def arrange(
     placed: list[tuple[FileTime, list[Path]]] = []
     if start is not None and len(paths) == 1:
         return list(paths), [FileTime(start, 0, GUESS)]
-    numbers = {_dash_digits(path) for path in paths}
-    has_zone = len(numbers) == 1 and numbers != {""} if len(paths) > 1 else None
+    has_zone = _have_zone(paths) if len(paths) > 1 else None
     for path in paths:
         found = file_time(path, zone, pattern, has_zone=has_zone)
         if found.origin == GUESS and placed:
@@ -246,9 +245,21 @@ def _dash_digits(path: Path) -> str:
     return ""
 
 
+def _have_zone(paths: Sequence[Path]) -> bool:
+    """Return whether the digits behind the times are of one zone, or of it and its summer time."""
+    numbers = {_dash_digits(path) for path in paths}
+    if len(numbers) == 1:
+        return numbers != {""}
+    zones = [zone for number in numbers if (zone := _offset(number)) is not None]
+    if not len(zones) == len(numbers) == 2:
+        return False
+    one, other = (datetime.now(zone).utcoffset() or timedelta() for zone in zones)
+    return abs(one - other) == timedelta(hours=1)
+
+
 def _doubt(path: Path, has_zone: bool | None) -> str:  # noqa: FBT001
     """Say why the time in a name may be read wrongly; empty if nothing speaks for that."""
-    if has_zone is None and _offset(_dash_digits(path)) is not None:
+    if has_zone is not True and _offset(_dash_digits(path)) is not None:
         return (
             "the digits behind the time in its name are taken for a number "
             "(a zone is read by --start-pattern with %z)"

@@ -231,10 +231,13 @@ class MicrophoneSource:
         """Yield the frames that a block completes, and the gap before them."""
         self._overruns += block.overflowed
         self._device_heard.add(block)
+        if not len(block.samples):
+            return
         if self._mixer is not None:
             block = replace(block, samples=self._mixer(block.samples, rate))
         # Before it is resampled: noise of one step becomes more, as noise of a quiet room is.
-        is_flat = int(block.samples.max()) - int(block.samples.min()) <= DEAD_STEPS
+        first = block.samples if block.samples.ndim == 1 else block.samples[:, 0]
+        is_flat = int(first.max()) - int(first.min()) <= DEAD_STEPS
         for event in self._framer.add(block):
             self._watch(event, is_flat=is_flat)
             yield event
@@ -260,13 +263,17 @@ class MicrophoneSource:
     def _open(self, device: "_Device", stop: Flag) -> Capture:
         if is_address(device.wanted):
             return NetworkProcess(device.wanted, stop, device.channel)
-        return CaptureProcess(
-            device.wanted,
-            exact=device.was_heard,
-            channels=device.channels,
-            channel=device.channel,
-            latency=device.latency,
-        )
+        try:
+            return CaptureProcess(
+                device.wanted,
+                exact=device.was_heard,
+                channels=device.channels,
+                channel=device.channel,
+                latency=device.latency,
+            )
+        except SourceError:
+            device.could_not_be_opened()
+            raise
 
     def _hear(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
@@ -409,6 +416,7 @@ class _Device:
         self.channel = channel
         self.was_heard = False
         self.latency = LATENCY_SECONDS
+        self._may_take_longer = True
         self._last = self._longest_pause = 0.0  # arrival of a block of this run, between two
         self._overflows: deque[float] = deque(maxlen=_OVERFLOWS)  # their arrival
 
@@ -425,9 +433,14 @@ class _Device:
         if block.overflowed:
             self._overflows.append(block.arrival)
 
+    def could_not_be_opened(self) -> None:
+        """Note that the device may refuse the longer buffer: it is asked for once."""
+        if self.latency != LATENCY_SECONDS:
+            self.latency, self._may_take_longer = LATENCY_SECONDS, False
+
     def was_silent(self) -> None:
         """Note that no more sound came: without any at all a longer buffer may be needed."""
-        if not self._last:
+        if not self._last and self._may_take_longer:
             self.latency = LONG_LATENCY_SECONDS
         elif self._longest_pause < LATENCY_SECONDS:
             self.latency = LATENCY_SECONDS
@@ -436,7 +449,7 @@ class _Device:
         """Ask for a longer buffer if the sound comes in pieces that are longer than it is."""
         often = len(self._overflows) == _OVERFLOWS
         often = often and self._overflows[-1] - self._overflows[0] < _OVERFLOW_SECONDS
-        if not often or self.latency == LONG_LATENCY_SECONDS:
+        if not often or self.latency == LONG_LATENCY_SECONDS or not self._may_take_longer:
             return False
         self.latency = LONG_LATENCY_SECONDS
         return True

@@ -143,6 +143,7 @@ class LogFile:
         self._lost = _Lost()
         self.undefined: set[int] = set()  # channels that no chunk defines
         self.doubtful: set[int] = set()  # channels that are defined in two ways
+        self._doubtful_schemas: set[int] = set()
         self.streams: list[ContentStream] = []  # of large chunks that are being read
         self.again: Counter[int] = Counter()  # bytes decompressed once more, by large chunk
         self.lock = threading.Lock()  # of both
@@ -325,8 +326,8 @@ class LogFile:
                 self.scan_new()
         self._warn_of_lost()
 
-    def _scan(self, size: int) -> None:
-        """Walk through all records; where one is damaged, go on with the next chunk."""
+    def _scan(self, size: int) -> NDArray[np.void]:
+        """Walk through what is left of the records; behind a damaged one go on with a chunk."""
         rows = array("q")
         row = self._walk(rows, self._end, size)
         for _ in range(_PLACES):
@@ -335,19 +336,21 @@ class LogFile:
                 break
             self._lost.add(self._end, place, _LENGTH)
             self._end = place
-            self._add_row(rows, row)
+            self._add_last_row(rows, row)
             row = self._walk(rows, self._end, size)
         if self.complete and not self.ended:
             self._lost.add(self._end, size, _LENGTH)
         self._add_last_row(rows, row)
-        self._add_chunks(rows)
+        return self._add_chunks(rows)
 
     def _next_chunk(self, start: int, size: int) -> int | None:
         """Search for a compressed chunk that fits into the file, and that a record follows."""
         while start < size:
             window = self.read(start, min(_SEARCHED + CHUNK_HEAD_LIMIT, size - start))
             for place in find_chunk_heads(window):
-                if place < _SEARCHED and self._is_chunk(start + place, window[place:], size):
+                if place < _SEARCHED and self._is_chunk(
+                    start + place, window[place : place + CHUNK_HEAD_LIMIT], size
+                ):
                     return start + place
             start += _SEARCHED
         return None
@@ -375,6 +378,7 @@ class LogFile:
             text = f"damaged at byte {lost.first} ({lost.why}){more}: {lost.size:,} bytes left out"
             text += RECOVER
             warnings.warn(HearthlogWarning(text, self.path, each=True), stacklevel=2)
+            self._lost = _Lost()
 
     def _has_index(self, footer: records.Footer, end: int) -> bool:
         """Read the summary, and return whether it has an index; warn if it is damaged."""
@@ -470,6 +474,10 @@ class LogFile:
             If a record is damaged, or the file cannot be read.
         """
         rows = array("q")
+        if self.partial:
+            found = self._scan(self.size)
+            self._warn_of_lost()
+            return found
         row = self._walk(rows, self._end, self.size)
         if self._lost.places:
             lost, self._lost = self._lost, _Lost()
@@ -590,13 +598,20 @@ class LogFile:
         """Add a schema or a channel; one that contradicts an earlier one makes that doubtful."""
         if isinstance(record, records.Schema):
             if self.schemas.setdefault(record.id, record) != record:
-                self._doubt({n for n, c in self.channels.items() if c.schema_id == record.id})
+                self._doubtful_schemas.add(record.id)
+                channels = list(self.channels.items())  # another thread may add one
+                self._doubt({number for number, c in channels if c.schema_id == record.id})
             return
         first = self.channels.setdefault(record.id, record)
-        if first is not record and replace(first, metadata={}) != replace(record, metadata={}):
+        differs = first is not record and replace(first, metadata={}) != replace(
+            record, metadata={}
+        )
+        if differs or record.schema_id in self._doubtful_schemas:
             self._doubt({record.id})
 
     def _doubt(self, channels: set[int]) -> None:
+        if channels <= self.doubtful:
+            return
         self.doubtful |= channels
         text = "messages of channels that the file defines in two ways are left out"
         warnings.warn(HearthlogWarning(text, self.path, each=True), stacklevel=2)
@@ -605,6 +620,9 @@ class LogFile:
         self.header = None
         self.late = False
         self._lost = _Lost()
+        self.doubtful.clear()
+        self.undefined.clear()
+        self._doubtful_schemas.clear()
         self.chunks = np.empty(0, CHUNKS)
         self.schemas.clear()
         self.channels.clear()

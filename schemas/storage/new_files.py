@@ -174,6 +174,9 @@ def _open(path: Path, flags: int, mode: int = 0) -> tuple[int, os.stat_result]:
     try:
         descriptor = os.open(path.name, flags | os.O_NOFOLLOW | os.O_CLOEXEC, mode, dir_fd=folder)
         return descriptor, os.fstat(folder)
+    except OSError as error:
+        error.filename = str(path)  # which names the file alone
+        raise
     finally:
         os.close(folder)
 

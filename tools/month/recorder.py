@@ -124,8 +124,9 @@ def main() -> None:
         exact: bool = False,
         channels: int | None = None,
         channel: int | None = None,
+        latency: float = 0.0,
     ) -> FastMicrophone:
-        del exact, channels, channel
+        del exact, channels, channel, latency
         return FastMicrophone(state, sound, month, rng)
 
     setattr(microphone, "CaptureProcess", capture)  # noqa: B010  it is imported there
