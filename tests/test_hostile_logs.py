@@ -263,6 +263,52 @@ def test_behind_a_record_with_a_wrong_length_the_next_chunk_is_read(tmp_path, he
         assert set(printed(done)) > {0, 29}
 
 
+def of_three_topics(path):
+    """Sixty numbers of three topics in turn, some in each chunk."""
+    bag = Bag(path, chunk_size=400)
+    channels = [bag.channel(topic, INT32) for topic in ("/a", "/b", "/c")]
+    for i in range(60):
+        bag.add(channels[i % 3], int32(i), T0 + i * STEP)
+    return bag.close()
+
+
+def test_a_log_that_is_damaged_while_it_is_written_is_read_as_far_as_it_goes(tmp_path, hearthlog):
+    path = without_index(numbers(tmp_path / "x.mcap"))
+    with LogFile(path) as file:
+        start = int(file.chunks["offset"][1])
+    data = bytearray(path.read_bytes()[: -len(END)])
+    struct.pack_into("<Q", data, start + 1, 2**40)
+    unfinished = tmp_path / "y.mcap.active"
+    unfinished.write_bytes(data)
+    done = hearthlog("cat", unfinished)
+    assert (done.returncode, set(printed(done)) > {0, 29}) == (3, True)
+    assert f"damaged at byte {start} (a record" in done.stderr
+
+
+def test_a_damaged_index_of_messages_costs_none_of_the_chunk_before_it(tmp_path, hearthlog):
+    path = without_index(of_three_topics(tmp_path / "x.mcap"))
+    with LogFile(path) as file:
+        row = file.chunks[1]
+    data = bytearray(path.read_bytes())
+    first = int(row["offset"] + row["length"])
+    (length,) = struct.unpack_from("<Q", data, first + 1)
+    struct.pack_into("<Q", data, first + HEAD.size + length + 1, 2**40)
+    path.write_bytes(data)
+    done = hearthlog("cat", path)
+    assert (done.returncode, sorted(printed(done))) == (3, list(range(60)))
+
+
+def test_a_damaged_summary_makes_no_channel_doubtful(tmp_path, hearthlog):
+    path = of_three_topics(tmp_path / "x.mcap")
+    data = bytearray(path.read_bytes())
+    (summary,) = struct.unpack_from("<Q", data, len(data) - FOOTER_SIZE + HEAD.size)
+    place = data.index(text("/b"), summary) - 4  # its number
+    data[place : place + 2] = struct.pack("<H", 1)
+    path.write_bytes(data)
+    done = hearthlog("cat", path)
+    assert (done.returncode, sorted(printed(done))) == (3, list(range(60)))
+
+
 def test_a_message_index_that_lies_is_not_used(tmp_path, hearthlog):
     path = numbers(tmp_path / "x.mcap")
     with LogFile(path) as file:
