@@ -61,7 +61,8 @@ class PrometheusOutput:
     Raises
     ------
     BridgeError
-        If the port cannot be had or has no token, or what is remembered is damaged.
+        If the port cannot be had or has no token, and there is no text file that goes on without
+        it, or what is remembered is damaged.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class PrometheusOutput:
     ) -> None:
         self._settings = settings
         self._home = home
+        self._say = say
         self.totals = Totals(state_folder / TOTALS, since)
         self._text, self._made = b"", -math.inf  # and when, by CLOCK_MONOTONIC
         self._lock = Lock()
@@ -84,13 +86,15 @@ class PrometheusOutput:
                 'write readable_by = "all" if that is meant, else "owner" or "group": the next '
                 'release takes "owner" if it says nothing'
             )
-        self._server = None if settings.port is None else self._listen(settings.port)
+        self._server: _Server | None = None
+        self._open_port()
 
     def update(self, news: News) -> None:
         """Work the figures out anew, if they are ten seconds old."""
         if time.monotonic() < self._due:
             return
         self._due = time.monotonic() + _EVERY_SECONDS
+        self._open_port()
         self.totals.keep(news.state, min(news.today.midnight, news.today.night) - _LATER)
         registry = CollectorRegistry()
         registry.register(_Figures(news, self._home, self.totals.count(news.state)))
@@ -109,6 +113,17 @@ class PrometheusOutput:
             self._server.end()
         if self._settings.text_file is not None:
             self._settings.text_file.unlink(missing_ok=True)
+
+    def _open_port(self) -> None:
+        """Open the port that is configured; a text file goes on without it."""
+        if self._settings.port is None or self._server is not None:
+            return
+        try:
+            self._server = self._listen(self._settings.port)
+        except BridgeError as error:
+            if self._settings.text_file is None:
+                raise
+            self._say(f"{error}; {self._settings.text_file} is written all the same")
 
     def _listen(self, port: int) -> "_Server":
         token = figures_token(port, self._settings.token_file)
