@@ -28,7 +28,7 @@ def midday_zone():
 
 
 class LiveHome:
-    """A log that is being written, from six hours ago on.
+    """A log that is being written, by its name from six hours ago on.
 
     Attributes
     ----------
@@ -36,9 +36,17 @@ class LiveHome:
         Of the log, in nanoseconds of UTC.
     """
 
-    def __init__(self, folder, microphones=("mic",), classes=GENERAL, scenarios=None, **metadata):
+    def __init__(
+        self,
+        folder,
+        microphones=("mic",),
+        classes=GENERAL,
+        scenarios=None,
+        minutes_ago=360,
+        **metadata,
+    ):
         self.folder, self.classes = folder, list(classes)
-        self.start = time.time_ns() - 360 * MINUTE
+        self.start = time.time_ns() - minutes_ago * MINUTE
         beside = {scenario_labelling(name): own for name, own in (scenarios or {}).items()}
         topics = {
             topic.name: topic

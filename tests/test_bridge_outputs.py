@@ -13,7 +13,7 @@ from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.outputs import open_outputs
+from hearthlog.analyzer.bridge.outputs import open_outputs, output_problems
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.analyzer.ports import free_port, listen
@@ -54,6 +54,69 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
     assert opened["prometheus"].output is not None
     for output in opened.values():
         output.close()
+
+
+CONTRADICTIONS = [
+    ({"mqtt": {"host": "127.0.0.1"} | more}, f"bridge.mqtt: {problem}")
+    for more, problem in [
+        ({"ca_file": "ca.pem"}, "ca_file is for an encrypted connection; write tls = true, or"),
+        ({"key_file": "key.pem"}, "key_file is for an encrypted connection; write tls = true"),
+        ({"certificate_file": "a.pem"}, "certificate_file is for an encrypted connection; write"),
+        ({"tls": True, "key_file": "key.pem"}, "key_file belongs to a certificate; name that"),
+        ({"password_file": "/etc/hostname"}, "password_file is the password of a user; say of"),
+    ]
+] + [({"prometheus": {}}, "bridge.prometheus: gives the figures to nobody; name a text_file, or")]
+
+
+@pytest.mark.parametrize(
+    ("tables", "line"), CONTRADICTIONS, ids=[str(t) for t, _ in CONTRADICTIONS]
+)
+def test_a_table_that_contradicts_itself_closes_its_own_output_alone(home, tmp_path, tables, line):
+    said = []
+    with listen() as broker:
+        port = {"port": broker.getsockname()[1]} if "mqtt" in tables else {}
+        tables = {name: table | port for name, table in tables.items()}
+        settings = BridgeSettings.model_validate(tables | {"page": {"port": free_port()}})
+        opened, _ = open_outputs(settings, home, tmp_path, Saying(said.append))
+        assert [name for name, output in opened.items() if output.output] == ["page"]
+        opened["page"].close()
+        broker.setblocking(False)
+        with pytest.raises(BlockingIOError):  # nobody came, with a password or without
+            broker.accept()
+    assert said[0].startswith(line)
+    assert said[0].endswith("; trying again")
+    problems, _ = output_problems(settings, [])
+    assert any(each.startswith(line) for each in problems)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("", "bridge.prometheus: text_file: {} is a folder; name a file in it, as hearthlog.prom"),
+        ("x" * 300, "bridge.prometheus: text_file: {} cannot be written (File name too long)"),
+        (f"{'x' * 300}/home.prom", "text_file: {} cannot be written (File name too long)"),
+        ("loop/home.prom", "text_file: {} cannot be written (Too many levels of symbolic links)"),
+        ("file/home.prom", "/file: cannot be written ("),
+    ],
+)
+def test_a_text_file_that_cannot_be_looked_at_is_no_reason_to_refuse_the_configuration(
+    home, tmp_path, name, problem
+):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "file").touch()
+    file = tmp_path / name
+    settings = BridgeSettings.model_validate({"prometheus": {"text_file": file}})
+    (line,), _ = output_problems(settings, [])
+    assert problem.format(file) in line
+    said = []
+    with_readers = settings.prometheus.model_copy(update={"readable_by": "all"})
+    outputs_of = settings.model_copy(update={"prometheus": with_readers})
+    opened, _ = open_outputs(outputs_of, home, tmp_path, Saying(said.append))
+    opened["prometheus"].update(NEWS)
+    opened["prometheus"].close()
+    assert said[0].startswith("bridge.prometheus: text_file: ")
+    assert said[0].endswith("; trying again")
+    assert all("cannot be removed" in line for line in said[1:])
 
 
 def test_an_output_that_is_tried_again_leaves_no_thread(home, tmp_path, monkeypatch):

@@ -229,27 +229,6 @@ def test_who_cannot_be_told_of_a_trouble_ends_nothing():
             "line 3: bridge.mqtt.port: 70000 is not a whole number from 1 to 65535",
         ),
         ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: is no address that can be"),
-        (
-            '[bridge.mqtt]\nhost = "x"\nca_file = "ca.pem"',
-            "line 1: bridge.mqtt: ca_file is for an encrypted connection; write tls = true",
-        ),
-        (
-            '[bridge.mqtt]\nhost = "x"\nkey_file = "key.pem"',
-            "line 1: bridge.mqtt: key_file is for an encrypted connection",
-        ),
-        (
-            '[bridge.mqtt]\nhost = "x"\ntls = true\nkey_file = "key.pem"',
-            "line 1: bridge.mqtt: key_file belongs to a certificate",
-        ),
-        (
-            '[bridge.mqtt]\nhost = "x"\npassword_file = "pw"',
-            "line 1: bridge.mqtt: password_file is the password of a user",
-        ),
-        ("[bridge.prometheus]", "line 1: bridge.prometheus: gives the figures to nobody"),
-        (
-            '[bridge.prometheus]\ntext_file = "/"',
-            "line 1: bridge.prometheus: text_file: / is a folder; name a file in it",
-        ),
         ('[bridge.page]\nbind = "224.0.0.1"', "line 2: bridge.page.bind: '224.0.0.1' is no"),
         ('[bridge.page]\nbind = "ff02::1"', "line 2: bridge.page.bind: 'ff02::1' is no address"),
         ("bridge = 3", "line 1: bridge: is a table; write [bridge]"),

@@ -371,6 +371,16 @@ microphone = "kitchn"
             "bridge.prometheus: port 9380 is that of [bridge.page]",
         ),
         (
+            "[bridge.mqtt]\nhost = 'x'\nca_file = 'ca.pem'\n",
+            1,
+            "bridge.mqtt: ca_file is for an encrypted connection; write tls = true, or leave",
+        ),
+        (
+            "[bridge.prometheus]\ntext_file = '/tmp'\n",
+            1,
+            "bridge.prometheus: text_file: /tmp is a folder; name a file in it",
+        ),
+        (
             ALERT,
             3,
             "a: there is no microphone 'kitchn', so that it hears nothing; there is mic",

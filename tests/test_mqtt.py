@@ -1,10 +1,11 @@
 """What is heard reaches a real broker, and what people say comes back from it."""
 
 import json
+import os
 import random
 import signal
 import time
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from livehome import LiveHome, following, midday_zone
 
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.mqtt import publisher
+from hearthlog.analyzer.bridge.mqtt.announced import Announced
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.settings import MqttSettings
@@ -34,11 +36,13 @@ _CLIPS = Path(__file__).parent / "data" / "household"
 class Bridged:
     """A bridge in a thread, between the log of a home and a broker."""
 
-    def __init__(self, folder: Path, broker: Broker, outputs=(), node="home", **settings):
+    def __init__(
+        self, folder: Path, broker: Broker, outputs=(), node="home", state=None, **settings
+    ):
         self.said = []
         place = Home(folder, node, midday_zone())
         mqtt = MqttSettings(**({"host": "127.0.0.1", "port": broker.port} | settings))
-        state = folder.parent / "bridge"
+        state = state or folder.parent / "bridge"
         publisher = MqttPublisher(mqtt, place, state, self.said.append)
         everybody = dict(outputs) | {"mqtt": publisher}
         self._following = following(place, everybody, self.said)
@@ -174,6 +178,11 @@ def test_a_microphone_that_the_newest_log_has_no_more_is_cleared_and_nobody_else
         ({"old": [8, 9], "new": [7, 10]}, True),
         ({"old": [8, 10], "new": [7, 9, 11]}, False),
         ({"old": [8, 9], "new": [7]}, False),
+        ({"old": [8], "new": [7, 9]}, True),
+        ({"old": [8.5], "new": [8, 9]}, False),  # one log, within one of the other
+        ({"old": [8], "new": [8.5, 9.5]}, False),
+        ({"new": [8]}, False),  # of another folder
+        ({"old": [8]}, True),
     ],
 )
 def test_a_recorder_that_records_beside_another_one_is_no_other_name_of_it(
@@ -181,12 +190,51 @@ def test_a_recorder_that_records_beside_another_one_is_no_other_name_of_it(
 ):
     for node, times in hours.items():
         for hour in times:
-            (tmp_path / f"{node}_20260301T{hour:02}0000Z.mcap").touch()
+            start = datetime(2026, 3, 1, tzinfo=UTC) + timedelta(hours=hour)
+            log = tmp_path / f"{node}_{start:%Y%m%dT%H%M%SZ}.mcap"
+            log.touch()
+            os.utime(log, (end := start.timestamp() + 3600, end))
     home = Home(tmp_path, "new", midday_zone())
-    assert publisher._is_renamed(home, "old") == is_renamed
-    assert not publisher._is_renamed(home, "new")
+    assert publisher._is_renamed(home, "old", is_first=True) == is_renamed
+    assert publisher._is_renamed(home, "old", is_first=False) == (is_renamed and "new" in hours)
+    assert not publisher._is_renamed(home, "new", is_first=True)
     with FolderLock(tmp_path, "old"):
-        assert not publisher._is_renamed(home, "old")
+        assert not publisher._is_renamed(home, "old", is_first=True)
+
+
+def test_two_recorders_of_different_folders_clear_nothing_of_each_other(tmp_path, broker):
+    homes = [LiveHome(tmp_path / node / "logs", node=node) for node in ("attic", "home")]
+    state = tmp_path / "bridge"
+    with Listener(broker.port) as listener:
+        for _ in range(2):
+            for home in homes:
+                home.hears("coughing")
+                node = home.folder.parent.name
+                with Bridged(home.folder, broker, node=node, state=state):
+                    listener.wait_for(f"hearthlog/{node}/mic/class/coughing/on", "ON")
+        assert "" not in listener.values.values()
+    assert {path.name for path in state.glob("*.json")} == {"mqtt-attic.json", "mqtt-home.json"}
+    for home in homes:
+        home.close()
+
+
+def test_what_was_switched_off_under_any_name_of_a_recorder_stays_off(tmp_path):
+    said, muted = [], {"mqtt-attic.json": "speech", "mqtt-home.json": "coughing"}
+    for name, label in muted.items():
+        (tmp_path / name).write_text(json.dumps({"muted": [label]}))
+    first = Announced(tmp_path, "home", "x", lambda _, **__: True, said.append)
+    assert first.muted() == ["coughing", "speech"]
+    other = Announced(tmp_path, "attic", "x", lambda _, **__: False, said.append)
+    assert "is used by another bridge" in said.pop()  # until the name is free
+    other.close()
+    first.save()
+    later = Announced(tmp_path, "attic", "x", lambda _, **__: False, said.append)
+    later.save()
+    first.switch("speech", is_told=True)
+    first.close()
+    later.close()
+    assert {path.name for path in tmp_path.glob("*.json")} == {*muted}
+    assert said == []
 
 
 @pytest.mark.parametrize(
@@ -472,7 +520,7 @@ def _own(port):
 def test_a_recorder_that_gets_its_former_name_back_leaves_nothing_of_the_other(tmp_path, broker):
     with Listener(broker.port) as listener:
         for node in ("home", "attic", "home"):
-            home = LiveHome(tmp_path / "logs", node=node)
+            home = LiveHome(tmp_path / "logs", node=node, minutes_ago=0)
             home.hears("coughing")
             with Bridged(home.folder, broker, node=node):
                 listener.wait_for(f"hearthlog/{node}/mic/class/coughing/on", "ON")

@@ -17,7 +17,7 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
-from hearthlog.analyzer.ports import free_port
+from hearthlog.analyzer.ports import free_port, listen
 from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
@@ -84,6 +84,13 @@ def known(port):
     """The text of the figures; empty while there are none."""
     status, text = ask(port)
     return text if status == 200 else ""
+
+
+def opened(port):
+    """The text of the figures; empty while there are none, or no port."""
+    with suppress(ConnectionError):
+        return known(port)
+    return ""
 
 
 def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
@@ -180,6 +187,35 @@ def test_a_port_without_a_token_stays_closed(home, tmp_path):
         PrometheusOutput(settings, place, tmp_path, 0, pytest.fail)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), timeout=10)
+
+
+@pytest.mark.parametrize("lacking", ["no token_file", "no file", "no token", "no port"])
+def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, monkeypatch, lacking):
+    monkeypatch.setattr(prometheus, "_EVERY_SECONDS", 0.0)
+    home.hears("silence")
+    token, text, said = tmp_path / "token", tmp_path / "home.prom", []
+    place, port = Home(home.folder, "home", UTC), free_port()
+    if lacking == "no token":
+        token.touch()
+    settings = PrometheusSettings(
+        port=port,
+        text_file=text,
+        token_file=None if lacking == "no token_file" else token,
+        readable_by="all",
+    )
+    with ExitStack() as held:
+        if lacking == "no port":
+            token.write_text(f"{TOKEN}\n")
+            held.enter_context(listen(port=port))
+        output = PrometheusOutput(settings, place, tmp_path, time.time_ns(), said.append)
+        with following(place, {"prometheus": output}, said):
+            wait_for(lambda: text.read_text() if text.exists() else "")
+            held.close()
+            token.write_text(f"{TOKEN}\n")
+            if lacking != "no token_file":
+                assert wait_for(lambda: opened(port))
+    assert all(line.endswith(f"; {text} is written all the same") for line in said)
+    assert said
 
 
 def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):

@@ -1,5 +1,6 @@
 """The outputs that are configured, opened, and opened again where that failed."""
 
+import stat
 import time
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
@@ -206,18 +207,36 @@ def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_St
 
 def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
     """Yield how certificates, addresses and folders are checked."""
-    if (mqtt := settings.mqtt) is not None and mqtt.tls:
-        from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
+    if (mqtt := settings.mqtt) is not None:
+        yield None, mqtt.check_files
+        if mqtt.tls:
+            from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
 
-        yield None, partial(tls_context, mqtt)
+            yield None, partial(tls_context, mqtt)
     if (page := settings.page) is not None:
         yield None, lambda: listen(bind=page.bind).close()
-    if (figures := settings.prometheus) is not None and figures.text_file is not None:
-        yield None, partial(check_writable, figures.text_file.absolute().parent)
+    if (figures := settings.prometheus) is not None:
+        yield None, figures.check_readers
+        if figures.text_file is not None:
+            yield None, partial(_check_text_file, figures.text_file)
     if page is not None and figures is not None and figures.port == page.port:
         yield None, partial(_check_ports, page)
     if settings.state is not None:
         yield None, partial(check_writable, settings.state)
+
+
+def _check_text_file(file: Path) -> None:
+    problem = ""
+    try:
+        if stat.S_ISDIR(file.stat().st_mode):
+            problem = "is a folder; name a file in it, as hearthlog.prom"
+    except (FileNotFoundError, NotADirectoryError):
+        pass  # what is there is looked at below
+    except OSError as error:
+        problem = f"cannot be written ({error.strerror})"
+    if problem:
+        raise BridgeError(f"bridge.prometheus: text_file: {file} {problem}")
+    check_writable(file.absolute().parent)
 
 
 def _check_ports(page: PageSettings) -> None:

@@ -29,6 +29,7 @@ from hearthlog.analyzer.bridge.page.page_token import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
 from hearthlog.analyzer.ports import HOST, is_asked_in_digits
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import create_file, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -61,7 +62,8 @@ class PrometheusOutput:
     Raises
     ------
     BridgeError
-        If the port cannot be had or has no token, or what is remembered is damaged.
+        If nobody is given the figures, if the port cannot be had or has no token and there is no
+        text file, which goes on without it, or if what is remembered is damaged.
     """
 
     def __init__(
@@ -72,8 +74,10 @@ class PrometheusOutput:
         since: int,
         say: Callable[[str], None],
     ) -> None:
+        settings.check_readers()
         self._settings = settings
         self._home = home
+        self._say = say
         self.totals = Totals(state_folder / TOTALS, since)
         self._text, self._made = b"", -math.inf  # and when, by CLOCK_MONOTONIC
         self._lock = Lock()
@@ -84,13 +88,15 @@ class PrometheusOutput:
                 'write readable_by = "all" if that is meant, else "owner" or "group": the next '
                 'release takes "owner" if it says nothing'
             )
-        self._server = None if settings.port is None else self._listen(settings.port)
+        self._server: _Server | None = None
+        self._open_port()
 
     def update(self, news: News) -> None:
         """Work the figures out anew, if they are ten seconds old."""
         if time.monotonic() < self._due:
             return
         self._due = time.monotonic() + _EVERY_SECONDS
+        self._open_port()
         self.totals.keep(news.state, min(news.today.midnight, news.today.night) - _LATER)
         registry = CollectorRegistry()
         registry.register(_Figures(news, self._home, self.totals.count(news.state)))
@@ -98,17 +104,36 @@ class PrometheusOutput:
         with self._lock:
             self._text, self._made = text, time.monotonic()
         if self._settings.text_file is not None:
-            rights = _READERS[self._settings.readable_by or "all"]
-            put = replaced_file(self._settings.text_file, readers=rights)
-            with put as temporary, create_file(temporary) as stream:
-                stream.write(text)
+            self._write(self._settings.text_file, text)
 
     def close(self) -> None:
         """Answer no more; the text file goes, so that nobody takes it for today's."""
         if self._server is not None:
             self._server.end()
-        if self._settings.text_file is not None:
-            self._settings.text_file.unlink(missing_ok=True)
+        if (file := self._settings.text_file) is not None:
+            try:
+                file.unlink(missing_ok=True)
+            except OSError as error:
+                self._say(f"bridge.prometheus: {file}: cannot be removed ({error.strerror})")
+
+    def _write(self, file: Path, text: bytes) -> None:
+        rights = _READERS[self._settings.readable_by or "all"]
+        try:
+            with replaced_file(file, readers=rights) as temporary, create_file(temporary) as stream:
+                stream.write(text)
+        except (LogError, OSError) as error:
+            self._say(f"bridge.prometheus: text_file: {error}; trying again")
+
+    def _open_port(self) -> None:
+        """Open the port that is configured; a text file goes on without it."""
+        if self._settings.port is None or self._server is not None:
+            return
+        try:
+            self._server = self._listen(self._settings.port)
+        except BridgeError as error:
+            if self._settings.text_file is None:
+                raise
+            self._say(f"{error}; {self._settings.text_file} is written all the same")
 
     def _listen(self, port: int) -> "_Server":
         token = figures_token(port, self._settings.token_file)

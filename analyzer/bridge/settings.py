@@ -15,6 +15,7 @@ from pydantic import (
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings, SecretFile
+from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.ping import is_ping_address
 from hearthlog.analyzer.ports import ip_of
 from hearthlog.recorder.config import (
@@ -128,18 +129,26 @@ class MqttSettings(_Table):
         default=False, description="Whether corrections and pauses are taken from the broker."
     )
 
-    @model_validator(mode="after")
-    def _check_files(self) -> Self:
-        for name in ("ca_file", "certificate_file", "key_file"):
-            if getattr(self, name) and not self.tls:
-                raise ValueError(
-                    f"{name} is for an encrypted connection; write tls = true, or leave it out"
-                )
-        if self.key_file and not self.certificate_file:
-            raise ValueError("key_file belongs to a certificate; name that, with certificate_file")
-        if self.password_file and not self.user:
-            raise ValueError("password_file is the password of a user; say of which, with user")
-        return self
+    def check_files(self) -> None:
+        """Check whether the files belong to what else is configured, before anything is sent.
+
+        No validator, which would refuse the other outputs, too.
+
+        Raises
+        ------
+        BridgeError
+            If they do not.
+        """
+        files = ("ca_file", "certificate_file", "key_file")
+        if not self.tls and (name := next((name for name in files if getattr(self, name)), "")):
+            problem = f"{name} is for an encrypted connection; write tls = true, or leave it out"
+        elif self.key_file and not self.certificate_file:
+            problem = "key_file belongs to a certificate; name that, with certificate_file"
+        elif self.password_file and not self.user:
+            problem = "password_file is the password of a user; say of which, with user"
+        else:
+            return
+        raise BridgeError(f"bridge.mqtt: {problem}")
 
 
 class PrometheusSettings(_Table):
@@ -162,15 +171,18 @@ class PrometheusSettings(_Table):
         default=None, description="Who of this machine may read `text_file`."
     )
 
-    @model_validator(mode="after")
-    def _check_outputs(self) -> Self:
+    def check_readers(self) -> None:
+        """Check whether anybody is given the figures; no validator, as `MqttSettings.check_files`.
+
+        Raises
+        ------
+        BridgeError
+            If nobody is.
+        """
         if self.text_file is None and self.port is None:
-            raise ValueError("gives the figures to nobody; name a text_file, or a port")
-        if self.text_file is not None and self.text_file.is_dir():
-            raise ValueError(
-                f"text_file: {self.text_file} is a folder; name a file in it, as hearthlog.prom"
+            raise BridgeError(
+                "bridge.prometheus: gives the figures to nobody; name a text_file, or a port"
             )
-        return self
 
 
 class PageSettings(_Table):

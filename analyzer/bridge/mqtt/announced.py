@@ -7,8 +7,10 @@ discovery of this very node, once, to clear what an earlier bridge left.
 import fcntl
 import os
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock
+from typing import Protocol
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -36,6 +38,10 @@ class _Content(BaseModel):
     last_events: dict[str, str] = {}  # id of the last event that was told of, by microphone
 
 
+class _IsRenamed(Protocol):
+    def __call__(self, former: str, /, *, is_first: bool) -> bool: ...
+
+
 class Announced:
     """The topics that a broker keeps of this bridge, classes it is not told of, events it knows.
 
@@ -48,8 +54,8 @@ class Announced:
     broker : str
         Host and port.
     is_renamed : callable
-        Given the name of another recorder, returns whether it has this name now: what was
-        remembered of it is taken over.
+        Given the name of another recorder, and as `is_first` whether nothing was remembered of
+        this one, returns whether it has this name now: what was remembered of it is taken over.
     say : callable
         Told what is wrong, in a line.
 
@@ -65,7 +71,7 @@ class Announced:
         folder: Path,
         node: str,
         broker: str,
-        is_renamed: Callable[[str], bool],
+        is_renamed: _IsRenamed,
         say: Callable[[str], None],
     ) -> None:
         self.path = folder / f"{_PREFIX}{node}{_SUFFIX}"
@@ -73,27 +79,27 @@ class Announced:
         self._lock = Lock()
         self._is_changed = False
         self._descriptor = self._take_lock(folder)
-        self._former: list[Path] = []  # of names that the recorder had
+        has_own = self.path.exists()
+        # Of names that the recorder had: their files, and locks that no bridge of theirs can take.
+        self._former: dict[Path, int] = {}
         if self._descriptor is not None:
-            self._former = [
-                path
-                for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}"))
-                if path != self.path
-                and not _is_used(path)
-                and is_renamed(path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX))
-            ]
-        sources = [*self._former, *([self.path] if self.path.exists() else [])]
+            for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}")):
+                former = path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX)
+                if path != self.path and is_renamed(former, is_first=not has_own):
+                    self._take_over(path)
+        sources = [*self._former, *([self.path] if has_own else [])]
         self.is_new = self._descriptor is None or not sources
         contents = [] if self.is_new else [self._load(source) for source in sources]
-        content = contents[-1] if contents else _Content()
         self._is_changed = bool(self._former)
         self._broker = broker
         self.topics: dict[str, Place] = {}
         # Of another address of the broker, too: it may be the same one, and else has none of them.
+        self._muted: set[str] = set()
+        self._last_events: dict[str, str] = {}
         for each in contents:
             self.topics |= each.topics
-        self._muted = set(content.muted)
-        self._last_events = content.last_events
+            self._muted.update(each.muted)
+            self._last_events |= each.last_events
 
     def add(self, topic: str, place: Place) -> None:
         """Note a topic to which a value is published that the broker keeps."""
@@ -170,17 +176,36 @@ class Announced:
             try:
                 with replaced_file(self.path) as temporary, create_file(temporary) as stream:
                     stream.write(content.model_dump_json().encode())
-                for path in self._former:
-                    path.unlink(missing_ok=True)
+                self._remove_former()
             except (LogError, OSError) as error:
                 self._say(f"mqtt: {error}; topics that go are not cleared after the next start")
 
     def close(self) -> None:
         """Write down what has changed, and let another bridge use the folder."""
         self.save()
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
+        for descriptor in [*self._former.values(), self._descriptor]:
+            if descriptor is not None:
+                os.close(descriptor)
+        self._former.clear()
+        self._descriptor = None
+
+    def _take_over(self, path: Path) -> None:
+        """Lock the memory of a former name, unless a bridge runs that remembers there."""
+        with suppress(OSError):
+            descriptor = open_lock(_lock_path(path))
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                os.close(descriptor)
+                return
+            self._former[path] = descriptor
+
+    def _remove_former(self) -> None:
+        """Remove the memories that were taken over, and only then let others have their names."""
+        while self._former:
+            path = next(iter(self._former))
+            path.unlink(missing_ok=True)
+            os.close(self._former.pop(path))
 
     def _take_lock(self, folder: Path) -> int | None:
         try:
@@ -211,20 +236,3 @@ class Announced:
 
 def _lock_path(path: Path) -> Path:
     return path.with_name(f".{path.stem}.lock")
-
-
-def _is_used(path: Path) -> bool:
-    """Return whether a bridge runs that remembers there."""
-    try:
-        descriptor = os.open(_lock_path(path), os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False

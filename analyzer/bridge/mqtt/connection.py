@@ -174,6 +174,7 @@ class Connection:
         self._client.loop_stop()
 
     def _make_client(self, settings: MqttSettings) -> mqtt.Client:
+        settings.check_files()
         client = mqtt.Client(
             CallbackAPIVersion.VERSION2, client_id=self._client_id, protocol=mqtt.MQTTv5
         )

@@ -3,7 +3,9 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +31,7 @@ from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.recorder.log.folder_lock import node_locks
-from hearthlog.schemas.logs.files import is_layer, log_name, walk_logs
+from hearthlog.schemas.logs.files import log_name, walk_logs
 from hearthlog.schemas.text import shortened
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ _BORN = b"online"  # of Home Assistant
 _MOST_ASKED = 20  # commands that wait
 _MOST_OFF = 1000  # classes that the broker says it is not told of
 _MOST_BEGUN = 1000
+_RESTART_SECONDS = 2.0  # so near to each other, two logs were not written at once
 
 
 class MqttPublisher:
@@ -380,26 +383,43 @@ def event_fields(event: Event, news: News) -> dict[str, str | float]:
     }
 
 
-def _is_renamed(home: Home, former: str) -> bool:
+def _is_renamed(home: Home, former: str, *, is_first: bool) -> bool:
     """Return whether another recorder of the folder has the name of this one now.
 
-    It does not record, and this recorder wrote none of its logs between those of the other, but
-    later ones, or writes now: two recorders of one folder write theirs side by side.
+    It wrote logs here, does not record, and this recorder wrote none of its logs while the other
+    wrote, but later ones, or writes now: two recorders of one folder write theirs side by side.
+
+    Parameters
+    ----------
+    home : Home
+    former : str
+        Name of the other recorder.
+    is_first : bool
+        Whether no bridge of this recorder ran before: it may have no log yet.
     """
     if former == home.node:
         return False
     locks = {each.node: each.is_held for each in node_locks(home.folder)}
     if locks.get(former, False) is not False:
         return False
-    names = [
-        log_name(Path(entry.name))
-        for entry in walk_logs(home.folder)
-        if not is_layer(Path(entry.name))
-    ]
-    own = [each.time for each in names if each.node == home.node]
-    theirs = [each.time for each in names if each.node == former]
-    if not own or not theirs:
-        return True
-    first, last = min(theirs), max(theirs)
-    is_since = max(own) > last or bool(locks.get(home.node, False))
-    return is_since and not any(first <= time <= last for time in own)
+    spans = _log_spans(home.folder, {home.node, former})
+    own, theirs = spans[home.node], spans[former]
+    if not theirs:  # it may record to another folder
+        return False
+    if not own:
+        return is_first
+    first, last = min(start for start, _ in theirs), max(end for _, end in theirs)
+    is_since = max(start for start, _ in own) > last or bool(locks.get(home.node, False))
+    return is_since and not any(start <= last and end >= first for start, end in own)
+
+
+def _log_spans(folder: Path, nodes: Collection[str]) -> dict[str, list[tuple[str, str]]]:
+    """Return when the logs of nodes began and were last written to, as in the names of logs."""
+    spans: dict[str, list[tuple[str, str]]] = {node: [] for node in nodes}
+    for entry in walk_logs(folder):
+        name = log_name(Path(entry.name))
+        if name.node in spans and not name.layer:
+            with suppress(OSError, ValueError, OverflowError):  # it is gone, or its time is none
+                end = datetime.fromtimestamp(entry.stat().st_mtime - _RESTART_SECONDS, UTC)
+                spans[name.node].append((name.time, max(name.time, f"{end:%Y%m%dT%H%M%SZ}")))
+    return spans
