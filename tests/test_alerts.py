@@ -549,6 +549,20 @@ def test_a_replay_says_that_no_model_knows_the_class_of_a_rule(two_days, hearthl
     )
 
 
+@pytest.mark.parametrize("table", ["", '[[microphone]]\nname = "kitchen"\n'])
+def test_a_replay_says_that_nothing_of_the_microphone_of_a_rule_was_recorded(
+    two_days, hearthlog, tmp_path, table
+):
+    rule = CONFIG.replace('class = "coughing"', 'class = "coughing"\nmicrophone = "kitchen"')
+    (tmp_path / "home.toml").write_text(table + rule)
+    options = ["--config", tmp_path / "home.toml"]
+    done = hearthlog("alerts", "replay", two_days / "logs", *options)
+    assert done.stderr == (
+        "hearthlog: coughs: nothing of the microphone 'kitchen' was recorded in this time; "
+        "there is mic\n"
+    )
+
+
 def test_a_bridge_says_that_no_model_knows_the_class_of_a_rule(tmp_path, monkeypatch):
     monkeypatch.setattr("hearthlog.analyzer.bridge.alerts.output._WAIT_SECONDS", 0.1)
     said, recorder = [], WrittenHome(tmp_path / "logs")

@@ -397,6 +397,17 @@ def test_what_the_bridge_could_not_tell_of_is_named_before_it_starts(
     assert words in result.stderr
 
 
+@pytest.mark.parametrize("tables", ["", "node = 'flat'\n", "[bridge.page]\n"])
+def test_a_configuration_without_microphones_says_of_none_that_it_is_not_there(
+    hearthlog, tmp_path, tables
+):
+    file = tmp_path / "home.toml"
+    rule = ALERT.partition('name = "mic"')[2]
+    file.write_text(f'model = "none"\noutput = "{tmp_path}/logs"\n{tables}{rule}')
+    result = hearthlog("config", "check", file)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
 def test_secrets_that_the_page_keeps_and_an_address_with_a_password_are_named(hearthlog, tmp_path):
     for name in ("page-token", "page-cookies", "page-address"):
         (tmp_path / name).write_text("0123456789abcdef0123")

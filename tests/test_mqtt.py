@@ -13,12 +13,14 @@ from brokers import Broker, Listener, settled_values, start_bridge
 from homelife import GENERAL
 from killed_bridge import ZONE, kill_at_random, start_recorder
 from livehome import LiveHome, following, midday_zone
+from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.mqtt import publisher
 from hearthlog.analyzer.bridge.mqtt.announced import Announced
-from hearthlog.analyzer.bridge.mqtt.discovery import device_id
+from hearthlog.analyzer.bridge.mqtt.discovery import described, device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
+from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
@@ -43,8 +45,8 @@ class Bridged:
         place = Home(folder, node, midday_zone())
         mqtt = MqttSettings(**({"host": "127.0.0.1", "port": broker.port} | settings))
         state = state or folder.parent / "bridge"
-        publisher = MqttPublisher(mqtt, place, state, self.said.append)
-        everybody = dict(outputs) | {"mqtt": publisher}
+        self.publisher = MqttPublisher(mqtt, place, state, self.said.append)
+        everybody = dict(outputs) | {"mqtt": self.publisher}
         self._following = following(place, everybody, self.said)
 
     def __enter__(self):
@@ -511,6 +513,54 @@ def test_what_a_bridge_left_whose_memory_is_lost_is_cleared_and_nobody_elses_is(
         after = settled_values(broker.port, seconds=0.3)
     assert {topic: after.get(topic) for topic in foreign} == foreign
     assert f"{ROOT}/mic/class/coughing/on" in after
+
+
+@pytest.mark.parametrize("kind", ["large", "many", "long"])
+def test_what_is_left_at_a_broker_is_taken_over_up_to_a_bound(home, broker, kind):
+    home.hears("coughing")
+    topics = Topics("hearthlog", "home")
+    count, name = {"large": (1, "x"), "many": (3000, "x"), "long": (100, "x" * 1000)}[kind]
+    with Listener(broker.port) as listener:
+        for number in range(8):
+            classes = [f"{name}{each}" for each in range(count)]
+            found = discovery(topics, f"old{number}", classes)
+            found["components"] = {
+                key: {"state_topic": each["state_topic"]}
+                for key, each in found["components"].items()
+                if "state_topic" in each
+            }
+            found["padding"] = "x" * (1 << 20) if kind == "large" else ""
+            text = json.dumps(found)
+            assert kind == "large" or len(text) < 1 << 20
+            listener.publish(f"homeassistant/device/{number}/config", text, retain=True)
+        listener.wait_for("homeassistant/device/7/config")
+        with Bridged(home.folder, broker):
+            listener.wait_for(f"{COUGHING}/on", "ON")
+    memory = (home.folder.parent / "bridge" / "mqtt-home.json").read_bytes()
+    taken = [topic for topic in json.loads(memory)["topics"] if "/old" in topic]
+    assert (len(taken) == 0) == (kind == "large")
+    assert len(taken) <= 5000
+    assert len(memory) < 4 << 20
+
+
+def test_what_comes_to_a_broker_later_is_not_taken_for_what_a_bridge_left(home, broker):
+    home.hears("coughing")
+    config = "homeassistant/device/later/config"
+    with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
+        listener.wait_for(f"{COUGHING}/on", "ON")
+        text = (
+            listener.wait_for(DISCOVERY).replace("home-mic", "home-hall").replace("/mic/", "/hall/")
+        )
+        listener.publish(f"{ROOT}/hall/level", "-3", retain=True)
+        message = MQTTMessage(topic=config.encode())
+        message.payload, message.retain = text.encode(), True
+        assert described(Topics("hearthlog", "home"), message.payload)
+        bridged.publisher._take(message)
+        home.heard("coughing", 0.1)
+        listener.wait_for(f"{ROOT}/mic/event")
+    assert listener.values[f"{ROOT}/hall/level"] == "-3"
+    memory = (home.folder.parent / "bridge" / "mqtt-home.json").read_text()
+    assert "/hall/" not in memory
 
 
 def _own(port):

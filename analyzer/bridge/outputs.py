@@ -159,7 +159,7 @@ def output_problems(
     ----------
     settings : BridgeSettings
     microphones : collection of str
-        The names of those that are recorded.
+        The names of those that are recorded; without any nothing is known.
 
     Returns
     -------

@@ -293,6 +293,15 @@ def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
     return settings, bridge
 
 
+def configured_microphones(settings: Settings) -> list[str]:
+    """Return the names of the microphones that a configuration has; none if it has no table of one.
+
+    The recorder may then have another configuration, and the default is no statement of it.
+    """
+    is_given = "microphone" in settings.model_fields_set
+    return [each.name for each in settings.microphone] if is_given else []
+
+
 def file_schema() -> dict[str, Any]:
     """Return the JSON schema of a configuration: of the recorder and of the bridge."""
     schema = Settings.model_json_schema()

@@ -35,7 +35,7 @@ def bridge(
     from hearthlog.analyzer.bridge.outputs import exposed_files, open_outputs
     from hearthlog.analyzer.bridge.run import Bridge
     from hearthlog.analyzer.bridge.saying import Saying
-    from hearthlog.analyzer.bridge.settings import load_bridge_settings
+    from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
     from hearthlog.analyzer.bridge.state_folder import state_folder
     from hearthlog.analyzer.extras import require
     from hearthlog.recorder.config import exposed_passwords
@@ -58,7 +58,7 @@ def bridge(
     state = state_folder(own.state, home.folder)
     for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
         say(line)
-    microphones = [] if logs else [each.name for each in settings.microphone]
+    microphones = [] if logs else configured_microphones(settings)
     for line in filter(None, (unknown_microphone(rule, microphones) for rule in own.alert)):
         say(f"alerts: {line}")
     outputs, since = open_outputs(own, home, state, say)

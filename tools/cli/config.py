@@ -49,14 +49,14 @@ def check(
     microphone that is not recorded.
     """
     from hearthlog.analyzer.bridge.outputs import exposed_files, output_problems
-    from hearthlog.analyzer.bridge.settings import load_bridge_settings
+    from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
     from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.recording import recording_problems
     from hearthlog.tools.cli.record import with_model
 
     settings, bridge = load_bridge_settings(file)
     errors = recording_problems(with_model(settings))
-    problems, warnings = output_problems(bridge, [each.name for each in settings.microphone])
+    problems, warnings = output_problems(bridge, configured_microphones(settings))
     warnings += [*exposed_passwords(settings, file), *exposed_files(bridge, file, bridge.state)]
     for line in [*map(str, errors), *problems, *warnings]:
         tell(line)

@@ -279,15 +279,36 @@ def unknown_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
     ----------
     rule : AlertRule
     microphones : collection of str
-        Their names; without any nothing is known.
+        Those that are configured; without any nothing is known.
     """
-    name = rule.microphone if isinstance(rule, _SoundRule) else ""
-    if not name or not microphones or name in microphones:
+    if not (name := _missing(rule, microphones)):
         return ""
     return (
         f"{rule.name}: there is no microphone {name!r}, so that it hears nothing; there is "
         f"{listed(sorted(microphones))}"
     )
+
+
+def unrecorded_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
+    """Say that logs have nothing of the microphone that a rule has; empty if they have.
+
+    Parameters
+    ----------
+    rule : AlertRule
+    microphones : collection of str
+        Those that the logs have something of; without any nothing is known.
+    """
+    if not (name := _missing(rule, microphones)):
+        return ""
+    return (
+        f"{rule.name}: nothing of the microphone {name!r} was recorded in this time; there is "
+        f"{listed(sorted(microphones))}"
+    )
+
+
+def _missing(rule: AlertRule, microphones: Collection[str]) -> str:
+    name = rule.microphone if isinstance(rule, _SoundRule) else ""
+    return name if microphones and name not in microphones else ""
 
 
 def live_history(rule: AlertRule) -> int:

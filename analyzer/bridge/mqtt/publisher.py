@@ -44,6 +44,8 @@ _BORN = b"online"  # of Home Assistant
 _MOST_ASKED = 20  # commands that wait
 _MOST_OFF = 1000  # classes that the broker says it is not told of
 _MOST_BEGUN = 1000
+_LARGEST_FOUND = 1 << 20  # bytes of a description that is read back
+_MOST_FOUND, _MOST_FOUND_SIZE = 5000, 1 << 20  # topics that are taken over, and their characters
 _RESTART_SECONDS = 2.0  # so near to each other, two logs were not written at once
 
 
@@ -89,6 +91,7 @@ class MqttPublisher:
         self._has_said_muted = False
         # Earlier versions left it to the broker to remember what it keeps, and is not told of.
         self._is_new = self._announced.is_new
+        self._found, self._found_size = 0, 0  # topics that the broker says it was told of
         self._reads_back = settings.commands and self._is_new
         self._off: set[str] = set()  # classes that the broker says it is not told of
         self._was_ready = False
@@ -225,9 +228,19 @@ class MqttPublisher:
             place = self._topics.parse(message.topic)
             if place is not None and place.kind == TOLD and len(self._off) < _MOST_OFF:
                 self._off.add(place.label)
-        elif self._is_new and message.retain:
-            for place in described(self._topics, bytes(message.payload)):
-                self._announced.add(self._topic(place), place)
+        elif self._is_new and message.retain and not self._was_ready:
+            self._take_found(bytes(message.payload))
+
+    def _take_found(self, payload: bytes) -> None:
+        """Take over topics that an earlier bridge described, as many as one could have."""
+        places = described(self._topics, payload) if len(payload) <= _LARGEST_FOUND else []
+        for place in places:
+            topic = self._topic(place)
+            size = self._found_size + len(topic)
+            if size > _MOST_FOUND_SIZE or self._found >= _MOST_FOUND:
+                return
+            self._found, self._found_size = self._found + 1, size
+            self._announced.add(topic, place)
 
     def _leave_out_again(self, classes: Iterable[str]) -> None:
         """Tell no more of the classes of a model that the broker was not told of before."""
