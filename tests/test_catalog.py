@@ -38,7 +38,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
@@ -488,6 +488,18 @@ def test_a_catalogue_of_an_older_version_is_made_anew(fleet):
     for part in (fleet / CATALOG).iterdir():
         part.write_bytes(unusable("another version", part.read_bytes()))
     assert write_catalog(fleet, read_catalog(fleet)).table == whole
+
+
+@pytest.mark.filterwarnings("ignore::hearthlog.schemas.errors.HearthlogWarning")
+def test_a_catalogue_that_is_a_link_is_refused_and_what_it_leads_to_stays(recording, tmp_path):
+    folder, elsewhere = tmp_path / "logs", tmp_path / "elsewhere"
+    shutil.copytree(recording, folder)
+    elsewhere.mkdir()
+    (elsewhere / "ledger.parquet").write_bytes(b"of root")
+    (folder / CATALOG).symlink_to(elsewhere)
+    with pytest.raises(LogError, match="is a link"):
+        write_catalog(folder)
+    assert [path.name for path in elsewhere.iterdir()] == ["ledger.parquet"]
 
 
 def test_how_much_a_catalogue_holds_is_known_before_it_is_read(fleet):

@@ -316,7 +316,7 @@ def make_home(folder):
         do(f"relabel logs --model {model}.safetensors")
     (folder / "home.toml").write_text(
         'node = "home"\n[[bridge.alert]]\nname = "coughs"\nrule = "more_than"\nclass = "coughing"\n'
-        'count = 3\nwindow = "2h"\n'
+        'count = 3\nwindow = "2h"\n[bridge.mqtt]\nhost = "127.0.0.1"\n'
     )
     (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
     for name in ("day.txt", "ten.txt"):

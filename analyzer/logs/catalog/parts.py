@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hearthlog.analyzer.logs.catalog.file import read_table, write_table
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, log_readers
 from hearthlog.schemas.storage.byte_ranges import is_local, map_logs, store_errors
 from hearthlog.schemas.storage.new_files import private_folder, replaced_file
@@ -86,9 +87,11 @@ def write_parts(
     Raises
     ------
     LogError
-        If the catalogue cannot be written.
+        If the catalogue cannot be written, or is a link.
     """
     catalog = folder / CATALOG
+    if is_local(catalog) and catalog.is_symlink():
+        raise LogError(f"{catalog}: is a link, and what it leads to is not hearthlog's: delete it")
     with store_errors(catalog):
         if catalog.is_file():  # an older one
             catalog.unlink()
