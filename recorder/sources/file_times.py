@@ -36,6 +36,9 @@ _HALF = re.compile(  # of the day, as other languages and programs have it
     r"[ _\u00a0\u202f-]{0,2}(?:[AaPp]\.? ?[Mm](?![A-Za-z])|nachm|vorm|[μπ]\.?μ"
     r"|上午|下午|午前|午後|오전|오후)",
 )
+_ZONE_NAME = re.compile(  # which says no offset: IST is that of three countries
+    r"[ _-]{0,2}\(?(?:[CEW]ES?T|MES?Z|[ACEMP][SD]T|[BIJK]ST|A[CEW][SD]T|NZ[SD]T)(?![A-Za-z])"
+)
 _DASH_DIGITS = re.compile(r"-\d{4}")
 _HEXADECIMAL = re.compile(r"[0-9A-F]{8}")  # of old AudioMoths: seconds since 1970
 _AUDIOMOTH = re.compile(
@@ -272,6 +275,11 @@ def _doubt(path: Path, has_zone: bool | None) -> str:  # noqa: FBT001
         and _HALF.match(path.name, found.end())
     ):
         return "what follows the time in its name may be a half of the day, and was not read"
+    if found and _ZONE_NAME.match(path.name, found.end()):
+        return (
+            "what follows the time in its name may be a zone, and was not read "
+            "(a zone is read by --start-pattern with %z, as +0100)"
+        )
     return ""
 
 
