@@ -89,9 +89,9 @@ def opened(monkeypatch) -> list[Path]:
     """Logs that were asked for their spans."""
     paths = []
 
-    def span_of(path):
+    def span_of(path, **options):
         paths.append(path)
-        return time_span(path)
+        return time_span(path, **options)
 
     monkeypatch.setattr(hearthlog.analyzer.logs.selection, "time_span", span_of)
     return paths

@@ -129,7 +129,7 @@ with open_workers(2) as workers:
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_processes_end_with_their_parent(tmp_path, end):
     command = [sys.executable, "-c", _PARENT, str(tmp_path)]
-    with running(command, stderr=subprocess.PIPE, start_new_session=True) as parent:
+    with running(command, stderr=subprocess.PIPE) as parent:
         until(lambda: len(list(tmp_path.iterdir())) == 2)
         children = psutil.Process(parent.pid).children()
         os.killpg(parent.pid, end)

@@ -135,6 +135,7 @@ class Review:
 
     def __init__(self, arguments, environment):
         self.lines = []
+        self._key = ""
         self.process = subprocess.Popen(
             [*_COMMAND, "review", *map(str, arguments)],
             stdin=subprocess.PIPE,
@@ -149,8 +150,12 @@ class Review:
     def _read(self):
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
+            if line.endswith("press the key again\n"):  # of a viewer that is slow
+                with suppress(OSError):
+                    self.press(self._key)
 
     def press(self, keys):
+        self._key = keys
         self.process.stdin.write(f"{keys}\n")
         self.process.stdin.flush()
 
