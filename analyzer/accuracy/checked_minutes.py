@@ -234,8 +234,8 @@ def _events(minute: ReviewedLabels, name: str) -> list[int]:
     start, end = minute.span.start, minute.span.end
     labelled, true = events_of(minute.labels, name), events_of(minute.true, name)
     own, others = _begun(labelled, minute), _begun(true, minute)
-    right = overlapping(own, without(cut(true, start, end), minute.untold))
-    found = overlapping(others, without(cut(labelled, start, end), minute.untold))
+    right = overlapping(own, without(cut(true, start, end), minute.undecided))
+    found = overlapping(others, without(cut(labelled, start, end), minute.undecided))
     return [len(own.starts), int(right.sum()), len(others.starts), int((~found).sum())]
 
 
@@ -244,5 +244,5 @@ def _begun(events: Spans, minute: ReviewedLabels) -> Spans:
     span = minute.span
     first, last = np.searchsorted(events.starts, [span.start, span.end])
     begun = Spans(events.starts[first:last], np.minimum(events.ends[first:last], span.end))
-    told = overlapping(begun, without(begun, minute.untold))
-    return Spans(begun.starts[told], begun.ends[told])
+    decided = overlapping(begun, without(begun, minute.undecided))
+    return Spans(begun.starts[decided], begun.ends[decided])

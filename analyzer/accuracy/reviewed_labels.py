@@ -43,15 +43,15 @@ class ReviewedLabels(NamedTuple):
         The same, overlaid with the marks.
     model : str
         SHA-256 of the model that labelled; empty if unknown.
-    untold : Spans
-        What a person could not tell: the labels there are neither right nor wrong.
+    undecided : Spans
+        What a person could not decide: the labels there are neither right nor wrong.
     """
 
     span: ReviewedSpan
     labels: Labelling
     true: Labelling
     model: str
-    untold: Spans = NONE
+    undecided: Spans = NONE
 
 
 def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
@@ -66,13 +66,13 @@ def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
     unchanged, number : int
         Spans that marks change in less than half, and all but those that nobody could tell.
     """
-    spans = [one for one in reviewed if one.span.chosen != RANDOM and not _is_untold(one)]
+    spans = [one for one in reviewed if one.span.chosen != RANDOM and not _is_undecided(one)]
     return sum(2 * _changed(one) < one.span.end - one.span.start for one in spans), len(spans)
 
 
-def _is_untold(reviewed: ReviewedLabels) -> bool:
+def _is_undecided(reviewed: ReviewedLabels) -> bool:
     start, end = reviewed.span.start, reviewed.span.end
-    return 2 * cut(reviewed.untold, start, end).length >= end - start
+    return 2 * cut(reviewed.undecided, start, end).length >= end - start
 
 
 def _changed(reviewed: ReviewedLabels) -> int:
@@ -163,12 +163,12 @@ def _reviewed_labels(
             around = span.start - _AROUND, span.end + _AROUND
             labels = unified(sources.read(span.microphone, name, *around).labelling)
             own = [mark for mark in marks if mark.microphone == span.microphone]
-            told = labelling_of_marks(one for one in own if class_name(one.label) != UNKNOWN)
+            decided = labelling_of_marks(one for one in own if class_name(one.label) != UNKNOWN)
             rest = labelling_of_marks(one for one in own if class_name(one.label) == UNKNOWN)
             yield ReviewedLabels(
                 span,
                 labels,
-                overlaid(labels, told),
+                overlaid(labels, decided),
                 models[span.microphone].model_sha256,
                 joined(rest.starts, rest.ends),
             )

@@ -205,10 +205,10 @@ class CaptureProcess(_Process):
         channel: int | None = None,
         latency: float = LATENCY_SECONDS,
     ) -> None:
-        asked = [device, str(channels or 0), str(channel or 0), str(latency)]
-        asked += ["exact"] if exact else []
+        arguments = [device, str(channels or 0), str(channel or 0), str(latency)]
+        arguments += ["exact"] if exact else []
         process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, *asked],
+            [*_CAPTURE, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
             bufsize=0,

@@ -65,7 +65,7 @@ _ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
 
 @dataclass
 class _Lost:
-    """What is left out of a file because its records are damaged."""
+    """The damaged part of a file, which is left out."""
 
     first: int = 0  # byte of the file
     why: str = ""

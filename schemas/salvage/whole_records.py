@@ -263,7 +263,7 @@ def read_message(raw: bytes) -> records.Message:
 
 
 class AttachmentHead(NamedTuple):
-    """What stands before the data of an attachment."""
+    """The fields of an attachment before its data."""
 
     index_record: records.AttachmentIndex  # its offset and length are 0
     first: int  # byte of the record at which the data begin

@@ -1,4 +1,4 @@
-"""What is remembered of rules and addresses from one start of the bridge to the next, in files."""
+"""The memory of rules and addresses between two starts of the bridge, in files."""
 
 import json
 from collections.abc import Callable, Sequence

@@ -99,7 +99,7 @@ def _reason(said: str) -> str:
 
 
 class Addresses(NamedTuple):
-    """What was read of a file of addresses.
+    """Addresses of a file, and its problems.
 
     Attributes
     ----------

@@ -57,7 +57,7 @@ def hidden_options() -> str:
 
 
 def has_display() -> bool:
-    """Tell whether a window can be opened: on Linux by a display of X11 or Wayland."""
+    """Return whether a window can be opened: on Linux by a display of X11 or Wayland."""
     names = ("DISPLAY", "WAYLAND_DISPLAY")
     return not sys.platform.startswith("linux") or any(map(os.environ.get, names))
 
