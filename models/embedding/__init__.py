@@ -1,0 +1,1 @@
+"""Embeddings of sound: what a pretrained network gives for a window, as it is logged."""

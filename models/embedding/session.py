@@ -1,0 +1,166 @@
+"""A network of sounds in memory, by LiteRT: samples in, embedding and scores out."""
+
+import struct
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hearthlog.models.errors import ModelError
+from hearthlog.schemas.arrays import Float32
+
+# Fields of the tables of a TFLite file, as numbered in its schema.
+_SUBGRAPHS, _TENSORS, _OUTPUTS, _OPERATORS = 2, 0, 2, 3
+_SHAPE, _OPERATOR_INPUTS, _OPERATOR_OUTPUTS = 0, 1, 2
+_MOST_STEPS = 64
+
+
+class NetworkOutput(NamedTuple):
+    """What a network gives for a window.
+
+    Attributes
+    ----------
+    embedding : np.ndarray [shape=(E,)], float32
+    logits : np.ndarray [shape=(N,)], float32
+        Of the classes that it has names for.
+    """
+
+    embedding: Float32
+    logits: Float32
+
+
+class TfliteSession:
+    """A network of a TFLite file, whose embedding and logits need not be among its outputs.
+
+    The file is not unpacked: a longer list of outputs is appended to it, as the library that
+    rewrites such files takes 50 MB.
+
+    Parameters
+    ----------
+    data : bytes
+        The file.
+    window : int
+        Samples that it takes.
+    embedding, names : int
+        Width of the embedding, and number of the names.
+
+    Raises
+    ------
+    ModelError
+        If LiteRT is not installed, or the file is no such network.
+    """
+
+    def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:
+        interpreter_type = _interpreter_type()
+        try:
+            data, places = _with_outputs(data, embedding, names)
+        except (struct.error, ValueError, IndexError) as error:
+            raise ModelError(f"is no TFLite file that can be used ({error})") from error
+        try:
+            self._interpreter = interpreter_type(model_content=data, num_threads=1)
+            self._interpreter.allocate_tensors()
+            (given,) = self._interpreter.get_input_details()
+        except (ValueError, RuntimeError) as error:
+            raise ModelError(f"is no network that LiteRT takes ({error})") from error
+        shape, dtype = given["shape"].tolist(), given["dtype"]
+        if int(np.prod(shape)) != window or dtype is not np.float32:
+            raise ModelError(f"takes {np.dtype(dtype)} of shape {shape}, not {window} samples")
+        self._input, self._shape = given["index"], shape
+        self._embedding, self._logits = places
+
+    def __call__(self, window: Float32) -> NetworkOutput:
+        """Compute the output for a window.
+
+        Parameters
+        ----------
+        window : np.ndarray [shape=(window,)], float32
+            Samples, -1 to 1.
+        """
+        self._interpreter.set_tensor(self._input, window.reshape(self._shape))
+        self._interpreter.invoke()
+        tensors = (self._interpreter.get_tensor(each) for each in (self._embedding, self._logits))
+        return NetworkOutput(*(each.reshape(-1) for each in tensors))
+
+
+def _interpreter_type() -> Any:
+    try:
+        from ai_edge_litert.interpreter import Interpreter  # noqa: PLC0415  where there is a network
+    except ImportError as error:
+        raise ModelError(
+            "needs LiteRT, which is not installed; try: pip install '.[embedding]' in a clone of "
+            "hearthlog"
+        ) from error
+    return Interpreter
+
+
+def _with_outputs(data: bytes, embedding: int, names: int) -> tuple[bytes, tuple[int, int]]:
+    """Add the tensors of embedding and logits to a network's outputs; return their numbers."""
+    model = _Table(data, *struct.unpack_from("<I", data))
+    graph = model.tables(_SUBGRAPHS)[0]
+    tensors, operators = graph.tables(_TENSORS), graph.tables(_OPERATORS)
+    maker = {number: each for each in operators for number in each.numbers(_OPERATOR_OUTPUTS)}
+    scores = graph.numbers(_OUTPUTS)[0]
+    found: dict[int, int] = {}
+    for number in _upstream(scores, maker):
+        width = (tensors[number].numbers(_SHAPE) or [0])[-1]
+        if width == names:
+            found[names] = number  # the last one is the one before the logistic function
+        if width == embedding:
+            found[embedding] = number
+            break
+    if found.keys() != {names, embedding} or found[names] == scores:
+        raise ValueError(f"there is no embedding of {embedding} values before {names} scores")
+    places = found[embedding], found[names]
+    field = graph.place(_OUTPUTS)
+    data += bytes(-len(data) % 4)
+    outputs = struct.pack("<4i", 3, scores, *places)
+    redirected = struct.pack("<I", len(data) - field)
+    return data[:field] + redirected + data[field + 4 :] + outputs, places
+
+
+def _upstream(number: int, maker: "dict[int, _Table]") -> Iterator[int]:
+    """Walk from a tensor to those that it is computed from, by the first input of each operator."""
+    for _ in range(_MOST_STEPS):
+        yield number
+        if number not in maker:
+            return
+        number = maker[number].numbers(_OPERATOR_INPUTS)[0]
+
+
+class _Table:
+    """A table of a FlatBuffers file: https://flatbuffers.dev/internals."""
+
+    def __init__(self, data: bytes, place: int) -> None:
+        self._data, self._place = data, place
+        back = struct.unpack_from("<i", data, place)[0]
+        self._fields = place - back
+        self._size = struct.unpack_from("<H", data, self._fields)[0]
+
+    def place(self, field: int) -> int:
+        """Return where a field is; 0 if it is left out."""
+        entry = 4 + 2 * field
+        if entry >= self._size:
+            return 0
+        offset = struct.unpack_from("<H", self._data, self._fields + entry)[0]
+        return self._place + offset if offset else 0
+
+    def numbers(self, field: int) -> list[int]:
+        """Return the vector of a field."""
+        place, count = self._vector(field)
+        return list(struct.unpack_from(f"<{count}i", self._data, place))
+
+    def tables(self, field: int) -> "list[_Table]":
+        """Return the tables in the vector of a field."""
+        place, _ = self._vector(field)
+        offsets = self.numbers(field)
+        return [_Table(self._data, place + 4 * i + each) for i, each in enumerate(offsets)]
+
+    def _vector(self, field: int) -> tuple[int, int]:
+        place = self.place(field)
+        if not place:
+            return 0, 0
+        place += struct.unpack_from("<I", self._data, place)[0]
+        count = struct.unpack_from("<I", self._data, place)[0]
+        if 4 * count > len(self._data):
+            raise ValueError("it is damaged")
+        return place + 4, count

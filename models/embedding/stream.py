@@ -1,0 +1,74 @@
+"""The embeddings of one stream of frames: of the windows in which there is sound."""
+
+import numpy as np
+
+from hearthlog.models.embedding.embeddings import (
+    HOP_FRAMES,
+    NO_EMBEDDINGS,
+    WINDOW_FRAMES,
+    Embeddings,
+)
+from hearthlog.models.embedding.networks import Embedder
+from hearthlog.schemas.arrays import Bool, Float32, Int64
+from hearthlog.schemas.frames import FRAME_SAMPLES
+
+
+class EmbeddingStream:
+    """Embeds the windows of one stream of frames in which there is sound.
+
+    Windows begin at frames whose number is a multiple of ten. A frame above the floor is in the
+    middle of a second of sound; all windows have one that end with it or up to nine frames later,
+    so that the frames from the middle of one window to that of the next have both of them.
+
+    Parameters
+    ----------
+    embedder : Embedder
+    """
+
+    def __init__(self, embedder: Embedder) -> None:
+        self._embedder = embedder
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._frames = np.empty((0, FRAME_SAMPLES), np.float32)
+        self._sound = np.empty(0, bool)
+        self._stamps = np.empty(0, np.int64)
+
+    def push(self, frames: Float32, sound: Bool, first: int, stamps: Int64) -> Embeddings:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        sound : np.ndarray [shape=(n,)], bool
+            Whether the second that ends with each frame is above the floor of the room.
+        first : int
+            Number of the first frame.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+
+        Returns
+        -------
+        Embeddings
+            Of the windows that these frames complete.
+        """
+        samples = np.clip(np.nan_to_num(frames, posinf=0.0, neginf=0.0), -1.0, 1.0)
+        samples = np.concatenate([self._frames, samples])
+        sound = np.concatenate([self._sound, sound])
+        stamps = np.concatenate([self._stamps, stamps])
+        first -= len(self._frames)
+        begins = np.arange(-first % HOP_FRAMES, len(samples) - WINDOW_FRAMES + 1, HOP_FRAMES)
+        lasts = begins + WINDOW_FRAMES
+        chosen = [
+            begin
+            for begin, last in zip(begins.tolist(), lasts.tolist(), strict=True)
+            if sound[last - HOP_FRAMES : last].any()
+        ]
+        self._frames = samples[1 - WINDOW_FRAMES :].copy()
+        self._sound, self._stamps = sound[1 - WINDOW_FRAMES :], stamps[1 - WINDOW_FRAMES :]
+        if not chosen:
+            return NO_EMBEDDINGS
+        values = [self._embedder(samples[begin : begin + WINDOW_FRAMES]) for begin in chosen]
+        places = np.array(chosen, np.int64)
+        return Embeddings(first + places, stamps[places], np.stack(values))
