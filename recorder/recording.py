@@ -7,8 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from threading import Event as Flag
 
+from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
+from hearthlog.models.errors import ModelError
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
+from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock, check_writable
@@ -246,6 +249,16 @@ def record(
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 
 
+def _embedder() -> Embedder | None:
+    """Return the network of sounds that is there, if it can be used."""
+    path = find_network(YAMNET.name)
+    try:
+        return None if path is None else load_embedder(YAMNET.name, path)
+    except ModelError as error:
+        say(str(error))
+        return None
+
+
 def _record(  # noqa: PLR0913, PLR0917
     settings: Settings,
     sources: Mapping[str, SoundSource],
@@ -258,7 +271,7 @@ def _record(  # noqa: PLR0913, PLR0917
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
         models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
-        session = RecordingSession(settings, sources, models, lock, state)
+        session = RecordingSession(settings, sources, models, lock, state, _embedder())
         manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):

@@ -12,6 +12,7 @@ from hearthlog.models.embedding.session import TfliteSession
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.messages.topics import EmbeddingSource
 from hearthlog.schemas.storage.small_file import read_whole
 
 _SIZE_LIMIT = 512 << 20
@@ -126,11 +127,16 @@ class Embedder:
             )
         self.projection: Projection = read_projection(network.projection)
         try:
-            self._session = TfliteSession(
-                data, network.window, network.width, network.names
-            )
+            self._session = TfliteSession(data, network.window, network.width, network.names)
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
+
+    @property
+    def source(self) -> EmbeddingSource:
+        """What logs say of their embeddings."""
+        steps = tuple(self.projection.steps.tolist())
+        sha256 = self.projection.sha256
+        return EmbeddingSource(self.network.name, self.sha256, sha256, self.projection.names, steps)
 
     def __call__(self, window: Float32) -> Int8:
         """Compute the integers of a window.
