@@ -38,6 +38,8 @@ class FrameLabels(NamedTuple):
         From 0 to 1; NaN where the classifier has none.
     calibrated_elsewhere : bool
         As of the classifier.
+    ahead : int
+        Frames behind the window that they waited for.
     """
 
     classes: tuple[str, ...]
@@ -48,6 +50,7 @@ class FrameLabels(NamedTuple):
     by_features: Float32
     novelty: Float32
     calibrated_elsewhere: bool
+    ahead: int = 0
 
     def columns(self, microphone: str) -> dict[str, Column]:
         """Return the fields of one `AudioLabel` for each frame.
@@ -229,6 +232,7 @@ class Labeller:
             by_features.probabilities[again:],
             novelty[again:],
             self._classifier.calibrated_elsewhere,
+            self.timing.ahead,
         )
         labelled = labelled.part(slice(max(self._first_segment - first, 0), None))
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
