@@ -3,6 +3,7 @@
 import numpy as np
 
 from hearthlog.models.classes import UNKNOWN
+from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.timing import label_timing
@@ -39,6 +40,8 @@ class Classifier:
         Those of the model.
     calibrated_elsewhere : bool
         Whether probabilities hold in homes of which nothing was learned.
+    embedding_heads : EmbeddingHeads or None
+        Of a model that takes the embeddings of a network.
 
     Raises
     ------
@@ -65,6 +68,11 @@ class Classifier:
         self._machine = classifier_kind(description.kind).machine(model)
         arrays = description.direction_microphones
         self._direction_weights = dict(zip(arrays, model.direction_weights, strict=True))
+        self._mix = description.embedding
+        self.embedding_heads: EmbeddingHeads | None = None
+        if self._mix is not None:
+            heads = model.embedding_weights, model.embedding_bias
+            self.embedding_heads = EmbeddingHeads(self._mix, *heads, self.classes)
 
     def direction_weights(self, microphone: str) -> Float64 | None:
         """Return what the directions of an array say, as `DirectionEvidence` takes it.
@@ -118,7 +126,12 @@ class Classifier:
         """
         return self.classify(inputs)[0]
 
-    def classify(self, inputs: Float32, evidence: Float64 | None = None) -> tuple[Float32, Float32]:
+    def classify(
+        self,
+        inputs: Float32,
+        evidence: Float64 | None = None,
+        embedded: Float64 | None = None,
+    ) -> tuple[Float32, Float32]:
         """Compute the probability of each class, and the novelty of each window.
 
         Parameters
@@ -127,6 +140,9 @@ class Classifier:
             Finite.
         evidence : np.ndarray [shape=(n, C)], float64, optional
             Of something else: what is added to the logarithms of the probabilities.
+        embedded : np.ndarray [shape=(n, C)], float64, optional
+            What the heads say at each window, as of `EmbeddingHeads.log_probabilities`. Rows of NaN
+            where they say nothing: there the classifier decides alone, as without heads.
 
         Returns
         -------
@@ -144,6 +160,8 @@ class Classifier:
             decision, novelty[rows] = self._machine.decide(inputs[rows])
             decision += self._bias
             decision *= self._inverse_temperature
+            if embedded is not None:
+                self._add_heads(decision, embedded[rows])
             if evidence is not None:
                 decision += evidence[rows]
             decision -= decision.max(axis=1, keepdims=True)
@@ -154,3 +172,9 @@ class Classifier:
             result /= _STEPS
             novelty = 1.0 - result[:, self._known].max(axis=1, initial=0.0)
         return result, novelty
+
+    def _add_heads(self, decision: Float64, said: Float64) -> None:
+        """Mix the decision values of windows with what heads say there."""
+        heard = ~np.isnan(said).any(axis=1)
+        if self._mix is not None and heard.any():
+            decision[heard] = mixed(decision[heard], said[heard], self._mix, self.classes)
