@@ -74,6 +74,4 @@ class Embeddings(NamedTuple):
         )
 
 
-NO_EMBEDDINGS = Embeddings(
-    np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 0), np.int8)
-)
+NO_EMBEDDINGS = Embeddings(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 0), np.int8))
