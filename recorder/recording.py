@@ -8,6 +8,7 @@ from functools import partial
 from threading import Event as Flag
 
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.embedder_probe import check_network
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.labelling.open_models import open_models
@@ -180,6 +181,7 @@ def recording_problems(settings: Settings) -> list[HearthlogError]:
                     settings, sources, open_models(settings, list(sources), None, stack)
                 )
             )
+    check(partial(check_network, settings.embedding, len(settings.microphone)))
     check(partial(check_writable, settings.output))
     return list(problems.values())
 

@@ -134,7 +134,10 @@ def read_projection(path: Path) -> Projection:
         arrays, text, damage = read_sealed(path, data, _KEY)
         groups = json.loads(text)
         projection = Projection(
-            *(arrays[name].astype(np.float32) for name in ("mean", "components", "steps", "lows")),
+            mean=arrays["mean"].astype(np.float32),
+            components=arrays["components"].astype(np.float32),
+            steps=arrays["steps"].astype(np.float32),
+            lows=arrays["lows"].astype(np.float32),
             groups=groups,
             sha256=hashlib.sha256(data).hexdigest(),
         )
