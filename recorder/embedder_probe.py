@@ -146,7 +146,7 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
         return None, f"{error}; {_GOES_ON}" if wanted else ""
     try:
         probe = probe_network(name, path)
-        _check_pace(path, probe, microphones)
+        check_pace(path, probe, microphones)
         return load_embedder(name, path), ""
     except ModelError as error:
         return None, f"{error}; {_GOES_ON}"
@@ -168,7 +168,7 @@ def check_network(wanted: str, microphones: int = 1) -> None:
     """
     if wanted not in {"", NO_NETWORK}:
         path = network_path(wanted)
-        _check_pace(path, probe_network(wanted, path), microphones)
+        check_pace(path, probe_network(wanted, path), microphones)
 
 
 def network_path(name: str) -> Path:
@@ -191,7 +191,22 @@ def network_path(name: str) -> Path:
     return path
 
 
-def _check_pace(path: Path, probe: Probe, microphones: int) -> None:
+def check_pace(path: Path, probe: Probe, microphones: int = 1) -> None:
+    """Check whether this machine is quick enough for a network.
+
+    Parameters
+    ----------
+    path : Path
+        Its file.
+    probe : Probe
+    microphones : int, optional
+        How many are listened to.
+
+    Raises
+    ------
+    ModelError
+        If a window would take more than half of the time to the next.
+    """
     if microphones * probe.seconds > _MOST_SHARE * _HOP_SECONDS:
         of = f" of each of {microphones} microphones" if microphones > 1 else ""
         raise ModelError(

@@ -65,7 +65,9 @@ def fixed_projection(embeddings: Float32, names: list[str]) -> Projection:
         components=components.astype(np.float16).astype(np.float32),
         steps=steps.astype(np.float32),
         lows=lows.astype(np.float32),
-        groups={group: [names.index(name) for name in members] for group, members in GROUPS.items()},
+        groups={
+            group: [names.index(name) for name in members] for group, members in GROUPS.items()
+        },
     )
 
 
