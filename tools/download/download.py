@@ -307,7 +307,11 @@ class _Redirects(HTTPRedirectHandler):
         *arguments
             As of `HTTPRedirectHandler`; the last one is the new address.
         """
-        _check_address(arguments[-1])
+        try:
+            _check_address(arguments[-1])
+        except DownloadError:
+            arguments[1].close()  # the answer
+            raise
         return super().redirect_request(*arguments)
 
 
