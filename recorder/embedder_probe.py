@@ -36,7 +36,7 @@ _PATIENCE_SECONDS = 30.0
 _WINDOWS = 5
 _MODULE = "hearthlog.recorder.embedder_probe"
 _GOES_ON = "it is recorded without a network"
-_SIGNALS = {
+_SIGNALS: dict[int, str] = {
     signal.SIGILL: "this processor lacks instructions that its runtime needs",
     signal.SIGKILL: "perhaps there is too little memory",
 }

@@ -10,8 +10,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
+from io import BufferedRandom
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import (
@@ -131,7 +132,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _part(path: Path, sha256: str) -> Iterator[BinaryIO]:
+def _part(path: Path, sha256: str) -> Iterator[BufferedRandom]:
     """Open the unfinished file beside a path, which no other command may be writing."""
     place = _part_path(path, sha256)
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
@@ -156,7 +157,7 @@ def _part_path(path: Path, sha256: str) -> Path:
     return path.with_name(f".{path.name}.{sha256[:12]}.part")
 
 
-def _give_name(part: BinaryIO, place: Path, path: Path) -> None:
+def _give_name(part: BufferedRandom, place: Path, path: Path) -> None:
     part.flush()
     os.fchmod(part.fileno(), _READABLE)
     os.fsync(part.fileno())
@@ -164,21 +165,21 @@ def _give_name(part: BinaryIO, place: Path, path: Path) -> None:
     sync_folder(path.parent)
 
 
-def _digest(part: BinaryIO) -> str:
+def _digest(part: BufferedRandom) -> str:
     part.seek(0)
     return hashlib.file_digest(part, "sha256").hexdigest()
 
 
-def _length(part: BinaryIO) -> int:
+def _length(part: BufferedRandom) -> int:
     return part.seek(0, os.SEEK_END)
 
 
-def _empty(part: BinaryIO) -> None:
+def _empty(part: BufferedRandom) -> None:
     part.seek(0)
     part.truncate()
 
 
-def _receive_all(url: str, part: BinaryIO, size: int, progress: Progress) -> None:
+def _receive_all(url: str, part: BufferedRandom, size: int, progress: Progress) -> None:
     """Receive what is missing, with as many tries as bring something, and a few that do not."""
     idle, problem = 0, ""
     for _ in range(_MOST_TRIES):
@@ -206,7 +207,7 @@ def _receive_all(url: str, part: BinaryIO, size: int, progress: Progress) -> Non
     raise DownloadError(f"{url}: cannot be had ({printable(problem)[:200]}){kept}")
 
 
-def _receive(url: str, part: BinaryIO, size: int, progress: Progress) -> None:
+def _receive(url: str, part: BufferedRandom, size: int, progress: Progress) -> None:
     """Receive the rest of a file, or as much as comes."""
     have = _length(part)
     with _opened(url, have) as response:
