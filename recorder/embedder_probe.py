@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -145,11 +146,18 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
     except ModelError as error:
         return None, f"{error}; {_GOES_ON}" if wanted else ""
     try:
-        probe = probe_network(name, path)
-        check_pace(path, probe, microphones)
+        check_pace(path, _probed(name, path, path.stat().st_mtime_ns), microphones)
         return load_embedder(name, path), ""
+    except OSError as error:
+        return None, f"{path}: cannot be read ({error.strerror}); {_GOES_ON}"
     except ModelError as error:
         return None, f"{error}; {_GOES_ON}"
+
+
+@lru_cache(maxsize=4)
+def _probed(name: str, path: Path, _changed: int) -> Probe:
+    """Try a file once in the life of a process."""
+    return probe_network(name, path)
 
 
 def check_network(wanted: str, microphones: int = 1) -> None:

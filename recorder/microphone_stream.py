@@ -1,5 +1,6 @@
 """One microphone of a recording, from its events to its messages."""
 
+from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.config import Settings
@@ -22,6 +23,8 @@ class MicrophoneStream:
         Its name.
     source : SoundSource
     models : LabellingModels
+    embedder : Embedder or None
+        Of the network whose embeddings are logged.
 
     Attributes
     ----------
@@ -38,7 +41,12 @@ class MicrophoneStream:
     """
 
     def __init__(
-        self, settings: Settings, microphone: str, source: SoundSource, models: LabellingModels
+        self,
+        settings: Settings,
+        microphone: str,
+        source: SoundSource,
+        models: LabellingModels,
+        embedder: Embedder | None = None,
     ) -> None:
         self._settings = settings
         self._source = source
@@ -55,6 +63,7 @@ class MicrophoneStream:
             {name: loaded.classifier for name, loaded in models.beside().items()},
             settings.privacy,
             settings.settings_of(microphone).geometry,
+            embedder,
         )
         if unknown := self.pipeline.unknown_private():
             classes = self.pipeline.classes
@@ -139,7 +148,9 @@ class MicrophoneStream:
         features, models = self.pipeline.feature_set, self.models
         info = stream_info(self.pipeline.microphone, self._device, features, models.model)
         beside = {name: loaded.model for name, loaded in models.beside().items()}
-        return describe_log(self._settings, info, features, models.model, beside)
+        return describe_log(
+            self._settings, info, features, models.model, beside, self.pipeline.embedding
+        )
 
 
 def _configured_features(settings: Settings, models: LabellingModels) -> FeatureSet:

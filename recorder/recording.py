@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from threading import Event as Flag
 
+from hearthlog.models.embedding.networks import Embedder
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.embedder_probe import check_network
+from hearthlog.recorder.embedder_probe import check_network, open_embedder
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
+from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock, check_writable
@@ -248,6 +250,14 @@ def record(
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 
 
+def _embedder(settings: Settings, microphones: int) -> Embedder | None:
+    """Return the network of sounds, if there is one; say why it is not used."""
+    embedder, why = open_embedder(settings.embedding, microphones)
+    if why:
+        say(why)
+    return embedder
+
+
 def _record(  # noqa: PLR0913, PLR0917
     settings: Settings,
     sources: Mapping[str, SoundSource],
@@ -260,7 +270,8 @@ def _record(  # noqa: PLR0913, PLR0917
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
         models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
-        session = RecordingSession(settings, sources, models, lock, state)
+        embedder = _embedder(settings, len(sources))
+        session = RecordingSession(settings, sources, models, lock, state, embedder)
         manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
+from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import Settings
@@ -97,6 +98,8 @@ class RecordingSession:
         Of the folder of the logs, where microphones are recorded into it.
     state : RecorderState or None
         Is kept true; None if nobody looks at it.
+    embedder : Embedder or None
+        Of the network whose embeddings are logged.
 
     Attributes
     ----------
@@ -111,18 +114,19 @@ class RecordingSession:
         and the model cannot tell what must not be.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917
         self,
         settings: Settings,
         sources: Mapping[str, SoundSource],
         models: Mapping[str, LabellingModels],
         lock: FolderLock | None = None,
         state: RecorderState | None = None,
+        embedder: Embedder | None = None,
     ) -> None:
         self._settings = settings
         self._state = state
         self._streams = {
-            name: MicrophoneStream(settings, name, source, models[name])
+            name: MicrophoneStream(settings, name, source, models[name], embedder)
             for name, source in sources.items()
         }
         is_live = not any(isinstance(source, FileSource) for source in sources.values())

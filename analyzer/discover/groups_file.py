@@ -21,9 +21,9 @@ from hearthlog.analyzer.discover.groups import (
 )
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
-from hearthlog.schemas.storage.sealed_file import read_sealed, write_sealed
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.storage.new_files import open_lock, replaced_file
+from hearthlog.schemas.storage.sealed_file import read_sealed, write_sealed
 from hearthlog.schemas.storage.small_file import read_whole
 
 GROUPS = "groups.safetensors"  # in a folder of logs

@@ -10,15 +10,17 @@ from hearthlog.analyzer.doctor.topic_types import (
     BESIDE_LABEL,
     BESIDE_SEGMENT,
     DIRECTION,
+    EMBEDDING,
     GAP,
     LABEL,
     SEGMENT,
 )
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.gaps import CLOCK_SET, LOG_DAMAGED, ON_PURPOSE
-from hearthlog.schemas.messages.topics import ROSOUT
+from hearthlog.schemas.messages.topics import ROSOUT, EmbeddingSource
 
 STAMP = "header.stamp"
 _SUM_TOLERANCE = 1e-4
@@ -27,6 +29,7 @@ _LATE = {  # ns, with what stamps may be off
     BESIDE_LABEL: 1_010_000_000,
     SEGMENT: 75_000_000_000,
     DIRECTION: 400_000_000,
+    EMBEDDING: 1_010_000_000,
     BESIDE_SEGMENT: 75_000_000_000,
 }
 
@@ -235,6 +238,37 @@ def check_directions(findings: Findings, columns: Columns) -> None:
         times,
         lambda i: f"{columns.topic}: confidence is {confidence[i]}",
     )
+
+
+def check_embeddings(findings: Findings, columns: Columns) -> None:
+    """Check that embeddings are of whole windows, and have a value for each name.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    columns : Columns
+        Messages of type `AudioEmbedding`.
+
+    Raises
+    ------
+    LogError
+        If a field of the type is missing.
+    """
+    times, frames, lengths = columns.log_times, columns["frame"], columns["frames"]
+    findings.rows(
+        "embedding-window",
+        (lengths != WINDOW_FRAMES) | (frames % HOP_FRAMES != 0),
+        times,
+        lambda i: f"{columns.topic}: is of {lengths[i]} frames from frame {frames[i]} on",
+    )
+    source = EmbeddingSource.from_metadata(columns.metadata)
+    if source is None:
+        findings.error("embedding-source", f"{columns.topic}: does not say of which network it is")
+        return
+    values, width = columns["values"], len(source.names)
+    if values.shape[1:] != (width,):
+        findings.error("values", f"{columns.topic}: some messages are not of {width} values")
 
 
 def check_gaps(findings: Findings, columns: Columns) -> None:

@@ -9,6 +9,7 @@ from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frame_steps import Steps, check_gaps, check_steps
 from hearthlog.analyzer.doctor.topic_types import (
     DIRECTION,
+    EMBEDDING,
     FEATURES,
     GAP,
     LABEL,
@@ -17,6 +18,7 @@ from hearthlog.analyzer.doctor.topic_types import (
 )
 from hearthlog.models.classifiers.directions import BLOCK_FRAMES
 from hearthlog.models.classifiers.timing import LabelTiming
+from hearthlog.models.embedding.embeddings import WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
@@ -79,7 +81,7 @@ class FrameSequence:
         Parameters
         ----------
         kind : str
-            `features`, `statistics`, `direction`, `label`, `segment` or `gap`.
+            `features`, `statistics`, `direction`, `embedding`, `label`, `segment` or `gap`.
         rows : np.ndarray [shape=(n, 3)], int64
             As the class describes them (times in nanoseconds of UTC), in the order of their log
             times, behind those of this kind that were added before.
@@ -131,8 +133,8 @@ class FrameSequence:
         until : int or None
             Nanoseconds of UTC; None for everything that was added.
         """
-        kinds = FEATURES, STATISTICS, DIRECTION, LABEL, SEGMENT, GAP
-        features, statistics, directions, labels, segments, gaps = (
+        kinds = FEATURES, STATISTICS, DIRECTION, EMBEDDING, LABEL, SEGMENT, GAP
+        features, statistics, directions, embeddings, labels, segments, gaps = (
             self._take(kind, until) for kind in kinds
         )
         if FEATURES in self._thinned:  # there is nothing to compare labels with
@@ -146,6 +148,9 @@ class FrameSequence:
         last = directions[:, 1] + BLOCK_FRAMES - 1
         ends = np.stack([directions[:, 0], last, directions[:, 0]], axis=1)
         self._check_same(features, ends, DIRECTION, None)
+        last = embeddings[:, 1] + WINDOW_FRAMES - 1
+        ends = np.stack([embeddings[:, 0], last, embeddings[:, 0]], axis=1)
+        self._check_same(features, ends, EMBEDDING, None)
         if self._timing is not None:
             self._check_labels(features, labels, runs, self._timing)
         self._check_segments(segments)

@@ -17,6 +17,7 @@ from hearthlog.analyzer.doctor.topic_types import (
     BESIDE_LABEL,
     BESIDE_SEGMENT,
     DIRECTION,
+    EMBEDDING,
     FEATURES,
     GAP,
     LABEL,
@@ -217,6 +218,8 @@ class MessageChecks:
             column_checks.check_gaps(self._findings, columns)
         if kind == DIRECTION:
             column_checks.check_directions(self._findings, columns)
+        if kind == EMBEDDING:
+            column_checks.check_embeddings(self._findings, columns)
 
     def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
         every, timing = statistics_every(self._data), None
@@ -325,7 +328,7 @@ def _sequence_rows(kind: str, columns: Columns) -> Int64 | None:
         parts = times, stamps, columns["frames_lost"]
     elif kind == SEGMENT:
         parts = times, stamps, stamps + columns["duration"]
-    elif kind in {*_WIDTHS, DIRECTION}:
+    elif kind in {*_WIDTHS, DIRECTION, EMBEDDING}:
         parts = times, columns["frame"], stamps
     else:
         return None

@@ -16,6 +16,7 @@ from hearthlog.analyzer.doctor.message_checks import MessageChecks, allowed_dela
 from hearthlog.analyzer.doctor.topic_types import (
     BESIDE_LABEL,
     DIRECTION,
+    EMBEDDING,
     LOG_NAME,
     split_topic,
     topic_type,
@@ -30,7 +31,13 @@ from hearthlog.schemas.logs.provenance import METADATA, describes_model, schema_
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.logs.scenario_record import recorded_scenarios
 from hearthlog.schemas.messages.fields import difference, type_hash_of
-from hearthlog.schemas.messages.topics import CANDIDATE, Topic, scenario_labelling, topics_of
+from hearthlog.schemas.messages.topics import (
+    CANDIDATE,
+    EmbeddingSource,
+    Topic,
+    scenario_labelling,
+    topics_of,
+)
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.messages.versions import SCHEMA_VERSION
 from hearthlog.schemas.times import NANOSECONDS
@@ -172,8 +179,12 @@ class MetadataChecks:
             own = [scenario_labelling(s.name) for s in scenarios if s.microphone == microphone]
             beside: dict[str, list[str]] = {name: [] for name in (*candidates, *own)}
             is_array = f"/{microphone}/{DIRECTION}" in self._channels
+            channel = self._channels.get(f"/{microphone}/{EMBEDDING}")
+            embedding = channel and EmbeddingSource.from_metadata(channel.metadata)
             names = list(info["feature_names"])
-            topics = topics_of(microphone, names, classes, beside, directions=is_array)
+            topics = topics_of(
+                microphone, names, classes, beside, directions=is_array, embedding=embedding
+            )
             expected |= {topic.name: topic for topic in topics}
         for name, topic in expected.items():
             if name not in self._channels and split_topic(name)[0]:

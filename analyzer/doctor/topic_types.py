@@ -14,6 +14,7 @@ from hearthlog.schemas.messages.topics import (
 
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
 DIRECTION = "direction"  # only of an array
+EMBEDDING = "embedding"  # only with a network
 _BESIDE = "beside"  # of a candidate or a scenario
 BESIDE_LABEL, BESIDE_SEGMENT = f"{_BESIDE}/{LABEL}", f"{_BESIDE}/{SEGMENT}"
 TYPES = {
@@ -24,6 +25,7 @@ TYPES = {
     SEGMENT: message_types.SEGMENT,
     GAP: message_types.GAP,
     DIRECTION: message_types.DIRECTION,
+    EMBEDDING: message_types.EMBEDDING,
     BESIDE_LABEL: message_types.LABEL,
     BESIDE_SEGMENT: message_types.SEGMENT,
 }

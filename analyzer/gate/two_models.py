@@ -116,7 +116,9 @@ class TwoModels:
         ]
         first, second = (
             _labelled(
-                sound, part, StreamLabeller(one, part.start - _LABELS_WARM_UP, info.microphone)
+                sound,
+                part,
+                StreamLabeller(one, part.start - _LABELS_WARM_UP, info.microphone, info.embedding),
             )
             for one in self._classifiers
         )

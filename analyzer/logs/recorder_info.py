@@ -32,7 +32,7 @@ from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import check_microphone_name, topic
+from hearthlog.schemas.messages.topics import EmbeddingSource, check_microphone_name, topic
 
 CONFIGURATION = "configuration.json"
 _INFO = ("device", "feature_set", "model", "model_sha256")
@@ -91,6 +91,7 @@ class RecorderInfo:
     # none
     first_frame: tuple[int, int] | None
     has_directions: bool  # whether those of an array are beside its features
+    embedding: EmbeddingSource | None  # of the embeddings beside them; None if there are none
 
 
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
@@ -162,6 +163,7 @@ def _info_of(
         attachments=attachments,
         first_frame=first,
         has_directions=kind == "features" and _has_topic(file, topic(microphone, "direction")),
+        embedding=_embedding(file, microphone) if kind == "features" else None,
     )
 
 
@@ -174,6 +176,13 @@ def _set_of_names(file: LogFile, name: str) -> str:
     names = next((array_names(channel.metadata, "values") for channel in channels), [])
     ours = {each.feature_names: each.name for each in (HOME33, AUROS21)}
     return ours.get(tuple(names), _UNNAMED) if names else ""
+
+
+def _embedding(file: LogFile, microphone: str) -> EmbeddingSource | None:
+    """Return what the channel of embeddings says of their network."""
+    name = topic(microphone, "embedding")
+    channels = (channel for channel in file.channels.values() if channel.topic == name)
+    return next((EmbeddingSource.from_metadata(channel.metadata) for channel in channels), None)
 
 
 def _has_topic(file: LogFile, name: str) -> bool:

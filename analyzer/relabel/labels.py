@@ -380,7 +380,7 @@ def _write_labels(part: Path, job: Job, begun: Sequence[_Begun], model: Model) -
 def _write_sound(writer: LogStreamWriter, topic: str, begun: _Begun) -> int:
     """Write the labels of one microphone, in chunks of their own, and count them."""
     frames = 0
-    for event in read_sound(begun.info, 0, directions=begun.labeller.takes_directions):
+    for event in read_sound(begun.info, 0, auxiliary=begun.labeller.takes_auxiliary):
         labels = begun.labeller.push(event)
         if labels is not None:
             columns = labels.columns(begun.info.microphone)

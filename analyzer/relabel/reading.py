@@ -79,7 +79,7 @@ def infos_for_model(
 
 
 def read_sound(
-    info: RecorderInfo, start: int, *, directions: bool = False
+    info: RecorderInfo, start: int, *, auxiliary: bool = False
 ) -> Iterator[Features | Gap]:
     """Read the features and gaps of a log from a time on.
 
@@ -89,8 +89,8 @@ def read_sound(
         Of the log.
     start : int
         Log time, in nanoseconds of UTC.
-    directions : bool
-        Whether to read the directions of an array, too.
+    auxiliary : bool
+        Whether to read directions and embeddings, too.
 
     Yields
     ------
@@ -103,7 +103,7 @@ def read_sound(
         If it is damaged, or not of a recorder, or its feature set is not installed.
     """
     try:
-        sound = read_recorded(info, start, _NEVER, sound_only=True, directions=directions)
+        sound = read_recorded(info, start, _NEVER, sound_only=True, auxiliary=auxiliary)
         for batch in sound:
             yield from (event for event in batch.events if isinstance(event, Features | Gap))
     except LogError as error:
@@ -179,7 +179,7 @@ def warm_up(
             labels_back *= 4
         else:
             floor_back *= 4
-    return StreamLabeller(classifier, microphone=info.microphone)
+    return StreamLabeller(classifier, microphone=info.microphone, embedding=info.embedding)
 
 
 def _label_earlier(
@@ -221,9 +221,11 @@ def _label_readable(
         if other.first_frame[1] < start:
             from_start = False
             break
-    labeller = StreamLabeller(classifier, label_from, info.microphone, from_start=from_start)
+    labeller = StreamLabeller(
+        classifier, label_from, info.microphone, info.embedding, from_start=from_start
+    )
     for other in chosen:
-        for event in read_sound(other, start, directions=labeller.takes_directions):
+        for event in read_sound(other, start, auxiliary=labeller.takes_auxiliary):
             labeller.push(event)
         labeller.segments.clear()
     return labeller, from_start
@@ -265,5 +267,7 @@ def _of_microphone(infos: Sequence[RecorderInfo], name: str) -> RecorderInfo | N
 
 
 def _same_sound(first: RecorderInfo, second: RecorderInfo) -> bool:
-    one, other = ((info.node, info.microphone, info.feature_set) for info in (first, second))
+    one, other = (
+        (info.node, info.microphone, info.feature_set, info.embedding) for info in (first, second)
+    )
     return one == other

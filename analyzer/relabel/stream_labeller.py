@@ -7,6 +7,7 @@ from hearthlog.models.labels.labeller import FrameLabels, Labeller
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.messages.topics import EmbeddingSource
 from hearthlog.schemas.times import NANOSECONDS
 
 _LARGEST_STEP = NANOSECONDS // 5  # by which the time of a sound card may jump between two frames
@@ -23,6 +24,8 @@ class StreamLabeller:
         the room is tracked, which is much quicker.
     microphone : str
         Its name; the directions of an array that the model knows count.
+    embedding : EmbeddingSource, optional
+        Of the embeddings of its logs.
     from_start : bool
         Whether nothing is known of the sound before the first frame.
 
@@ -39,13 +42,14 @@ class StreamLabeller:
         classifier: Classifier,
         label_from: int = 0,
         microphone: str = "",
+        embedding: EmbeddingSource | None = None,
         *,
         from_start: bool = False,
     ) -> None:
         self.segments: list[Segment] = []
         self.floor_converged = from_start or not classifier.timing.needs_floor
         self._label_from = label_from
-        self._labeller = Labeller(classifier, microphone)
+        self._labeller = Labeller(classifier, microphone, embedding)
         self._powers = classifier.feature_set.band_powers
         self._floor = None if self._powers is None else FloorTracker()
         self._next: int | None = None  # number of the next frame
@@ -63,9 +67,9 @@ class StreamLabeller:
         return self._from_start or self._labeller.segments_converged
 
     @property
-    def takes_directions(self) -> bool:
-        """Whether directions change its labels."""
-        return self._labeller.takes_directions
+    def takes_auxiliary(self) -> bool:
+        """Whether directions or embeddings change its labels."""
+        return self._labeller.takes_auxiliary
 
     @property
     def open_run(self) -> Run | None:
@@ -114,7 +118,7 @@ class StreamLabeller:
         if self._end <= self._label_from:
             self._from_start = False
             return None
-        sound = event.values, floors, event.first, event.stamps, event.directions
+        sound = event.values, floors, event.first, event.stamps, event.auxiliary
         labels, segments = self._labeller.push(*sound)
         self.segments += segments
         return labels

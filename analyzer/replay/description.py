@@ -67,6 +67,7 @@ def describe(  # noqa: PLR0913, PLR0917
             classes,
             named,
             directions=recorded.has_directions,
+            embedding=recorded.embedding,
         ),
         infos=[info],
         metadata={

@@ -177,7 +177,9 @@ class Player:
         clips = self._options.kind != "features"  # which do not say how often
         every = LOGGED_EVERY if clips else configuration.statistics_every
         beside = self._scenarios(info, features, model)
-        self._pipeline = Pipeline(info.microphone, features, classifier, every, beside)
+        self._pipeline = Pipeline(
+            info.microphone, features, classifier, every, beside, embedding=info.embedding
+        )
         if self._options.output is not None:
             self._log = RollingLog(
                 self._describe(info, model),
@@ -292,7 +294,7 @@ class Player:
                 return False
             if isinstance(event, Features):
                 part = event.part(block)
-                messages = self._pipeline.push_features(part.values, first, stamps, part.directions)
+                messages = self._pipeline.push_features(part.values, first, stamps, part.auxiliary)
             else:
                 messages = self._pipeline.push(Frames(first, event.samples[block], stamps))
             self._next, self._end = first + len(stamps), end

@@ -1,15 +1,18 @@
 """The events that a recorder's pipeline was given, read back from its log."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, LARGEST_FRAME, directions_of
+from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.logs.typed_columns import is_compatible
+from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.directions import NOWHERE, Directions
+from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, Embeddings
 from hearthlog.recorder.events import Gap, SourceHealth
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
@@ -18,15 +21,19 @@ from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Fields
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, topic
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, EmbeddingSource, topic
 
 _SOUND_TYPES = {"features": message_types.FEATURES, "gap": message_types.GAP}
-_DIRECTION_TYPES = {"direction": message_types.DIRECTION}
+_AUXILIARY_TYPES = {
+    "direction": message_types.DIRECTION,
+    "embedding": message_types.EMBEDDING,
+}
 _TYPES = _SOUND_TYPES | {"label": message_types.LABEL, "segment": message_types.SEGMENT}
 _FIELDS = {
     message_types.FEATURES: ("header.stamp", "frame", "values"),
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
     message_types.DIRECTION: DIRECTION_FIELDS,
+    message_types.EMBEDDING: EMBEDDING_FIELDS,
     message_types.DIAGNOSTICS: ("status",),
     message_types.LABEL: ("label",),
     message_types.SEGMENT: ("label",),
@@ -35,6 +42,7 @@ _LARGEST_VALUE = 1e30  # of a feature: its statistics are still finite
 _PLACE_BITS = 40
 
 _RawByType = dict[str, list[RawMessages]]
+_Known = TypeVar("_Known", Directions, Embeddings)
 
 
 class Features(NamedTuple):
@@ -47,20 +55,20 @@ class Features(NamedTuple):
     values : np.ndarray [shape=(n, d)], float32
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
-    directions : Directions
+    auxiliary : Auxiliary
         That became known with these frames.
     """
 
     first: int
     values: Float32
     stamps: Int64
-    directions: Directions = NOWHERE
+    auxiliary: Auxiliary = NO_AUXILIARY
 
     def part(self, frames: slice) -> "Features":
         """Return some of the frames."""
         first, stamps = self.first + (frames.start or 0), self.stamps[frames]
-        directions = self.directions.known_at(first, len(stamps))
-        return Features(first, self.values[frames], stamps, directions)
+        known = self.auxiliary.known_at(first, len(stamps))
+        return Features(first, self.values[frames], stamps, known)
 
 
 class RecordedBatch(NamedTuple):
@@ -77,7 +85,7 @@ def read_recorded(
     end: int,
     *,
     sound_only: bool = False,
-    directions: bool = True,
+    auxiliary: bool = True,
 ) -> Iterator[RecordedBatch]:
     """Read a log, one span of time after the other.
 
@@ -89,8 +97,8 @@ def read_recorded(
         Log times, in nanoseconds of UTC: from `start` on, before `end`.
     sound_only : bool
         Read only features and gaps, and compare the checksums of what is read.
-    directions : bool
-        Read those of an array, too.
+    auxiliary : bool
+        Read the directions of an array and the embeddings of a network, too.
 
     Yields
     ------
@@ -105,8 +113,8 @@ def read_recorded(
     """
     width = features_of(info).width
     kinds = _SOUND_TYPES if sound_only else _TYPES
-    if directions:
-        kinds = kinds | _DIRECTION_TYPES
+    if auxiliary:
+        kinds = kinds | _AUXILIARY_TYPES
     topics = {topic(info.microphone, kind): type_ for kind, type_ in kinds.items()}
     if not sound_only:
         topics[DIAGNOSTICS] = message_types.DIAGNOSTICS
@@ -114,6 +122,8 @@ def read_recorded(
         by_type: _RawByType = {type_: [] for type_ in _FIELDS}
         for raw in batch:
             type_ = topics[raw.channel.topic]
+            if type_ == message_types.EMBEDDING and not _is_of(raw, info):
+                continue  # those of another network, in a log that was merged
             if is_compatible(raw.channel, raw.schema, type_, _FIELDS[type_]):
                 by_type[type_].append(raw)
         buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
@@ -122,6 +132,12 @@ def read_recorded(
         except LogError as error:
             raise LogError(f"{info.path}: {error}") from error
         yield RecordedBatch(events, by_type[message_types.LABEL], by_type[message_types.SEGMENT])
+
+
+def _is_of(raw: RawMessages, info: RecorderInfo) -> bool:
+    """Return whether embeddings are of the network that is that of the microphone."""
+    source = EmbeddingSource.from_metadata(raw.channel.metadata)
+    return source is not None and source == info.embedding
 
 
 def _events(
@@ -148,13 +164,18 @@ def _events(
         path: np.concatenate([fields[path] for fields in features])
         for path in (features[0] if features else ())
     }
-    known = [_directions(raw) for raw in by_type[message_types.DIRECTION]]
+    directions = [_directions(raw) for raw in by_type[message_types.DIRECTION]]
+    embeddings = [_embeddings(raw) for raw in by_type[message_types.EMBEDDING]]
     count = len(times) - len(others)
     events: list[Features | Gap | SourceHealth] = []
     begin = 0
     for position in [*np.flatnonzero(order >= count).tolist(), len(order)]:
         if position > begin:
-            events += (_located(run, known) for run in _runs(frames, order[begin:position]))
+            for run in _runs(frames, order[begin:position]):
+                here = Auxiliary(
+                    _known(run, directions, NOWHERE), _known(run, embeddings, NO_EMBEDDINGS)
+                )
+                events.append(run._replace(auxiliary=here))
         if position < len(order) and (event := others[order[position] - count]) is not None:
             events.append(event)
         begin = position + 1
@@ -188,19 +209,25 @@ def _directions(raw: RawMessages) -> tuple[Int64, Directions]:
     return columns.log_times, directions_of(columns)
 
 
-def _located(run: Features, known: Sequence[tuple[Int64, Directions]]) -> Features:
-    """Add the directions that became known with some frames; others are of sound that is not here.
+def _embeddings(raw: RawMessages) -> tuple[Int64, Embeddings]:
+    """Return embeddings, and when they were known."""
+    (columns,) = decode([raw], _FIELDS[message_types.EMBEDDING])
+    return columns.log_times, embeddings_of(columns)
+
+
+def _known(run: Features, read: Sequence[tuple[Int64, _Known]], nothing: _Known) -> _Known:
+    """Return what became known with some frames; the rest is of sound that is not here.
 
     Frames of another run of a recorder may have the same numbers, but not the same times.
     """
-    located = NOWHERE
-    for times, directions in known:
-        places = directions.last_frames - run.first
+    known = nothing
+    for times, rows in read:
+        places = rows.last_frames - run.first
         inside = np.flatnonzero((places >= 0) & (places < len(run.stamps)))
         same = inside[run.stamps[places[inside]] == times[inside]]
-        located = located.followed_by(directions.rows(same))
-    _, once = np.unique(located.frames, return_index=True)
-    return run._replace(directions=located.rows(once))
+        known = known.followed_by(rows.rows(same))
+    _, once = np.unique(known.frames, return_index=True)
+    return known.rows(once)
 
 
 def _gaps(raw: RawMessages) -> list[Gap]:

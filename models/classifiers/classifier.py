@@ -8,6 +8,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.messages.topics import EmbeddingSource
 
 _ROWS_AT_ONCE = 256
 _STEPS = 1 << 16  # of a probability; what is finer is noise, of the processor too
@@ -60,6 +61,7 @@ class Classifier:
         self._bias = np.array([description.decision_bias.get(name, 0.0) for name in self.classes])
         self._doubts = description.novelty == "doubt"
         self._known = np.array([name != UNKNOWN for name in self.classes])
+        self.heads = None
         self._machine = classifier_kind(description.kind).machine(model)
         arrays = description.direction_microphones
         self._direction_weights = dict(zip(arrays, model.direction_weights, strict=True))
@@ -78,6 +80,28 @@ class Classifier:
             None where the model takes no directions of this microphone.
         """
         return self._direction_weights.get(microphone)
+
+    def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
+        """Return whether the model was learned on the embeddings of a network and a projection."""
+        return False
+
+    def mix(self, probabilities: Float32, embedded: Float64) -> tuple[Float32, Float32]:
+        """Let embeddings say which class a sound is of; whether it is silence, features say.
+
+        Parameters
+        ----------
+        probabilities : np.ndarray [shape=(n, C)], float32
+            As `classify` gives them.
+        embedded : np.ndarray [shape=(n, C)], float64
+            Of the heads; NaN where there is no embedding, and the probabilities stay.
+
+        Returns
+        -------
+        probabilities : np.ndarray [shape=(n, C)], float32
+        novelty : np.ndarray [shape=(n,)], float32
+            As of `classify`.
+        """
+        raise NotImplementedError
 
     def probabilities(self, inputs: Float32) -> Float32:
         """Compute the probability of each class in each window.

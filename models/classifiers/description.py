@@ -227,6 +227,7 @@ class Description(_Record):
     training_data: TrainingData
     metrics: Metrics
     direction_microphones: Annotated[list[_Text], Field(max_length=MOST_ARRAYS)] = []
+    embedding: None = None
     versions: dict[_Text, _Text]
 
 

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from hearthlog.models.classifiers.description import Description
+from hearthlog.models.embedding.embeddings import DELAY_FRAMES
 from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import feature_set
 
@@ -18,19 +19,22 @@ class LabelTiming(NamedTuple):
         Frame of the window, from 0 on, which the label speaks of.
     needs_floor : bool
         Whether the floor of the room must be known at every frame of the window.
+    ahead : int
+        Frames behind the window that must be known, too: those of embeddings that begin in it.
     """
 
     window_frames: int
     label_frame: int
     needs_floor: bool
+    ahead: int = 0
 
     @property
     def delay(self) -> int:
-        """Frames from the one that a label speaks of to the last one of its window."""
-        return self.window_frames - 1 - self.label_frame
+        """Frames from the one that a label speaks of to the one with which it is known."""
+        return self.window_frames - 1 - self.label_frame + self.ahead
 
     def first_window_end(self, start: int) -> int:
-        """Return the last frame of the first window of a sound.
+        """Return the frame with which the first label of a sound is known.
 
         Parameters
         ----------
@@ -39,7 +43,7 @@ class LabelTiming(NamedTuple):
         """
         if self.needs_floor:  # it is known with the last frame of the first whole block
             start += -start % BLOCK_FRAMES + BLOCK_FRAMES - 1
-        return start + self.window_frames - 1
+        return start + self.window_frames - 1 + self.ahead
 
 
 def label_timing(description: Description) -> LabelTiming:
@@ -56,4 +60,7 @@ def label_timing(description: Description) -> LabelTiming:
     """
     inputs = feature_set(description.feature_set).inputs[description.inputs]
     needs_floor = description.gate > 0.0 or inputs.needs_floor
-    return LabelTiming(inputs.window_frames, description.label_frame, needs_floor)
+    timing = LabelTiming(inputs.window_frames, description.label_frame, needs_floor)
+    if description.embedding is None:
+        return timing
+    return timing._replace(ahead=max(DELAY_FRAMES - timing.delay, 0))

@@ -22,6 +22,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.messages.topics import EmbeddingSource
 from hearthlog.schemas.storage.small_file import read_whole
 from hearthlog.schemas.text import printable
 
@@ -183,6 +184,13 @@ class Embedder:
             self._of_silence = self._tried()
         except ModelError as error:
             raise ModelError(f"{path}: {printable(str(error))[:300]}") from error
+
+    @property
+    def source(self) -> EmbeddingSource:
+        """What logs say of their embeddings."""
+        steps = tuple(self.projection.steps.tolist())
+        sha256 = self.projection.sha256
+        return EmbeddingSource(self.network.name, self.sha256, sha256, self.projection.names, steps)
 
     def __call__(self, window: Float32) -> Int8:
         """Compute the integers of a window.

@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors
+from numpy.typing import NDArray
 
 from hearthlog.models.embedding.embeddings import Int8
 from hearthlog.models.embedding.session import NetworkOutput
@@ -95,7 +97,8 @@ class Projection:
         -------
         np.ndarray [shape=(n, W)], float64
         """
-        return quantised * self.steps.astype(np.float64)
+        values: Float64 = quantised * self.steps.astype(np.float64)
+        return values
 
 
 def write_projection(projection: Projection, path: Path) -> None:
@@ -106,7 +109,7 @@ def write_projection(projection: Projection, path: Path) -> None:
     projection : Projection
     path : Path
     """
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "mean": projection.mean.astype(np.float16),
         "components": np.ascontiguousarray(projection.components, np.float16),
         "steps": projection.steps,
@@ -133,13 +136,14 @@ def read_projection(path: Path) -> Projection:
     try:
         arrays, text, damage = read_sealed(path, data, _KEY)
         groups = json.loads(text)
+        arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
         projection = Projection(
-            mean=arrays["mean"].astype(np.float32),
-            components=arrays["components"].astype(np.float32),
-            steps=arrays["steps"].astype(np.float32),
-            lows=arrays["lows"].astype(np.float32),
-            groups=groups,
-            sha256=hashlib.sha256(data).hexdigest(),
+            arrays["mean"],
+            arrays["components"],
+            arrays["steps"],
+            arrays["lows"],
+            groups,
+            hashlib.sha256(data).hexdigest(),
         )
     except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise ModelError(f"{path}: is no projection of a network ({error})") from error

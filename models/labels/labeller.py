@@ -7,12 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
+from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.directions import NOWHERE, DirectionEvidence, Directions
+from hearthlog.models.classifiers.directions import DirectionEvidence
+from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.messages.cdr_codec import Column
+from hearthlog.schemas.messages.topics import EmbeddingSource
 
 
 class FrameLabels(NamedTuple):
@@ -29,6 +32,8 @@ class FrameLabels(NamedTuple):
     known_at : np.ndarray [shape=(n,)], int64
         Starts of the last frames of the windows.
     probabilities : np.ndarray [shape=(n, C)], float32
+    by_features : np.ndarray [shape=(n, C)], float32
+        The same by the features alone: what is private is decided by them.
     novelty : np.ndarray [shape=(n,)], float32
         From 0 to 1; NaN where the classifier has none.
     calibrated_elsewhere : bool
@@ -40,6 +45,7 @@ class FrameLabels(NamedTuple):
     stamps: Int64
     known_at: Int64
     probabilities: Float32
+    by_features: Float32
     novelty: Float32
     calibrated_elsewhere: bool
 
@@ -76,6 +82,9 @@ class Labeller:
     classifier : Classifier
     microphone : str
         Name of the one that is heard; the directions of an array that the model knows count.
+    embedding : EmbeddingSource, optional
+        Of the embeddings; those of another network or projection than that of the model do not
+        count.
 
     Attributes
     ----------
@@ -85,7 +94,12 @@ class Labeller:
     segmenter : Segmenter
     """
 
-    def __init__(self, classifier: Classifier, microphone: str = "") -> None:
+    def __init__(
+        self,
+        classifier: Classifier,
+        microphone: str = "",
+        embedding: EmbeddingSource | None = None,
+    ) -> None:
         self.classes = classifier.classes
         self.segmenter = Segmenter(classifier.classes, classifier.smoothing, classifier.transitions)
         self.timing = classifier.timing
@@ -94,7 +108,13 @@ class Labeller:
         self._window: _Frames | None = None  # the last frames, one less than a window
         weights = classifier.direction_weights(microphone)
         self._evidence = None if weights is None else DirectionEvidence(weights)
-        self._inputs_converged = not self.timing.needs_floor and self._evidence is None
+        self._embedded: EmbeddingEvidence | None = None
+        if classifier.takes_embeddings(embedding) and classifier.heads is not None:
+            self._embedded = EmbeddingEvidence(classifier.heads, len(self.classes))
+        self._pending: LabelledFrames | None = None  # that embeddings to come say something of
+        self._inputs_converged = (
+            not self.timing.needs_floor and self._evidence is None and self._embedded is None
+        )
         self._first_label = self._first_segment = 0  # numbers of frames
 
     @property
@@ -108,9 +128,9 @@ class Labeller:
         return self._inputs_converged and self.segmenter.segments_converged
 
     @property
-    def takes_directions(self) -> bool:
-        """Whether directions change its labels."""
-        return self._evidence is not None
+    def takes_auxiliary(self) -> bool:
+        """Whether directions or embeddings change its labels."""
+        return self._evidence is not None or self._embedded is not None
 
     def follow(  # noqa: PLR0913, PLR0917
         self,
@@ -119,7 +139,7 @@ class Labeller:
         stamps: Int64,
         frame: int,
         unlabelled: int,
-        directions: Directions = NOWHERE,
+        auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> None:
         """Take the place of another labeller before a frame, with which segments begin.
 
@@ -135,13 +155,16 @@ class Labeller:
             Number of the frame.
         unlabelled : int
             Number of the first frame that the other one has not labelled.
-        directions : Directions, optional
+        auxiliary : Auxiliary, optional
             Of the last second before the frame, or more.
         """
         self._first_label, self._first_segment = unlabelled, frame
         self._advance(features, floors if self.timing.needs_floor else None, stamps)
         if self._evidence is not None:
-            self._evidence.push(directions, frame - len(features), len(features), 0)
+            before = frame - len(features), len(features)
+            self._evidence.push(auxiliary.directions, *before, 0)
+        if self._embedded is not None:
+            self._embedded.push(auxiliary.embeddings, frame - len(features))
 
     def push(
         self,
@@ -149,7 +172,7 @@ class Labeller:
         floors: Floors | None,
         first: int,
         stamps: Int64,
-        directions: Directions = NOWHERE,
+        auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> tuple[FrameLabels, list[Segment]]:
         """Add successive frames.
 
@@ -163,13 +186,13 @@ class Labeller:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-        directions : Directions, optional
+        auxiliary : Auxiliary, optional
             That become known with these frames.
 
         Returns
         -------
         labels : FrameLabels
-            Of the frames whose windows these frames complete.
+            Of the frames that these frames complete the windows of, and the embeddings.
         segments : list of Segment
             Those whose end these frames decide.
         """
@@ -179,23 +202,31 @@ class Labeller:
         inputs, window = self._advance(features, powers, stamps)
         evidence = None
         if self._evidence is not None:
+            directions = auxiliary.directions
             evidence = self._evidence.push(directions, first, len(features), len(inputs))
         probabilities, novelty = self._classify(inputs, window, room, evidence)
         count, spoken = len(inputs), self.timing.label_frame
-        first = first + len(features) - count - self.timing.delay
-        labelled = LabelledFrames(
+        by_features = LabelledFrames(
             probabilities,
             window.powers[spoken:][:count],
             window.stamps[spoken:][:count],
             window.stamps[self.timing.window_frames - 1 :],
         )
+        labelled, end = by_features, first + len(features) - self.timing.delay
+        if self.timing.ahead:
+            if self._embedded is not None:
+                self._embedded.push(auxiliary.embeddings, first)
+            by_features = self._complete(by_features)
+            labelled, novelty = self._mixed(by_features, end - len(by_features.stamps))
+        count, first = len(labelled.stamps), end - len(labelled.stamps)
         again = max(self._first_label - first, 0)  # frames that were labelled before
         labels = FrameLabels(
             self.classes,
             np.arange(first, first + count)[again:],
             labelled.stamps[again:],
             labelled.known_at[again:],
-            probabilities[again:],
+            labelled.probabilities[again:],
+            by_features.probabilities[again:],
             novelty[again:],
             self._classifier.calibrated_elsewhere,
         )
@@ -218,6 +249,9 @@ class Labeller:
         self._inputs.restart()
         if self._evidence is not None:
             self._evidence.restart()
+        if self._embedded is not None:
+            self._embedded.restart()
+        self._pending = None
         self._window, self._first_label, self._first_segment = None, 0, 0
         return self.segmenter.close(end)
 
@@ -227,9 +261,28 @@ class Labeller:
             self.timing.needs_floor and not (floors and floors.converged)
         ):
             return
-        if self._evidence is None or self._evidence.is_full(first):
+        full = self._evidence is None or self._evidence.is_full(first)
+        if full and (self._embedded is None or self._embedded.is_full(first - self.timing.delay)):
             self._inputs_converged = True
             self.segmenter.forget()
+
+    def _complete(self, frames: LabelledFrames) -> LabelledFrames:
+        """Add frames labelled by their features; return those whose embeddings are all known."""
+        ahead = self.timing.ahead
+        pending = frames if self._pending is None else self._pending.followed_by(frames)
+        count = max(len(pending.stamps) - ahead, 0)
+        self._pending = pending.part(slice(count, None))
+        known_at = pending.known_at[ahead:]
+        return pending.part(slice(count))._replace(known_at=known_at)
+
+    def _mixed(self, frames: LabelledFrames, first: int) -> tuple[LabelledFrames, Float32]:
+        """Let embeddings say what the sound of frames is; return also its novelty."""
+        count = len(frames.stamps)
+        said = np.full((count, len(self.classes)), np.nan)
+        if self._embedded is not None:
+            said = self._embedded.at(first, count)
+        probabilities, novelty = self._classifier.mix(frames.probabilities, said)
+        return frames._replace(probabilities=probabilities), novelty
 
     def _advance(
         self, features: Float32, floors: Float64 | None, stamps: Int64

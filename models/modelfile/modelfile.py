@@ -27,10 +27,10 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.storage.sealed_file import damage, read_sealed, write_sealed
 from hearthlog.models.starter import SHA256, STARTERS, starter_file
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
+from hearthlog.schemas.storage.sealed_file import damage, read_sealed, write_sealed
 from hearthlog.schemas.storage.small_file import read_whole
 
 SUFFIX = ".safetensors"

@@ -15,7 +15,13 @@ from hearthlog.schemas.logs.feature_record import other_features
 from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.logs.scenario_record import RecordedScenario, scenario_entries
-from hearthlog.schemas.messages.topics import CANDIDATE, SCENARIO, Topic, topics_of
+from hearthlog.schemas.messages.topics import (
+    CANDIDATE,
+    SCENARIO,
+    EmbeddingSource,
+    Topic,
+    topics_of,
+)
 
 
 @dataclass(frozen=True)
@@ -32,12 +38,13 @@ class LogDescription:
     lines: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
-def describe_log(
+def describe_log(  # noqa: PLR0913, PLR0917
     settings: Settings,
     info: Any,
     features: FeatureSet,
     model: Model | None,
     beside: Mapping[str, Model] | None = None,
+    embedding: EmbeddingSource | None = None,
 ) -> LogDescription:
     """Return the description of the logs of one microphone.
 
@@ -51,6 +58,8 @@ def describe_log(
         The model that labels the sound; None for no labels.
     beside : mapping of str to Model, optional
         Those that label beside it, by labelling: `candidate`, `scenario/<name>`.
+    embedding : EmbeddingSource, optional
+        Of the embeddings; None without a network.
     """
     beside = beside or {}
     microphone = info.header.frame_id
@@ -83,6 +92,7 @@ def describe_log(
             classes,
             named,
             directions=bool(settings.settings_of(microphone).array),
+            embedding=embedding,
         ),
         infos=[info],
         metadata=metadata,

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.directions import Directions
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
 from hearthlog.models.labels.segments import Segment
@@ -14,7 +14,12 @@ from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
-from hearthlog.schemas.messages.topics import LIVE, ROSOUT, labelling_topic
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    ROSOUT,
+    EmbeddingSource,
+    labelling_topic,
+)
 
 
 class LabelStream:
@@ -27,6 +32,8 @@ class LabelStream:
     labelling : str
         `live`, or another one, whose segments are not told in `/rosout`.
     classifier : Classifier
+    embedding : EmbeddingSource, optional
+        Of the embeddings.
 
     Attributes
     ----------
@@ -38,13 +45,19 @@ class LabelStream:
         Labels of the frames that were pushed last; None if they have none.
     """
 
-    def __init__(self, microphone: str, labelling: str, classifier: Classifier) -> None:
+    def __init__(
+        self,
+        microphone: str,
+        labelling: str,
+        classifier: Classifier,
+        embedding: EmbeddingSource | None = None,
+    ) -> None:
         self.classes = classifier.classes
         self.segments_converged = False
         self.last: FrameLabels | None = None
         self._microphone = microphone
         self._labelling = labelling
-        self._labeller = Labeller(classifier, microphone)
+        self._labeller = Labeller(classifier, microphone, embedding)
 
     @property
     def delay(self) -> int:
@@ -58,7 +71,7 @@ class LabelStream:
         stamps: Int64,
         frame: int,
         unlabelled: int,
-        directions: Directions,
+        auxiliary: Auxiliary,
     ) -> None:
         """Take the place of another stream before a frame; as `Labeller.follow`.
 
@@ -72,10 +85,10 @@ class LabelStream:
             Number of the frame.
         unlabelled : int
             Number of the first frame that has no label yet.
-        directions : Directions
+        auxiliary : Auxiliary
             Of the last second before it, or more.
         """
-        self._labeller.follow(features, floors, stamps, frame, unlabelled, directions)
+        self._labeller.follow(features, floors, stamps, frame, unlabelled, auxiliary)
 
     def push(
         self,
@@ -83,7 +96,7 @@ class LabelStream:
         floors: Floors | None,
         first: int,
         stamps: Int64,
-        directions: Directions,
+        auxiliary: Auxiliary,
     ) -> list[EncodedMessage]:
         """Turn successive frames into messages.
 
@@ -95,7 +108,7 @@ class LabelStream:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-        directions : Directions
+        auxiliary : Auxiliary
             That become known with these frames.
 
         Returns
@@ -104,7 +117,7 @@ class LabelStream:
             Segments, then labels; each in the order of their log times.
         """
         self.last = None
-        labels, segments = self._labeller.push(features, floors, first, stamps, directions)
+        labels, segments = self._labeller.push(features, floors, first, stamps, auxiliary)
         if not len(labels.frames):
             return []
         self.last = labels

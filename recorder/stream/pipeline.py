@@ -7,9 +7,12 @@ from operator import attrgetter
 
 import numpy as np
 
+from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE, Directions
+from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS
+from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
@@ -19,6 +22,10 @@ from hearthlog.recorder.events import OK, READING, WARNING, Event, Frames, Gap, 
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.direction_messages import ArrayDirections, direction_messages
+from hearthlog.recorder.stream.embedding_messages import (
+    MicrophoneEmbeddings,
+    embedding_messages,
+)
 from hearthlog.recorder.stream.feature_messages import FeatureMessages
 from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -28,7 +35,9 @@ from hearthlog.recorder.stream.veil import Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.gaps import encode_gap
-from hearthlog.schemas.messages.topics import LIVE, ROSOUT, topic
+from hearthlog.schemas.messages.topics import LIVE, ROSOUT, EmbeddingSource, topic
+
+_REMEMBERED_WINDOWS = 4  # of embeddings: two seconds
 
 
 class Pipeline:
@@ -52,6 +61,10 @@ class Pipeline:
         seconds later at most, so that log time never runs backwards.
     array : ArrayGeometry or None
         Of an array of microphones; without one there are no directions.
+    embedder : Embedder or None
+        Of the network whose embeddings are logged.
+    embedding : EmbeddingSource, optional
+        Of the embeddings that `push_features` gets, where nothing is embedded here.
 
     Attributes
     ----------
@@ -70,13 +83,18 @@ class Pipeline:
         beside: Mapping[str, Classifier] | None = None,
         private: Sequence[str] = (),
         array: ArrayGeometry | None = None,
+        embedder: Embedder | None = None,
+        embedding: EmbeddingSource | None = None,
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
         self.last_frames: Frames | None = None
         live = {} if classifier is None else {LIVE: classifier}
+        self._source = embedding if embedder is None else embedder.source
+        self._embeddings = None if embedder is None else MicrophoneEmbeddings(embedder, features)
+        self._recent_embeddings = NO_EMBEDDINGS
         self._streams = {
-            labelling: LabelStream(microphone, labelling, one)
+            labelling: LabelStream(microphone, labelling, one, self._source)
             for labelling, one in (live | dict(beside or {})).items()
         }
         window, width = features.window_frames, features.width
@@ -99,6 +117,11 @@ class Pipeline:
     @property
     def _live(self) -> LabelStream | None:
         return self._streams.get(LIVE)
+
+    @property
+    def embedding(self) -> EmbeddingSource | None:
+        """The network behind the embeddings; None without any."""
+        return self._source
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -134,7 +157,14 @@ class Pipeline:
             self._watch.add_samples(event.samples, samples)
             self.last_frames = replace(event, samples=samples)
             features = self._features(samples)
-            return self.push_features(features, event.first, event.stamps, directions)
+            floors = self._track_floor(features, event.first)
+            embeddings = NO_EMBEDDINGS
+            if self._embeddings is not None:
+                embeddings = self._embeddings.push(
+                    samples, features, floors, event.first, event.stamps
+                )
+            known = Auxiliary(directions, embeddings)
+            return self._push_frames(features, floors, event.first, event.stamps, known)
         if isinstance(event, Gap):
             return self.hold(self._push_gap(event))
         return self.hold(self._push_health(event))
@@ -144,7 +174,7 @@ class Pipeline:
         features: Float32,
         first: int,
         stamps: Int64,
-        directions: Directions = NOWHERE,
+        auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> list[EncodedMessage]:
         """Turn the features of successive frames into messages.
 
@@ -155,7 +185,7 @@ class Pipeline:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-        directions : Directions, optional
+        auxiliary : Auxiliary, optional
             That become known with these frames.
 
         Returns
@@ -164,28 +194,45 @@ class Pipeline:
             In the order of their log times.
         """
         floors = self._track_floor(features, first)
+        return self._push_frames(features, floors, first, stamps, auxiliary)
+
+    def _push_frames(
+        self,
+        features: Float32,
+        floors: Floors | None,
+        first: int,
+        stamps: Int64,
+        auxiliary: Auxiliary,
+    ) -> list[EncodedMessage]:
         labels = [
             message
             for stream in self._streams.values()
-            for message in stream.push(features, floors, first, stamps, directions)
+            for message in stream.push(features, floors, first, stamps, auxiliary)
         ]
         logged = features, first, stamps
         if self._veil is not None:
             logged = self._veil.push(*logged, self.last_labels)
-        located = self._located(directions, first, stamps)
-        messages = [*self._feature_messages(*logged), *located, *labels]
+        logged_too = self._encoded(auxiliary, first, stamps)
+        messages = [*self._feature_messages(*logged), *logged_too, *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
         return self.hold(messages)
 
-    def _located(self, directions: Directions, first: int, stamps: Int64) -> list[EncodedMessage]:
-        """Encode the directions of frames, and remember the last ones."""
-        if not len(directions.frames):
-            return []
-        recent = self._recent_directions.followed_by(directions)
-        self._recent_directions = recent.rows(slice(-MEMORY_BLOCKS, None))
-        known = stamps[directions.last_frames - first]
-        return direction_messages(self.microphone, directions, known)
+    def _encoded(self, auxiliary: Auxiliary, first: int, stamps: Int64) -> list[EncodedMessage]:
+        """Encode directions and embeddings, and remember the last ones."""
+        messages = []
+        directions, embeddings = auxiliary
+        if len(directions.frames):
+            recent = self._recent_directions.followed_by(directions)
+            self._recent_directions = recent.rows(slice(-MEMORY_BLOCKS, None))
+            known = stamps[directions.last_frames - first]
+            messages += direction_messages(self.microphone, directions, known)
+        if len(embeddings.frames):
+            latest = self._recent_embeddings.followed_by(embeddings)
+            self._recent_embeddings = latest.rows(slice(-_REMEMBERED_WINDOWS, None))
+            known = stamps[embeddings.last_frames - first]
+            messages += embedding_messages(self.microphone, embeddings, known)
+        return messages
 
     def _remember(self, features: Float32, stamps: Int64) -> None:
         before = features[:0] if self._recent is None else self._recent
@@ -271,7 +318,7 @@ class Pipeline:
         earlier = self._streams.pop(labelling, None)
         closing = [] if earlier is None else earlier.close(stamp)
         if classifier is not None:
-            stream = LabelStream(self.microphone, labelling, classifier)
+            stream = LabelStream(self.microphone, labelling, classifier, self._source)
             self._streams[labelling] = stream
             self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
         opening = self.report("model", stamp, _from_frame(labelling, model, frame))
@@ -295,7 +342,8 @@ class Pipeline:
         stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
         if floors is not None:
             floors = floors[max(len(floors) - len(recent), 0) :]
-        stream.follow(recent, floors, stamps, frame, unlabelled, self._recent_directions)
+        known = Auxiliary(self._recent_directions, self._recent_embeddings)
+        stream.follow(recent, floors, stamps, frame, unlabelled, known)
 
     def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
         """Turn a notice into messages.
@@ -342,10 +390,13 @@ class Pipeline:
         self._features.restart()
         if self._directions is not None:
             self._directions.restart()
+        if self._embeddings is not None:
+            self._embeddings.restart()
         self._feature_messages.restart()
         self._recent = None
         self._recent_floors = None
         self._recent_directions = NOWHERE
+        self._recent_embeddings = NO_EMBEDDINGS
         if self._floor is not None:
             self._floor.restart()
         data = encode_gap(self.microphone, gap.start, gap.end, gap.reason, gap.frames_lost)

@@ -70,7 +70,7 @@ class LogStreamWriter:
                 )
             names = {f"{key}_names": json.dumps([*n]) for key, n in topic.array_names.items()}
             ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
-            channel_metadata = ros | names
+            channel_metadata = ros | names | dict(topic.metadata)
             self._topics[topic.name] = rosbag2.TopicCount(topic.type, channel_metadata)
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, ENCODING, schemas[topic.type], channel_metadata

@@ -22,6 +22,7 @@ MARK = f"{PACKAGE}/msg/AudioMark"
 REVIEWED = f"{PACKAGE}/msg/AudioReview"
 GAP = f"{PACKAGE}/msg/AudioGap"
 DIRECTION = f"{PACKAGE}/msg/AudioDirection"
+EMBEDDING = f"{PACKAGE}/msg/AudioEmbedding"
 RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 LOG = "rcl_interfaces/msg/Log"
@@ -36,6 +37,7 @@ _DEFINED_HERE = (
     REVIEWED,
     GAP,
     DIRECTION,
+    EMBEDDING,
     RAW_AUDIO,
 )
 

@@ -1,5 +1,6 @@
 """The topics of a log: their types, their quality of service, the names behind their arrays."""
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -48,12 +49,64 @@ class Topic:
     quality : Quality
     array_names : mapping of str to sequence of str
         Names of the elements of an array, by the name of the field that holds the array.
+    metadata : mapping of str to str
+        What the channel says besides.
     """
 
     name: str
     type: str
     quality: Quality = Quality()
     array_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+class EmbeddingSource(NamedTuple):
+    """The network and the projection behind the embeddings of a microphone.
+
+    Attributes
+    ----------
+    network, network_sha256 : str
+        Its name, and the digest of its file.
+    projection_sha256 : str
+        Embeddings of two projections cannot be compared.
+    names : tuple of str
+    steps : tuple of float
+        Of the logged integers.
+    """
+
+    network: str
+    network_sha256: str
+    projection_sha256: str
+    names: tuple[str, ...]
+    steps: tuple[float, ...]
+
+    def metadata(self) -> dict[str, str]:
+        """Return what the channel says besides the names."""
+        return {
+            "network": self.network,
+            "network_sha256": self.network_sha256,
+            "projection_sha256": self.projection_sha256,
+            "values_steps": json.dumps(list(self.steps)),
+        }
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> "EmbeddingSource | None":
+        """Read what a channel says of its embeddings; None where it does not.
+
+        Parameters
+        ----------
+        metadata : mapping of str to str
+            Of the channel.
+        """
+        try:
+            names = json.loads(metadata["values_names"])
+            steps = tuple(float(step) for step in json.loads(metadata["values_steps"]))
+            digests = metadata["network_sha256"], metadata["projection_sha256"]
+            "".join(names).encode()
+        except (KeyError, ValueError, TypeError, RecursionError, OverflowError):
+            return None
+        fits = isinstance(names, list) and len(names) == len(steps)
+        return cls(metadata.get("network", ""), *digests, tuple(names), steps) if fits else None
 
 
 def check_microphone_name(name: str) -> str:
@@ -255,13 +308,14 @@ def label_topics(microphone: str, labelling: str, classes: Sequence[str]) -> tup
     )
 
 
-def topics_of(
+def topics_of(  # noqa: PLR0913
     microphone: str,
     feature_names: Sequence[str],
     classes: Sequence[str] | None,
     beside: Mapping[str, Sequence[str]] | None = None,
     *,
     directions: bool = False,
+    embedding: EmbeddingSource | None = None,
 ) -> list[Topic]:
     """List the topics that a recorder writes for a microphone.
 
@@ -278,6 +332,8 @@ def topics_of(
         The same of the labellings beside it, such as `candidate` or `scenario/<name>`.
     directions : bool
         Whether it is an array, and has directions.
+    embedding : EmbeddingSource, optional
+        Of its embeddings; None without a network.
     """
     statistics = {"mean": feature_names, "std": feature_names}
     topics = [
@@ -294,6 +350,15 @@ def topics_of(
     ]
     if directions:
         topics.append(Topic(topic(microphone, "direction"), message_types.DIRECTION))
+    if embedding is not None:
+        topics.append(
+            Topic(
+                topic(microphone, "embedding"),
+                message_types.EMBEDDING,
+                array_names={"values": embedding.names},
+                metadata=embedding.metadata(),
+            )
+        )
     if classes is not None:
         topics += label_topics(microphone, LIVE, classes)
     for labelling, names in (beside or {}).items():

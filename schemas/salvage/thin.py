@@ -20,7 +20,8 @@ from hearthlog.schemas.times import NANOSECONDS
 _CHUNK_SPAN = 10 * NANOSECONDS
 _REST = "all but labels, segments and gaps"
 STEPS = ("", "statistics", "statistics and features", _REST)  # what a log is thinned of
-_DROPPED = (set[str](), {"statistics"}, {"statistics", "features"}, {"statistics", "features"})
+_SOUND = {"statistics", "features", "embedding"}
+_DROPPED = (set[str](), {"statistics"}, _SOUND, _SOUND)
 _KEPT = {"info", "label", "segment", "gap"}
 
 
@@ -59,7 +60,7 @@ def dropped_kinds(text: str | None) -> set[str]:
     Returns
     -------
     set of str
-        Of `statistics` and `features`.
+        Of `statistics`, `features` and `embedding`.
     """
     return _DROPPED[STEPS.index(text)] if text in STEPS else set()
 

@@ -34,9 +34,12 @@ def label_logs(models: Sequence[Model], logs: Sequence[Path]) -> Iterator[Labell
     """
     infos = [infos_for_model(log, models[0], log)[0][0] for log in logs]
     name = infos[0].microphone
-    labellers = [StreamLabeller(Classifier(model), microphone=name) for model in models]
+    source = infos[0].embedding
+    labellers = [
+        StreamLabeller(Classifier(model), microphone=name, embedding=source) for model in models
+    ]
     for info in infos:
-        for event in read_sound(info, 0, directions=True):
+        for event in read_sound(info, 0, auxiliary=True):
             for labeller in labellers:
                 labeller.push(event)
     for labeller, model in zip(labellers, models, strict=True):

@@ -1,0 +1,108 @@
+"""What embeddings say of the frames of one stream, between the middles of their windows."""
+
+from typing import Protocol
+
+import numpy as np
+
+from hearthlog.models.embedding.embeddings import (
+    HOP_FRAMES,
+    WINDOW_FRAMES,
+    Embeddings,
+    Int8,
+)
+from hearthlog.schemas.arrays import Float64
+
+_MIDDLE = WINDOW_FRAMES // 2
+
+
+class Heads(Protocol):
+    """Turns embeddings into logarithms of probabilities."""
+
+    def log_probabilities(self, values: Int8) -> Float64:
+        """Compute the logarithms of the probabilities of C classes, shape (m, C)."""
+
+
+class EmbeddingEvidence:
+    """Interpolates what is said of windows to frames.
+
+    A frame between the middles of two windows has both of them in proportion, or the only one that
+    there is.
+
+    Parameters
+    ----------
+    heads : Heads
+    classes : int
+        Number of classes.
+    """
+
+    def __init__(self, heads: Heads, classes: int) -> None:
+        self._heads = heads
+        self._classes = classes
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._windows = np.empty(0, np.int64)  # numbers of the windows, in the order of time
+        self._values = np.empty((0, self._classes))
+        self._first: int | None = None
+
+    def push(self, embeddings: Embeddings, first: int) -> None:
+        """Add embeddings.
+
+        Parameters
+        ----------
+        embeddings : Embeddings
+        first : int
+            Number of the first of the frames with which they become known.
+        """
+        if self._first is None:
+            self._first = first
+        if not len(embeddings.frames):
+            return
+        values = self._heads.log_probabilities(embeddings.values)
+        self._windows = np.append(self._windows, embeddings.frames // HOP_FRAMES)
+        self._values = np.concatenate([self._values, values])
+
+    def is_full(self, frame: int) -> bool:
+        """Tell whether embeddings before the first frame leave no trace from a frame on.
+
+        Parameters
+        ----------
+        frame : int
+            Number of the next frame that is labelled.
+        """
+        begin = frame - frame % HOP_FRAMES - _MIDDLE
+        return self._first is not None and begin >= self._first
+
+    def at(self, first: int, count: int) -> Float64:
+        """Return what is said of successive frames; earlier ones are never asked for again.
+
+        Parameters
+        ----------
+        first, count : int
+            Number of the first frame, and how many.
+
+        Returns
+        -------
+        np.ndarray [shape=(count, C)], float64
+            NaN where nothing is said.
+        """
+        frames = np.arange(first, first + count)
+        before = (frames - _MIDDLE) // HOP_FRAMES
+        share = ((frames - _MIDDLE) % HOP_FRAMES + 0.5)[:, np.newaxis] / HOP_FRAMES
+        earlier, later = self._of_windows(before), self._of_windows(before + 1)
+        keep = np.searchsorted(self._windows, (first + count - _MIDDLE) // HOP_FRAMES)
+        self._windows, self._values = self._windows[keep:], self._values[keep:]
+        earlier = np.where(np.isnan(earlier), later, earlier)
+        later = np.where(np.isnan(later), earlier, later)
+        said: Float64 = (1.0 - share) * earlier + share * later
+        return said
+
+    def _of_windows(self, numbers: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64:
+        """Return what is said of windows; NaN of those that there are not."""
+        values = np.full((len(numbers), self._classes), np.nan)
+        if len(self._windows):
+            places = np.minimum(np.searchsorted(self._windows, numbers), len(self._windows) - 1)
+            there = self._windows[places] == numbers
+            values[there] = self._values[places[there]]
+        return values

@@ -1,0 +1,108 @@
+"""Embeddings of a microphone's frames, and their messages."""
+
+import numpy as np
+
+from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding.networks import Embedder
+from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
+from hearthlog.models.features.floor import Floors, is_quiet
+from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.schemas.arrays import Bool, Float32, Int64
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
+from hearthlog.schemas.messages.topics import topic
+
+_GATE = 2.0  # dB above the floor, as of the models
+
+
+class MicrophoneEmbeddings:
+    """Embeds what a microphone hears above the floor of the room.
+
+    Parameters
+    ----------
+    embedder : Embedder
+    features : FeatureSet
+        By which the sound is compared with the floor.
+    """
+
+    def __init__(self, embedder: Embedder, features: FeatureSet) -> None:
+        self._feature_set = features
+        self._stream = EmbeddingStream(embedder)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._stream.restart()
+        self._features = np.empty((0, self._feature_set.width), np.float32)
+
+    def push(
+        self, frames: Float32, features: Float32, floors: Floors | None, first: int, stamps: Int64
+    ) -> Embeddings:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        features : np.ndarray [shape=(n, d)], float32
+        floors : Floors or None
+            At the last of these frames; None if the feature set has no bands.
+        first : int
+            Number of the first frame.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        """
+        recent = np.concatenate([self._features, features])
+        sound = np.zeros(len(frames), bool)
+        count = min(len(recent) - WINDOW_FRAMES + 1, len(frames))  # that end a whole second
+        if count > 0:
+            sound[-count:] = self._is_sound(recent[-count - WINDOW_FRAMES + 1 :], floors)
+        self._features = recent[1 - WINDOW_FRAMES :].copy()
+        return self._stream.push(frames, sound, first, stamps)
+
+    def _is_sound(self, features: Float32, floors: Floors | None) -> Bool:
+        """Return which seconds are above the floor, or where there is none, above -60 dBFS."""
+        count = len(features) - WINDOW_FRAMES + 1
+        powers_of = self._feature_set.band_powers
+        if floors is None or powers_of is None:
+            powers = self._feature_set.power(features).astype(np.float64)
+            loud: Bool = np.convolve(powers > SILENCE_POWER, np.ones(WINDOW_FRAMES), "valid") > 0
+            return loud
+        sound = np.zeros(count, bool)
+        known = min(len(floors.room), count)
+        if known:
+            powers = powers_of(features[-known - WINDOW_FRAMES + 1 :])
+            sound[-known:] = ~is_quiet(powers, floors.room[-known:], WINDOW_FRAMES, _GATE)
+        return sound
+
+
+def embedding_messages(
+    microphone: str, embeddings: Embeddings, known: Int64
+) -> list[EncodedMessage]:
+    """Encode embeddings.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    embeddings : Embeddings
+    known : np.ndarray [shape=(m,)], int64
+        Starts of the last frames of their windows, in nanoseconds of UTC.
+
+    Returns
+    -------
+    list of EncodedMessage
+        In the order of their log times: each is known with the last frame of its window.
+    """
+    if not len(known):
+        return []
+    columns: dict[str, Column] = {
+        "header.stamp": embeddings.stamps,
+        "header.frame_id": microphone,
+        "frame": embeddings.frames,
+        "frames": np.full(len(known), WINDOW_FRAMES, np.uint32),
+        "values": embeddings.values,
+    }
+    rows = encode_rows(message_types.EMBEDDING, columns, len(known))
+    name = topic(microphone, "embedding")
+    return [EncodedMessage(t, name, row) for t, row in zip(known.tolist(), rows, strict=True)]
