@@ -12,6 +12,7 @@ from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
 _ROWS_AT_ONCE = 256
+_TINY = 1e-38
 _STEPS = 1 << 16  # of a probability; what is finer is noise, of the processor too
 
 
@@ -64,7 +65,6 @@ class Classifier:
         self._bias = np.array([description.decision_bias.get(name, 0.0) for name in self.classes])
         self._doubts = description.novelty == "doubt"
         self._known = np.array([name != UNKNOWN for name in self.classes])
-        self.heads = None
         self._machine = classifier_kind(description.kind).machine(model)
         arrays = description.direction_microphones
         self._direction_weights = dict(zip(arrays, model.direction_weights, strict=True))
@@ -90,10 +90,16 @@ class Classifier:
         return self._direction_weights.get(microphone)
 
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
-        """Return whether the model was learned on the embeddings of a network and a projection."""
-        return False
+        """Return whether the model was learned on embeddings of the same network and projection."""
+        mix = self._mix
+        if source is None or mix is None:
+            return False
+        theirs = source.network, source.projection_sha256, len(source.names)
+        return theirs == (mix.network, mix.projection_sha256, mix.values)
 
-    def mix(self, probabilities: Float32, embedded: Float64) -> tuple[Float32, Float32]:
+    def mix(
+        self, probabilities: Float32, embedded: Float64, evidence: Float64 | None = None
+    ) -> tuple[Float32, Float32]:
         """Let embeddings say which class a sound is of; whether it is silence, features say.
 
         Parameters
@@ -102,6 +108,8 @@ class Classifier:
             As `classify` gives them.
         embedded : np.ndarray [shape=(n, C)], float64
             Of the heads; NaN where there is no embedding, and the probabilities stay.
+        evidence : np.ndarray [shape=(n, C)], float64, optional
+            Of something else, as `classify` takes it.
 
         Returns
         -------
@@ -109,7 +117,14 @@ class Classifier:
         novelty : np.ndarray [shape=(n,)], float32
             As of `classify`.
         """
-        raise NotImplementedError
+        decision = np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
+        self._add_heads(decision, embedded)
+        if evidence is not None:
+            decision += evidence
+        decision -= decision.max(axis=1, keepdims=True)
+        np.exp(decision, out=decision)
+        mixed = (decision / decision.sum(axis=1, keepdims=True)).astype(np.float32)
+        return self._in_steps(mixed)
 
     def probabilities(self, inputs: Float32) -> Float32:
         """Compute the probability of each class in each window.
@@ -168,10 +183,14 @@ class Classifier:
             np.exp(decision, out=decision)
             result[rows] = decision / decision.sum(axis=1, keepdims=True)
         if self._doubts:  # models of hearthlog 0.1 label as they did, to the last bit
-            np.rint(_STEPS * result, out=result)
-            result /= _STEPS
-            novelty = 1.0 - result[:, self._known].max(axis=1, initial=0.0)
+            return self._in_steps(result)
         return result, novelty
+
+    def _in_steps(self, probabilities: Float32) -> tuple[Float32, Float32]:
+        """Round probabilities, and return them with the novelty."""
+        np.rint(_STEPS * probabilities, out=probabilities)
+        probabilities /= _STEPS
+        return probabilities, 1.0 - probabilities[:, self._known].max(axis=1, initial=0.0)
 
     def _add_heads(self, decision: Float64, said: Float64) -> None:
         """Mix the decision values of windows with what heads say there."""
