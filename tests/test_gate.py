@@ -526,6 +526,22 @@ def test_a_new_class_may_take_what_marks_say_was_wrong_and_not_what_a_person_lef
     assert len(reasons) == (not harmless)
 
 
+def test_an_old_class_may_take_what_marks_say_was_wrong_where_what_was_right_is_known_and_stays():
+    def reasons(known):
+        table = [[1300, 0, 0], [0, 40, 40], [0, 0, 60]]
+        return damages(replace(evidence(table, sure=table), known=known), "one")
+
+    wrong = {("music", "speech", "music"): 3}
+    right = {("speech", "speech", "speech"): 3}
+    assert reasons(wrong | right) == [], "talking was a telephone, say, and talk stays talk"
+    assert reasons(wrong | right | {("speech", "speech", "music"): 1}) == []
+    assert reasons(wrong | right | {("speech", "speech", "music"): 2}) != []
+    assert reasons(wrong) != [], "all of it may be wrong marks: nothing is known to be talking"
+    assert reasons(wrong | {("speech", "music", "speech"): 9}) != [], "nor was that called so"
+    assert reasons(right | {("music", "speech", "music"): 2}) != [], "a slip, or two"
+    assert reasons(right | {("music", "music", "music"): 9}) != []
+
+
 def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refused():
     def reasons(known, column=(0, 0, 0, 20), each=" a day"):
         table = np.diag([1200.0, 100.0, 100.0, 0.0])
