@@ -28,15 +28,14 @@ LEVELS = -60.0, -50.0, -40.0, -36.0, -34.0, -25.0  # dBFS
 _ROOM, _ROOM_SECONDS = -70.0, 60
 _SECONDS = 120
 _CROSSFADE = SAMPLE_RATE // 2
-_HERTZ = 20.0
-_START = 1_772_323_200  # a midnight
+_NAME, _START = "20260301_000000.wav", 1_772_323_200  # the start that the name says
 
 
 def _room() -> Float64:
     """Return three minutes of the noise of a faint room."""
     count = (_ROOM_SECONDS + _SECONDS) * SAMPLE_RATE
     spectrum = np.fft.rfft(np.random.default_rng(0).standard_normal(count))
-    spectrum /= np.sqrt(np.maximum(np.fft.rfftfreq(count, 1 / SAMPLE_RATE), _HERTZ))
+    spectrum /= np.sqrt(np.maximum(np.fft.rfftfreq(count, 1 / SAMPLE_RATE), 20.0))
     return _at_level(np.fft.irfft(spectrum, count), _ROOM)
 
 
@@ -68,10 +67,10 @@ def sounding_seconds(sound: Float64, level: float, model: str = GENERAL) -> floa
     mix = _room()
     mix[_ROOM_SECONDS * SAMPLE_RATE :] += _at_level(_lasting(sound, _SECONDS * SAMPLE_RATE), level)
     with tempfile.TemporaryDirectory(prefix="hearthlog-steady-") as place:
-        audio, logs = Path(place) / "steady.wav", Path(place) / "logs"
+        audio, logs = Path(place) / _NAME, Path(place) / "logs"
         soundfile.write(audio, mix, SAMPLE_RATE, "PCM_16")
         hearthlog = Path(sys.executable).with_name("hearthlog")
-        words = ["record", audio, "-o", logs, "--model", model, "--start", "2026-03-01T00:00:00"]
+        words = ["record", str(audio), "-o", str(logs), "--model", model]
         subprocess.run([hearthlog, *words], check=True, capture_output=True)  # noqa: S603  ours
         labellings = find_labellings(logs)
         labels = labellings.read(labellings.microphone(None), LIVE).labelling
