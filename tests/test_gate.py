@@ -25,7 +25,7 @@ from hearthlog.analyzer.gate.evidence import (
     _taught,
     gather_evidence,
 )
-from hearthlog.analyzer.gate.judge import find_champion
+from hearthlog.analyzer.gate.judge import Verdict, find_champion
 from hearthlog.analyzer.gate.recent_time import (
     Part,
     RecentLog,
@@ -58,6 +58,7 @@ from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.tools.cli.verdict import print_verdict
 from hearthlog.tools.home.simulate import write_day
 
 OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
@@ -480,6 +481,17 @@ def test_a_model_that_changes_much_has_to_be_right_about_more():
     assert damages(evidence(much), "one") == []  # nothing was drawn at random
     little = [[1300, 0, 0], [0, 80, 20], [0, 0, 40]]
     assert damages(evidence(little, Right(40, 30, 30, 3, 3)), "one") == []
+
+
+def test_a_day_of_which_hours_were_recorded_is_said_to_be_one(capsys):
+    for hours, words in (
+        (13, " (a day: the 13 h 00 min that a mean day with logs has):"),
+        (24, ":"),
+    ):
+        table = [[hours * 60.0 - 40, 0, 0], [0, 10, 30], [0, 0, 0]]
+        print_verdict(Verdict(None, "new", "one", evidence(table)), [], "new")
+        first = capsys.readouterr().out.splitlines()[1]
+        assert first.endswith(f"that it has not learned from{words}")
 
 
 COUGHING_BECOMES_NEW = [[1300, 0, 0, 0], [0, 10, 0, 50], [0, 0, 40, 0], [0, 0, 0, 0]]

@@ -269,7 +269,11 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
     ]
     if not own or any(rule.label in names for names in own):
         return ""
-    return f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard"
+    there = listed(sorted(set().union(*own) - {SILENCE}), "and")
+    return (
+        f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard; "
+        f"there are {there}"
+    )
 
 
 def unknown_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
@@ -303,6 +307,23 @@ def unrecorded_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
     return (
         f"{rule.name}: nothing of the microphone {name!r} was recorded in this time; there is "
         f"{listed(sorted(microphones))}"
+    )
+
+
+def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
+    """Say that nothing labels what the microphone of a rule hears; empty if something does.
+
+    Parameters
+    ----------
+    rule : AlertRule
+    microphones : collection of str
+        Those without a model.
+    """
+    if not isinstance(rule, _SoundRule) or rule.microphone not in microphones:
+        return ""
+    return (
+        f"{rule.name}: the microphone {rule.microphone!r} has no model, so that no sound of it has "
+        "a class"
     )
 
 
