@@ -42,6 +42,12 @@ def bridge(
     from hearthlog.recorder.timezone import time_zone
 
     settings, own = load_bridge_settings(config)
+    if not own.has_outputs():
+        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
+        wrong_use(
+            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
+            "tell others"
+        )
     needed = {
         "paho": own.mqtt,
         "prometheus_client": own.prometheus,
@@ -62,10 +68,4 @@ def bridge(
     for line in filter(None, (unknown_microphone(rule, microphones) for rule in own.alert)):
         say(f"alerts: {line}")
     outputs, since = open_outputs(own, home, state, say)
-    if not outputs:
-        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
-        wrong_use(
-            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
-            "tell others"
-        )
     Bridge(home, since, outputs, say).run(stop)
