@@ -241,7 +241,7 @@ def test_time_that_a_model_has_learned_from_does_not_speak_for_it(capfd):
     assert done.returncode == 1
     assert done.stdout.splitlines()[-1:] != ["learned is the champion"]
     assert "only 4.0 min are recorded and not learned from, and it takes 10 min" in done.stderr
-    assert "record 7 minutes more, then promote it" in done.stderr
+    assert "record 7 more minutes, then promote it" in done.stderr
 
 
 @pytest.mark.usefixtures("place")
@@ -471,6 +471,13 @@ def evidence(minutes, right=NOTHING_KNOWN, sure=None):
     certain = np.zeros_like(table) if sure is None else np.array(sure, float)
     changes = Changes(["silence", "speech", "music"], table)
     return Evidence(60.0, 14 * 1440.0, changes, certain, right, Right(), [])
+
+
+@pytest.mark.parametrize(("minutes", "more"), [(9.6, "1 more minute,"), (8.2, "2 more minutes,")])
+def test_how_much_more_has_to_be_recorded_is_said(minutes, more):
+    short = replace(evidence([[1, 0], [0, 1]]), minutes=minutes)
+    (line,) = damages(short, "one")
+    assert f" judge it: record {more} then promote it" in line
 
 
 def test_a_model_that_changes_much_has_to_be_right_about_more():

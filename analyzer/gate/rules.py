@@ -47,7 +47,7 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
         text = (
             f"of the last two weeks only {time_words(evidence.minutes)} are recorded and not "
             f"learned from, and it takes {time_words(LEAST_MINUTES)} to judge it{loss}: record "
-            f"{missing} minutes more, then promote it"
+            f"{missing} more minute{'s' * (missing > 1)}, then promote it"
         )
         return [text]
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]

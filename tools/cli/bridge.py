@@ -41,6 +41,12 @@ def bridge(
     from hearthlog.recorder.timezone import time_zone
 
     settings, own = load_bridge_settings(config)
+    if not own.has_outputs():
+        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
+        wrong_use(
+            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
+            "tell others"
+        )
     modules = needed_modules(own)
     if not (own.page or own.ping or any(modules.values())):
         lacking = [name for name, is_there in modules.items() if not is_there]
@@ -57,10 +63,4 @@ def bridge(
     for line in rule_doubts(own.alert, settings, microphones):
         say(f"alerts: {line}")
     outputs, since = open_outputs(own, home, state, say)
-    if not outputs:
-        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
-        wrong_use(
-            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
-            "tell others"
-        )
     Bridge(home, since, outputs, say).run(stop)
