@@ -1,13 +1,16 @@
 """Fix the projection of YAMNet: `python -m hearthlog.tools.projection YAMNET MANIFEST -o FILE`.
 
-The components are those of the principal component analysis of windows with sound of licensed
-recordings. Logs and models depend on the file: it is made once for a network.
+The components are the directions of the embedding in which the network's last layer tells the names
+of the groups apart: its singular vectors. Principal components of the licensed recordings, of which
+one is music and none a telephone, know those sounds badly. The recordings give the mean and the
+scale. Logs and models depend on the file: it is made once for a network.
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
+from ai_edge_litert.interpreter import Interpreter
 
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
@@ -38,23 +41,29 @@ def main() -> None:
     options = parser.parse_args()
     embeddings = np.concatenate([_embeddings(options.network, one) for one in options.manifests])
     names = Path(__file__).parents[1] / "models" / "embedding" / "yamnet_names.txt"
-    write_projection(fixed_projection(embeddings, names.read_text().splitlines()), options.output)
+    layer = _last_layer(options.network)
+    projection = fixed_projection(layer, embeddings, names.read_text().splitlines())
+    write_projection(projection, options.output)
 
 
-def fixed_projection(embeddings: Float32, names: list[str]) -> Projection:
-    """Return the projection onto whitened components of embeddings, and groups of names.
+def fixed_projection(layer: Float32, embeddings: Float32, names: list[str]) -> Projection:
+    """Return the projection onto components of embeddings, and groups of names.
 
     Parameters
     ----------
+    layer : np.ndarray [shape=(N, E)], float32
+        Weights from the embedding to the scores.
     embeddings : np.ndarray [shape=(n, E)], float32
         Of sounds.
     names : list of str
         Of the network's scores.
     """
     mean = embeddings.mean(axis=0, dtype=np.float64)
-    powers, vectors = np.linalg.eigh(np.cov((embeddings - mean).T))
-    strongest = np.argsort(powers)[::-1][:_COMPONENTS]
-    components = vectors[:, strongest] / np.sqrt(powers[strongest])
+    members = sorted({names.index(name) for group in GROUPS.values() for name in group})
+    rows = layer[members].astype(np.float64)
+    _, _, vectors = np.linalg.svd(rows - rows.mean(axis=0), full_matrices=False)
+    components = vectors[:_COMPONENTS].T
+    components /= np.std((embeddings - mean) @ components, axis=0)
     components *= np.where(components.sum(axis=0) < 0, -1.0, 1.0)  # a sign is free
     singles = len(GROUPS) - _CLASSES
     counts = (_COMPONENTS, _CLASSES, singles)
@@ -69,6 +78,19 @@ def fixed_projection(embeddings: Float32, names: list[str]) -> Projection:
             group: [names.index(name) for name in members] for group, members in GROUPS.items()
         },
     )
+
+
+def _last_layer(network: Path) -> Float32:
+    """Return the weights of the last layer, which may be kept in eight bits."""
+    interpreter = Interpreter(str(network))
+    interpreter.allocate_tensors()
+    shape = [YAMNET.names, YAMNET.width]
+    (tensor,) = (
+        each for each in interpreter.get_tensor_details() if each["shape"].tolist() == shape
+    )
+    scales = tensor["quantization_parameters"]["scales"]
+    weights: Float32 = interpreter.get_tensor(tensor["index"]).astype(np.float32)
+    return weights * scales[:, np.newaxis] if len(scales) else weights
 
 
 def _embeddings(network: Path, manifest: Path) -> Float32:
