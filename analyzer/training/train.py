@@ -151,11 +151,10 @@ def train_model(  # noqa: PLR0913, PLR0917
         training_digests=segment_digests(data.windows),
     )
     if mixture is not None:
-        weights, bias = mixture.heads
         model = replace(
             model,
-            embedding_weights=weights,
-            embedding_bias=bias,
+            embedding_weights=mixture.heads.weights,
+            embedding_bias=mixture.heads.bias,
             embedding_scaler=scaler_of(data.heard, data.classes),
         )
     model = with_directions(model, data.target, data.sightings)
