@@ -213,7 +213,7 @@ def main(  # noqa: PLR0913, PLR0917
             found = label_scene(scene.frames, classifier, heard)
             scores.append(evaluate_labelling(truth, found, classifier.classes))
         print(f"{_row(scores)}  {file.stem}", flush=True)
-        print("  " + "  ".join(f"{k} {v.f1:.2f}" for k, v in scores[0].scores.per_class.items()))
+        print("  " + "  ".join(f"{k} {v.f1 or 0.0:.2f}" for k, v in scores[0].scores.per_class.items()))
 
 
 if __name__ == "__main__":
