@@ -112,6 +112,12 @@ def model_card(model: Model) -> str:
     if arrays := description.direction_microphones:
         named = ", ".join(arrays)
         lines += ["", f"Takes the directions of {named}; other microphones are labelled without."]
+    if (mix := description.embedding) is not None:
+        wanted = (
+            f"Takes what the network {mix.network} hears (projection {mix.projection_sha256[:12]}) "
+            "where a log has it; elsewhere it labels by the features alone, and less often rightly."
+        )
+        lines += ["", wanted]
     if description.training_data.simulated:
         lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
     lines += [*_elsewhere(description), "", "Learned from recordings of:", ""]

@@ -66,7 +66,7 @@ def train(
             show_default="the one that labelled the latest log",
         ),
     ] = None,
-    method: Annotated[str, typer.Option(help=METHODS)] = METHOD,
+    method: Annotated[str | None, typer.Option(help=METHODS, show_default=METHOD)] = None,
     cost: Annotated[
         float | None,
         typer.Option(help="Cost of a wrong segment; `evaluate search` finds a good one."),
@@ -112,8 +112,11 @@ def train(
         model, segments = _adapted(base, home, scenario or "")
     else:
         assert scenario is not None
+        from hearthlog.analyzer.training.installed import DEFAULT
         from hearthlog.analyzer.workers.parallel import fits_on
 
+        if speakers and method is None:
+            method = DEFAULT.name  # who speaks is told by the features
         chosen = chosen_method(method, cost=cost, gamma=gamma)
         with fits_on(scheduler):
             words = scenario, home or [], chosen, smoothing
@@ -231,6 +234,7 @@ def _learned(
     left_out: "list[LeftOut]",
 ) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import build_dataset
+    from hearthlog.analyzer.training.installed import clip_embedder
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.training.train import train_model
     from hearthlog.models.classes import UNKNOWN
@@ -249,7 +253,10 @@ def _learned(
         )
     recordings = list(_home_recordings(home, method.features, method.gate))
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
+        heard = clip_embedder(method)
+        segments = build_dataset(
+            clips, chosen, report, recordings, method.features, method.rooms, heard
+        )
     _tell_left_out(segments.left_out)
     left_out += segments.left_out
     _warn_of_few(segments)
