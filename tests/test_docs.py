@@ -48,8 +48,9 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 NOT_HERE = re.compile(
     r"hearthlog( record( --model \S+)?( --keep-audio \w+)?( --config \S+)?$| devices| watch| demo"
     r"| models fetch yamnet| install-service| bridge|.*--start 2026-03-10 "
-    r"| evaluate (adaptation|paper)|.* s3://|.*tcp:|.* --web|.* --microphone USB|.* --folds collection"
-    r"| discover| voices|.* speakers |.* mood.toml|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
+    r"| evaluate (adaptation|paper)|.* s3://|.*tcp:|.* --web"
+    r"|.* --microphone USB|.* --folds collection| discover| voices|.* speakers |.* mood.toml"
+    r"|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
     r"| review(?!.* --save))"
 )
 
