@@ -52,14 +52,8 @@ class Scene(NamedTuple):
     truth: Labelling
 
 
-def compose_scene(  # noqa: PLR0913  what a scene is made of
-    clips: Sequence[LabelledClip],
-    seconds: float,
-    seed: int,
-    *,
-    floor: float = -70.0,
-    gain: float = 0.0,
-    pink: bool = False,
+def compose_scene(
+    clips: Sequence[LabelledClip], seconds: float, seed: int, *, noisy: bool = False
 ) -> Scene:
     """Lay clips into steady noise, as many of each label.
 
@@ -69,25 +63,22 @@ def compose_scene(  # noqa: PLR0913  what a scene is made of
         None of silence.
     seconds : float
     seed : int
-    floor : float
-        Level of the noise, in dBFS.
-    gain : float
-        Of the clips, in dB.
-    pink : bool
-        Whether the noise is pink; else it is white.
+    noisy : bool
+        Whether they are 12 dB fainter, in pink noise of -50 dBFS; else it is white, of -70 dBFS.
     """
     rng = random.Random(seed)
+    gain = np.float32(10 ** (-12 / 20) if noisy else 1.0)
     by_label: dict[str, list[LabelledClip]] = {}
     for clip in clips:
         by_label.setdefault(clip.label, []).append(clip)
-    sound = _noise(round(seconds * SAMPLE_RATE), floor, seed, pink=pink)
+    sound = _noise(round(seconds * SAMPLE_RATE), -50.0 if noisy else -70.0, seed, pink=noisy)
     spans, time = [], 2.0
     while time < seconds - max(_LENGTHS) - max(_PAUSES):
         label = rng.choice(sorted(by_label))
         samples = clip_frames(rng.choice(by_label[label])).ravel()
         samples = samples[: round(rng.uniform(*_LENGTHS) * SAMPLE_RATE)]
         start = round(time * SAMPLE_RATE)
-        sound[start : start + len(samples)] += samples * np.float32(10 ** (gain / 20))
+        sound[start : start + len(samples)] += gain * samples
         spans.append((time, time + len(samples) / SAMPLE_RATE, label))
         time = spans[-1][1] + rng.choice(_PAUSES)
     frames = np.clip(sound[: len(sound) // FRAME_SAMPLES * FRAME_SAMPLES], -1.0, 1.0)
@@ -139,8 +130,9 @@ def _labelling(spans: Sequence[tuple[float, float, str]], seconds: float) -> Lab
     edges = [0.0, *(time for span in spans for time in span[:2]), seconds]
     quiet = [(a, b, SILENCE) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
     rows = sorted([*spans, *quiet])
-    starts, ends = (np.array([round(row[k] * NANOSECONDS) for row in rows]) for k in (0, 1))
-    return Labelling(starts, ends, np.array([row[2] for row in rows], object))
+    starts = np.array([round(start * NANOSECONDS) for start, _, _ in rows])
+    ends = np.array([round(end * NANOSECONDS) for _, end, _ in rows])
+    return Labelling(starts, ends, np.array([label for _, _, label in rows], object))
 
 
 def _write_manifest(clips: Iterable[LabelledClip], path: Path) -> None:
@@ -196,8 +188,7 @@ def main(  # noqa: PLR0913, PLR0917
         for label in labels
     }
     sounds = [clip for clip in chosen if clip.label in known]
-    level = {"floor": -50.0, "gain": -12.0, "pink": True} if noisy else {}
-    scenes = [compose_scene(sounds, seconds, one, **level) for one in seed or [10, 11]]
+    scenes = [compose_scene(sounds, seconds, one, noisy=noisy) for one in seed or [10, 11]]
     path = find_network(YAMNET.name)
     embedder = None if path is None else load_embedder(YAMNET.name, path)
     print(f"{len(scenes)} scenes of {seconds / 60:.0f} min, {len(sounds)} clips")
@@ -213,7 +204,10 @@ def main(  # noqa: PLR0913, PLR0917
             found = label_scene(scene.frames, classifier, heard)
             scores.append(evaluate_labelling(truth, found, classifier.classes))
         print(f"{_row(scores)}  {file.stem}", flush=True)
-        print("  " + "  ".join(f"{k} {v.f1 or 0.0:.2f}" for k, v in scores[0].scores.per_class.items()))
+        print(
+            "  "
+            + "  ".join(f"{k} {v.f1 or 0.0:.2f}" for k, v in scores[0].scores.per_class.items())
+        )
 
 
 if __name__ == "__main__":
