@@ -1,14 +1,16 @@
 """Fix the projection of YAMNet: `python -m hearthlog.tools.projection YAMNET MANIFEST -o FILE`.
 
-The components are the singular vectors of the network's last layer, of the rows of the names that
-are logged: no sound decides what they are. Licensed recordings decide only the mean and the
-deviation of each. Logs and models depend on the file: it is made once for a network.
+The components are the directions of the embedding in which the network's last layer tells the names
+of the groups apart: its singular vectors. Principal components of the licensed recordings, of which
+one is music and none a telephone, know those sounds badly. The recordings give the mean and the
+scale. Logs and models depend on the file: it is made once for a network.
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
+from ai_edge_litert.interpreter import Interpreter
 
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
@@ -37,67 +39,63 @@ def main() -> None:
     parser.add_argument("manifests", type=Path, nargs="+")
     parser.add_argument("-o", "--output", type=Path, required=True)
     options = parser.parse_args()
-    data = options.network.read_bytes()
-    embeddings = np.concatenate([_embeddings(data, one) for one in options.manifests])
+    embeddings = np.concatenate([_embeddings(options.network, one) for one in options.manifests])
     names = Path(__file__).parents[1] / "models" / "embedding" / "yamnet_names.txt"
-    fixed = fixed_projection(last_layer(data), embeddings, names.read_text().splitlines())
-    write_projection(fixed, options.output)
+    layer = _last_layer(options.network)
+    projection = fixed_projection(layer, embeddings, names.read_text().splitlines())
+    write_projection(projection, options.output)
 
 
-def last_layer(network: bytes) -> Float32:
-    """Return the weights from the embedding to the scores, shape (names, width).
-
-    Parameters
-    ----------
-    network : bytes
-        A TFLite file, in which these are 8 bit and a scale.
-    """
-    from ai_edge_litert.interpreter import Interpreter  # noqa: PLC0415  not everybody has it
-
-    interpreter = Interpreter(model_content=network)
-    shape = [YAMNET.names, YAMNET.width]
-    (tensor,) = (
-        each for each in interpreter.get_tensor_details() if each["shape"].tolist() == shape
-    )
-    interpreter.allocate_tensors()
-    scales = np.atleast_1d(tensor["quantization_parameters"]["scales"])
-    weights: Float32 = interpreter.get_tensor(tensor["index"]) * scales[:, np.newaxis]
-    return weights
-
-
-def fixed_projection(weights: Float32, embeddings: Float32, names: list[str]) -> Projection:
+def fixed_projection(layer: Float32, embeddings: Float32, names: list[str]) -> Projection:
     """Return the projection onto components of embeddings, and groups of names.
 
     Parameters
     ----------
-    weights : np.ndarray [shape=(N, E)], float32
-        Of the network's last layer.
+    layer : np.ndarray [shape=(N, E)], float32
+        Weights from the embedding to the scores.
     embeddings : np.ndarray [shape=(n, E)], float32
         Of sounds.
     names : list of str
         Of the network's scores.
     """
-    members = {group: [names.index(name) for name in each] for group, each in GROUPS.items()}
-    rows = weights[sorted({row for each in members.values() for row in each})].astype(np.float64)
+    mean = embeddings.mean(axis=0, dtype=np.float64)
+    members = sorted({names.index(name) for group in GROUPS.values() for name in group})
+    rows = layer[members].astype(np.float64)
     _, _, vectors = np.linalg.svd(rows - rows.mean(axis=0), full_matrices=False)
     components = vectors[:_COMPONENTS].T
-    components /= (embeddings @ components).std(axis=0)
+    components /= np.std((embeddings - mean) @ components, axis=0)
     components *= np.where(components.sum(axis=0) < 0, -1.0, 1.0)  # a sign is free
-    counts = (_COMPONENTS, _CLASSES, len(GROUPS) - _CLASSES)
+    singles = len(GROUPS) - _CLASSES
+    counts = (_COMPONENTS, _CLASSES, singles)
     steps = np.repeat([_STEP_OF_COMPONENT, _STEP_OF_CLASS, _STEP_OF_NAME], counts)
     lows = np.repeat([-127 * _STEP_OF_COMPONENT, _LOW_OF_CLASS, _LOW_OF_NAME], counts)
     return Projection(
-        mean=embeddings.mean(axis=0, dtype=np.float64).astype(np.float16).astype(np.float32),
+        mean=mean.astype(np.float16).astype(np.float32),
         components=components.astype(np.float16).astype(np.float32),
         steps=steps.astype(np.float32),
         lows=lows.astype(np.float32),
-        groups=members,
+        groups={
+            group: [names.index(name) for name in members] for group, members in GROUPS.items()
+        },
     )
 
 
-def _embeddings(network: bytes, manifest: Path) -> Float32:
+def _last_layer(network: Path) -> Float32:
+    """Return the weights of the last layer, which may be kept in eight bits."""
+    interpreter = Interpreter(str(network))
+    interpreter.allocate_tensors()
+    shape = [YAMNET.names, YAMNET.width]
+    (tensor,) = (
+        each for each in interpreter.get_tensor_details() if each["shape"].tolist() == shape
+    )
+    scales = tensor["quantization_parameters"]["scales"]
+    weights: Float32 = interpreter.get_tensor(tensor["index"]).astype(np.float32)
+    return weights * scales[:, np.newaxis] if len(scales) else weights
+
+
+def _embeddings(network: Path, manifest: Path) -> Float32:
     """Return the embeddings of the sounds of a manifest that may be learned from."""
-    session = TfliteSession(network, YAMNET.window, YAMNET.width, YAMNET.names)
+    session = TfliteSession(network.read_bytes(), YAMNET.window, YAMNET.width, YAMNET.names)
     noise = np.random.default_rng(1)
     found = []
     for clip in read_manifest(manifest, LABELS):

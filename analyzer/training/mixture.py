@@ -23,6 +23,7 @@ HEAD_WEIGHTS = (1.0, 1.0)  # of the head on components, and on groups of names
 MACHINE_WEIGHT = 0.75
 CLASS_EXPONENT = 0.2
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
+_REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
 _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 
@@ -43,6 +44,11 @@ class Hearing:
     projection_sha256: str
     names: tuple[str, ...]
     inputs: tuple[slice, ...]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups, which the last of the heads takes."""
+        return self.names[self.inputs[-1]]
 
 
 def hearing_of(network: str) -> Hearing:
@@ -171,8 +177,8 @@ class BestMix(NamedTuple):
 def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
     """Try heads and a classifier together, with and without the names of the network as they are.
 
-    Names are mixed in where segments left out are told better with them: where the recordings of a
-    class are too few to learn from.
+    They say what is of no class of the scenario, and, where the recordings of a class are too few
+    to learn from, of which class it is; they are mixed in where segments left out are told better.
 
     Parameters
     ----------
@@ -182,17 +188,18 @@ def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
     ways : sequence of Tried
         At least one.
     """
-    mix = _plain(hearing)
-    said = [said_unseen(data, mix, hearing, way.folds) for way in ways]
-    best = BestMix(mix, said, _left_out(data, mix, ways, said))
-    names = names_head(hearing, data.classes)
-    if names is None:
-        return best
-    mix = mix.model_copy(update={"names": [names]})
-    of_names = _said_by_names(data, mix)
-    said = [one + of_names for one in said]
-    other = BestMix(mix, said, _left_out(data, mix, ways, said))
-    return max(best, other, key=lambda one: _right(data, one.left_out))
+    plain = _plain(hearing)
+    said = [said_unseen(data, plain, hearing, way.folds) for way in ways]
+    best = BestMix(plain, said, _left_out(data, plain, ways, said))
+    for head in (rejecting_head(hearing, data.classes), names_head(hearing, data.classes)):
+        if head is None:
+            continue
+        mix = plain.model_copy(update={"names": [head]})
+        of_names = _said_by_names(data, mix)
+        with_names = [one + of_names for one in said]
+        other = BestMix(mix, with_names, _left_out(data, mix, ways, with_names))
+        best = max(best, other, key=lambda one: _right(data, one.left_out))
+    return best
 
 
 def learn_mixture(
@@ -235,6 +242,35 @@ def _plain(hearing: Hearing) -> EmbeddingMix:
     )
 
 
+def rejecting_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
+    """Return what the names of a network say of whether a sound is of any known class.
+
+    Parameters
+    ----------
+    hearing : Hearing
+    classes : sequence of str
+
+    Returns
+    -------
+    NamesHead or None
+        None where there is no class `unknown`, or no known one has a name.
+    """
+    first, groups = hearing.inputs[-1].start, hearing.groups
+    known = [name for name in classes if name not in {SILENCE, UNKNOWN}]
+    named = {group for name in known for group in _groups_of(name)} & set(groups)
+    others = set(groups) - named - {SILENCE}
+    if UNKNOWN not in classes or not named or not others:
+        return None
+    inside = [first + number for number, group in enumerate(groups) if group in named]
+    outside = [first + number for number, group in enumerate(groups) if group in others]
+    return NamesHead(
+        weight=_REJECTING_WEIGHT,
+        slope=_NAMES_SLOPE,
+        classes={**dict.fromkeys(known, inside), UNKNOWN: outside},
+        bias={UNKNOWN: _REJECTING_BIAS},
+    )
+
+
 def names_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
     """Return what the names of a network say of some classes; None if one of them has no name.
 
@@ -243,14 +279,17 @@ def names_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
     hearing : Hearing
     classes : sequence of str
     """
-    first = hearing.inputs[-1].start
-    groups = hearing.names[first : hearing.inputs[-1].stop]
-    of_class = {UNKNOWN: ["outside"], OTHER: [one for one in groups if one in _OF_GENERAL]}
-    named = {name: of_class.get(name, [name]) for name in classes if name != SILENCE}
+    first, groups = hearing.inputs[-1].start, hearing.groups
+    named = {name: _groups_of(name) for name in classes if name != SILENCE}
     if len(named) < 2 or not all(one in groups for same in named.values() for one in same):
         return None
     numbers = {name: [first + groups.index(one) for one in same] for name, same in named.items()}
     return NamesHead(weight=_NAMES_WEIGHT, slope=_NAMES_SLOPE, classes=numbers)
+
+
+def _groups_of(name: str) -> list[str]:
+    """Return the groups of names that mean a class."""
+    return {UNKNOWN: ["outside"], OTHER: sorted(_OF_GENERAL)}.get(name, [name])
 
 
 def _said_by_names(data: Dataset, mix: EmbeddingMix) -> Float64:

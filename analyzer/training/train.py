@@ -144,8 +144,8 @@ def train_model(  # noqa: PLR0913, PLR0917
         training_digests=segment_digests(data.windows),
     )
     if mixture is not None:
-        weights, bias = mixture.heads
-        model = replace(model, embedding_weights=weights, embedding_bias=bias)
+        heads = mixture.heads
+        model = replace(model, embedding_weights=heads[0], embedding_bias=heads[1])
     model = with_directions(model, data.target, data.sightings)
     if method.remembered(model) is not None:
         return model

@@ -371,7 +371,7 @@ def _print(model: "Model", segments: "Dataset") -> None:
     data, amounts = model.description.training_data, ("sources", "seconds", "segments")
     adapted = bool(data.base_sha256)
     if not adapted:  # else the figures are those of another model, which has said them
-        _print_figures(model)
+        print_figures(model)
     if data.home:
         home = "also learned from the home"
         print(home if adapted else f"\n{home} (the figures above are those without it)")
@@ -385,7 +385,9 @@ def _print(model: "Model", segments: "Dataset") -> None:
     print_skipped(segments.skipped)
 
 
-def _print_figures(model: "Model") -> None:
+def print_figures(model: "Model") -> None:
+    """Print what a model was learned from, and how good it is on sources it has not heard."""
+    from hearthlog.models.classes import UNKNOWN
     from hearthlog.models.classifiers.installed import classifier_kind
 
     description, metrics = model.description, model.description.metrics
@@ -399,15 +401,16 @@ def _print_figures(model: "Model") -> None:
         rows.append((name, *_amounts(amount), *figures))
     head = "class", "sources", "seconds", "segments", "precision", "recall", "F1"
     print_table(head, rows)
+    others = f" without {UNKNOWN}" * (UNKNOWN in description.classes)
     print(
-        f"\nmacro F1 {metrics.macro_f1:.3f}, expected calibration error "
+        f"\nmacro F1 {metrics.macro_f1:.3f}{others}, expected calibration error "
         f"{metrics.expected_calibration_error:.3f} (cross-validated, {metrics.folds} folds, "
         "sources never split)"
     )
     if (elsewhere := description.elsewhere) is not None:
         print(
             f"in collections that nothing was learned from: {elsewhere.right:.0%} of "
-            f"{elsewhere.segments} segments right, expected calibration error "
+            f"{elsewhere.segments} segments of its classes right, expected calibration error "
             f"{elsewhere.expected_calibration_error:.3f} ({elsewhere.collections} left out in turn)"
         )
     parameters = [f"{name} {value:.4g}" for name, value in description.parameters.items()]
