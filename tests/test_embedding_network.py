@@ -53,7 +53,8 @@ def yamnet_file():
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """The folder of networks of one test."""
+    """The folder of networks of one test, whose verbs are not told to listen without one."""
+    monkeypatch.delenv("HEARTHLOG_EMBEDDING", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setenv("XDG_DATA_DIRS", str(tmp_path / "all"))
     folder = tmp_path / "data" / "hearthlog" / "networks"
