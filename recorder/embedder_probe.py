@@ -5,7 +5,7 @@ module is that process, too: ``embedder_probe NAME FILE`` answers in one line of
 """
 
 import json
-import resource
+import re
 import signal
 import subprocess
 import sys
@@ -27,6 +27,7 @@ from hearthlog.models.embedding.runtimes import missing_modules
 from hearthlog.models.errors import ModelError
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.text import printable
 
 NO_NETWORK = "none"  # in place of a name
 DEFAULT_NETWORK = "yamnet"
@@ -51,7 +52,7 @@ class Probe(NamedTuple):
     seconds : float
         That a window takes here.
     megabytes : float
-        Most memory of a process that does nothing else.
+        Most memory of a process that does nothing else; 0 where that is not known.
     different_answers : list of str
         As of `Embedder`.
     """
@@ -148,10 +149,10 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
     try:
         check_pace(path, _probed(name, path, path.stat().st_mtime_ns), microphones)
         return load_embedder(name, path), ""
-    except OSError as error:
-        return None, f"{path}: cannot be read ({error.strerror}); {_GOES_ON}"
     except ModelError as error:
         return None, f"{error}; {_GOES_ON}"
+    except Exception as error:  # noqa: BLE001  no runtime may keep a recorder from its start
+        return None, f"{path}: cannot be used ({printable(repr(error))[:200]}); {_GOES_ON}"
 
 
 @lru_cache(maxsize=4)
@@ -240,11 +241,24 @@ def main() -> None:
         answer = {
             "seconds": _window_seconds(embedder),
             "different_answers": embedder.different_answers(),
-            "megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "megabytes": _most_megabytes(),
         }
     except ModelError as error:
         answer = {"error": str(error)}
     sys.stdout.write(json.dumps(answer) + "\n")
+
+
+def _most_megabytes() -> float:
+    """Return the most memory that this process had; 0 where the system does not say.
+
+    That of `getrusage` counts what the process had that started it.
+    """
+    try:
+        status = Path("/proc/self/status").read_text("ascii", "replace")
+    except OSError:
+        return 0.0
+    found = re.search(r"^VmHWM:\s+(\d+) kB$", status, re.MULTILINE)
+    return int(found[1]) / 1024 if found else 0.0
 
 
 def _window_seconds(embedder: Embedder) -> float:

@@ -1,6 +1,7 @@
 """A server of one file, on loopback, which misbehaves as it is told."""
 
 import re
+import ssl
 import time
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -13,11 +14,11 @@ class FileServer:
     A mood is a number of bytes after which the connection is closed, or a word.
     """
 
-    def __init__(self, port):
+    def __init__(self, origin):
         self.data = b""
         self.moods = ["well"]
         self.asked = []  # the ranges
-        self.url = f"http://127.0.0.1:{port}/network.tflite"
+        self.url = f"{origin}/network.tflite"
         self.over = Event()
 
     def mood(self):
@@ -25,7 +26,9 @@ class FileServer:
 
 
 @contextmanager
-def file_server():
+def file_server(certificate=None):
+    """Serve over http, or over https with the files of a certificate and its key."""
+
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
             server.asked.append(self.headers["Range"])
@@ -36,7 +39,13 @@ def file_server():
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as listening:
         listening.daemon_threads = True
-        server = FileServer(listening.server_port)
+        if certificate:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(*certificate)
+            listening.socket = context.wrap_socket(listening.socket, server_side=True)
+            listening.handle_error = lambda *_: None  # who does not trust it ends the handshake
+        scheme = "https" if certificate else "http"
+        server = FileServer(f"{scheme}://127.0.0.1:{listening.server_port}")
         Thread(target=listening.serve_forever, args=(0.02,), daemon=True).start()
         try:
             yield server

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certificates import Authority
 from fileserver import file_server
 from typer.testing import CliRunner
 
@@ -161,6 +162,27 @@ def test_the_file_before_stays_where_the_new_one_is_wrong(server, path):
     server.data = DATA
     get(server, path)
     assert path.read_bytes() == DATA
+
+
+def test_https_is_of_a_server_that_is_trusted_and_leads_nowhere_less_safe(
+    server, path, tmp_path, monkeypatch
+):
+    authority = Authority(tmp_path, "authority")
+    with file_server(authority.sign("server")) as safe:
+        safe.data = DATA
+        with pytest.raises(
+            DownloadError, match=r"no certificate that this machine trusts \(.*clock"
+        ):
+            get(safe, path)
+        assert safe.asked == []
+        monkeypatch.setenv("SSL_CERT_FILE", str(authority.file))
+        get(safe, path)
+        assert path.read_bytes() == DATA
+        safe.moods = [f"moved to {server.url}"]
+        path.unlink()
+        with pytest.raises(DownloadError, match="no address that begins with https"):
+            get(safe, path)
+        assert server.asked == []
 
 
 @pytest.mark.parametrize("url", ["http://example.org/x", "ftp://example.org/x", "file:///x", "x"])

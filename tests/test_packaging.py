@@ -185,7 +185,8 @@ def imported(folders):
 
 
 @pytest.mark.parametrize(
-    ("folders", "extras"), [(BOX, ("onnx",)), (("analyzer", "tools/cli", "tools/home"), EXTRAS)]
+    ("folders", "extras"),
+    [(BOX, ("embedding", "onnx")), (("analyzer", "tools/cli", "tools/home"), EXTRAS)],
 )
 def test_what_is_imported_is_asked_for(folders, extras):
     names = {name.partition(".")[0] for name in imported(folders)}

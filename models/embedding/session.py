@@ -5,7 +5,7 @@ import struct
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -111,10 +111,12 @@ def _without_notice() -> Iterator[None]:
     LiteRT has no switch for it. What else is written in the meantime, by whichever thread, comes
     when the block ends.
     """
-    with _loading, tempfile.TemporaryFile(buffering=0) as lines:
+    with _loading, ExitStack() as stack:
         try:
             error = os.dup(2)
-        except OSError:  # there is none
+            stack.callback(os.close, error)
+            lines = stack.enter_context(tempfile.TemporaryFile(buffering=0))
+        except OSError:  # no standard error, or no room: then the line may come
             yield
             return
         os.dup2(lines.fileno(), 2)
@@ -122,7 +124,6 @@ def _without_notice() -> Iterator[None]:
             yield
         finally:
             os.dup2(error, 2)
-            os.close(error)
             lines.seek(0)
             kept = [line for line in lines.read().splitlines(keepends=True) if _NOTICE not in line]
             if kept:

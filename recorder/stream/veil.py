@@ -172,5 +172,5 @@ class EmbeddingVeil:
         self._held = self._held.rows(slice(len(ended.frames), None))
         if not len(ended.frames):
             return ended
-        windows = sliding_window_view(private, WINDOW_FRAMES).any(axis=1)
+        windows = np.asarray(sliding_window_view(private, WINDOW_FRAMES).any(axis=1))
         return ended.rows(np.flatnonzero(~windows[ended.last_frames - frames.first]))

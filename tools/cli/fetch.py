@@ -25,7 +25,9 @@ def fetch(
     This is the only command of hearthlog that downloads. It says whose the network is, checks that
     the file is the one that is known, and tries it. Exit status 3: it is there, and cannot be used.
     """
-    from hearthlog.models.embedding.networks import NETWORKS
+    from hearthlog.models.embedding.networks import NETWORKS, network_folders
+    from hearthlog.tools.service.unit import NAME
+    from hearthlog.tools.service.units import SYSTEM_UNITS
 
     if name is None:
         if source is not None:
@@ -36,6 +38,8 @@ def fetch(
     tell(f"{network.attribution}; its licence is {network.licence}")
     path = _put(network) if source is None else _put_from(network, source)
     print(path)
+    if path.is_relative_to(network_folders()[0]) and (SYSTEM_UNITS / NAME).exists():
+        tell("the service of this machine does not look there: for it, run this with sudo")
     end_with_warnings(_tried(network, path))
 
 

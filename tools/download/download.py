@@ -290,10 +290,11 @@ def _words(error: object) -> str:
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
-def _check_address(url: str) -> None:
+def _check_address(url: str, *, of_here: bool = True) -> None:
+    """Refuse what is not https, nor http of this machine where that is expected."""
     parts = urlsplit(url)
-    of_here = parts.scheme == "http" and parts.hostname in _LOOPBACK
-    if parts.scheme != "https" and not of_here:
+    is_here = of_here and parts.scheme == "http" and parts.hostname in _LOOPBACK
+    if parts.scheme != "https" and not is_here:
         raise DownloadError(f"{url}: is no address that begins with https://")
 
 
@@ -308,10 +309,11 @@ class _Redirects(HTTPRedirectHandler):
         *arguments
             As of `HTTPRedirectHandler`; the last one is the new address.
         """
+        request, answer, address = arguments[0], arguments[1], arguments[-1]
         try:
-            _check_address(arguments[-1])
+            _check_address(address, of_here=request.type == "http")
         except DownloadError:
-            arguments[1].close()  # the answer
+            answer.close()
             raise
         return super().redirect_request(*arguments)
 

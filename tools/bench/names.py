@@ -1,0 +1,447 @@
+"""`python -m hearthlog.tools.bench.names YAMNET MANIFEST`: which names may be events.
+
+The clips of each half of the sources are laid, each once and at a level of its own, into hours of
+noise, and the network names what it hears. A threshold is chosen on one half, so that a name is
+right often enough and said falsely seldom enough, and tried on the other. With `-o` the
+table of names takes the thresholds and figures; what is printed is the table of docs/audioset.md.
+
+The manifest needs a column `detail`, the kind of the sound; `KINDS` says which kinds are which
+names'.
+"""
+
+import csv
+import hashlib
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+
+from hearthlog.analyzer.evaluation.scenes import background
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, Embeddings
+from hearthlog.models.embedding.networks import YAMNET, Embedder
+from hearthlog.models.embedding.projection import Projection
+from hearthlog.models.embedding.sound_names import (
+    NamedSound,
+    SoundName,
+    audioset_names,
+    named_sounds,
+    write_names,
+)
+from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
+
+# Kinds as `label/detail`, or a label alone, and the names that are right for them.
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "speech": ("speech", "television/news", "television/broadcast_speech"),
+    "music": ("music",),
+    "phone_ring": ("phone_ring",),
+    "doorbell": ("other_negative/doorbell",),
+    "knock": ("objects_activity/knock", "objects_activity/knocking", "other_negative/knock"),
+    "door": ("other_negative/door", "other_negative/door_slam", "objects_activity/doorslam"),
+    "slam": ("other_negative/door_slam", "objects_activity/doorslam"),
+    "cupboard": ("objects_activity/cupboard", "objects_activity/drawer"),
+    "keys": ("objects_activity/keys", "objects_activity/keysDrop"),
+    "footsteps": ("other_negative/footsteps",),
+    "thump": ("other_negative/thump_fall",),
+    "glass": ("other_negative/glass_break",),
+    "breaking": ("other_negative/glass_break",),
+    "paper": ("objects_activity/paper", "objects_activity/book", "objects_activity/pageturn"),
+    "zipper": ("objects_activity/zipper",),
+    "writing": ("objects_activity/pencil",),
+    "coughing": ("coughing",),
+    "throat_clearing": (
+        "other_negative/clearthroat",
+        "other_negative/throat",
+        "other_negative/throatclear",
+    ),
+    "sneeze": ("other_negative/sneeze",),
+    "burp": ("other_negative/burp",),
+    "breathing": ("other_negative/breathing",),
+    "snoring": ("other_negative/snoring",),
+    "sobbing": ("crying/cry", "crying/adult_or_unknown", "crying/unknown_age_baby_like"),
+    "baby_cry": (
+        "crying/baby",
+        "crying/baby_cry",
+        "crying/baby_cry/discomfort",
+        "crying/baby_cry/hungry",
+        "crying/baby_cry/tired",
+    ),
+    "scream": ("yelling/scream", "yelling/agony"),
+    "yelling": ("yelling",),
+    "laughing": ("laughing",),
+    "chuckle": ("laughing",),
+    "clapping": ("other_negative/applause",),
+    "eating": ("objects_activity/eat",),
+    "dishes": (
+        "objects_activity/dishes",
+        "objects_activity/clean-dishes",
+        "objects_activity/plates",
+        "objects_activity/cutlery",
+    ),
+    "chopping": ("objects_activity/chopping",),
+    "frying": ("objects_activity/frying-pan", "objects_activity/frying"),
+    "boiling": ("objects_activity/boiling-water", "other_negative/kettle"),
+    "microwave": ("objects_activity/microwave", "other_negative/microwave"),
+    "blender": ("objects_activity/blender", "objects_activity/juicer"),
+    "tap_water": ("tap_water",),
+    "flushing_water": ("flushing_water",),
+    "shower": ("shower",),
+    "toothbrush": ("bathroom_other/toothbrush",),
+    "hair_dryer": ("bathroom_other/hair_dryer", "bathroom_other/dryer"),
+    "vacuum_cleaner": ("other_negative/vacuum",),
+    "fan": ("other_negative/fan_hum", "objects_activity/stove-fan"),
+    "printer": ("other_negative/printer",),
+    "keyboard": ("objects_activity/keyboard", "other_negative/keyboard"),
+    "clock": ("objects_activity/clock_tick", "other_negative/clock"),
+    "alarm_clock": ("other_negative/alarm_clock",),
+    "smoke_alarm": ("other_negative/fire_alarm",),
+    "siren": ("other_negative/siren",),
+    "fire": ("other_negative/fire_crackling",),
+    "dog": ("other_negative/dog", "other_negative/dog_bark"),
+    "cat": ("other_negative/cat", "other_negative/cat_meow"),
+    "rooster": ("other_negative/rooster",),
+    "rain": ("other_negative/rain",),
+    "waves": ("other_negative/sea_waves",),
+    "car_horn": ("other_negative/car_honk",),
+    "aircraft": ("other_negative/helicopter",),
+    "chainsaw": ("other_negative/chainsaw",),
+    "television": ("television",),
+    "radio": ("television/radio", "television/radio_static?"),
+}
+# Kinds of which a name is neither right nor wrong: they may well hold such sounds.
+LIKE: Mapping[str, tuple[str, ...]] = {
+    "speech": ("television", "speech", "crying", "laughing", "yelling"),
+    "music": ("television", "phone_ring", "other_negative/alarm_clock"),
+    "phone_ring": ("other_negative/alarm_clock",),
+    "door": ("objects_activity/cupboard", "objects_activity/drawer"),
+    "slam": ("other_negative/door",),
+    "cupboard": ("other_negative/door",),
+    "glass": ("objects_activity/bottle", "objects_activity/dishes", "objects_activity/cutlery"),
+    "paper": ("objects_activity/sheets",),
+    "throat_clearing": ("coughing",),
+    "coughing": ("other_negative/clearthroat", "other_negative/throat"),
+    "breathing": ("other_negative/snoring", "other_negative/yawn"),
+    "snoring": ("other_negative/breathing",),
+    "sobbing": ("crying",),
+    "baby_cry": ("crying", "laughing/baby"),
+    "scream": ("yelling", "crying"),
+    "yelling": ("crying",),
+    "clapping": ("laughing/audience", "laughing/canned_audience_laugh"),
+    "dishes": ("objects_activity/dishwasher", "other_negative/dishwasher"),
+    "boiling": ("objects_activity/frying-pan", "objects_activity/frying"),
+    "tap_water": ("flushing_water", "shower", "objects_activity/clean-dishes", "bathroom_other"),
+    "flushing_water": ("tap_water",),
+    "shower": ("tap_water", "bathroom_other/bath", "other_negative/rain"),
+    "vacuum_cleaner": ("bathroom_other/hair_dryer", "bathroom_other/dryer"),
+    "hair_dryer": ("other_negative/vacuum",),
+    "fan": ("silence", "other_negative/air_conditioner_hum", "other_negative/heater"),
+    "alarm_clock": ("phone_ring",),
+    "smoke_alarm": ("other_negative/alarm_clock",),
+    "cat": ("other_negative/cat_imitation",),
+    "rain": ("shower", "tap_water"),
+    "waves": ("other_negative/rain",),
+    "radio": ("television",),
+}
+_LONGEST = round(10 / FRAME_SECONDS)
+_PAUSES = (10, 40, 120)  # frames
+_FLOOR = -70.0  # dBFS
+_FAINTEST = -12.0  # dB, by which a clip is laid fainter
+_THRESHOLDS = np.arange(-3.5, 12.1, 0.5)
+_PRECISION, _FALSE_AN_HOUR = 0.8, 1.0  # of an event
+_CHOSEN = ((0.9, 0.5), (_PRECISION, _FALSE_AN_HOUR))  # with a margin, if it can be had
+_FEWEST = 2  # clips of a name in each half
+_LEAST_RECALL = 0.1
+_EDGE = 10  # frames
+
+
+class Kind(NamedTuple):
+    """A clip, the kind of its sound, and the half that its source is in."""
+
+    clip: LabelledClip
+    kind: str
+    half: int
+
+
+class Laid(NamedTuple):
+    """A clip in a scene: its kind, source, and frames."""
+
+    kind: str
+    source: str
+    first: int
+    end: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the network said of a scene.
+
+    Attributes
+    ----------
+    embeddings : Embeddings
+    laid : sequence of Laid
+    hours : float
+    """
+
+    embeddings: Embeddings
+    laid: Sequence[Laid]
+    hours: float
+
+
+class Counts(NamedTuple):
+    """How often a name was said.
+
+    Attributes
+    ----------
+    clips, heard : int
+        Of its kinds, and those in which it was said.
+    right, wrong : int
+        Times that it was said in them, and where there was nothing of the kind.
+    hours : float
+        Without it.
+    """
+
+    clips: int = 0
+    heard: int = 0
+    right: int = 0
+    wrong: int = 0
+    hours: float = 0.0
+
+    @property
+    def precision(self) -> float:
+        """Share of the times that were right."""
+        return self.right / (self.right + self.wrong) if self.right + self.wrong else math.nan
+
+    @property
+    def recall(self) -> float:
+        """Share of the clips that were heard."""
+        return self.heard / self.clips if self.clips else math.nan
+
+    @property
+    def false_an_hour(self) -> float:
+        """Wrong ones in an hour without it."""
+        return self.wrong / self.hours if self.hours else math.nan
+
+    def good(self, precision: float, false_an_hour: float) -> bool:
+        """Tell whether it is right often enough."""
+        return self.precision >= precision and self.false_an_hour <= false_an_hour
+
+    def __add__(self, other: tuple[object, ...]) -> "Counts":
+        """Count both."""
+        return Counts(*(a + b for a, b in zip(self, other, strict=True)))  # type: ignore[operator]
+
+
+def names(
+    network: Annotated[Path, typer.Argument(help="File of YAMNet.")],
+    manifests: Annotated[list[Path], typer.Argument(help="Clips, with their kinds.")],
+    output: Annotated[Path | None, typer.Option("-o", help="Table to write.")] = None,
+    seeds: Annotated[int, typer.Option(help="Scenes of each half.")] = 2,
+) -> None:
+    """Measure each name, and print the table."""
+    clips = [kind for manifest in manifests for kind in _kinds(manifest)]
+    embedder = Embedder(YAMNET, network)
+    halves = [[one for one in clips if one.half == half] for half in (0, 1)]
+    scenes = [[compose(half, embedder, seed) for seed in range(seeds)] for half in halves]
+    hours = [sum(scene.hours for scene in half) for half in scenes]
+    print(f"{len(clips):,} clips; {hours[0]:.1f} and {hours[1]:.1f} hours of scenes")
+    measured = measure(scenes, embedder.projection)
+    print(table(measured))
+    if output is not None:
+        write_names(measured, output)
+
+
+def _kinds(manifest: Path) -> list[Kind]:
+    """Read the clips of a manifest; its labels are free."""
+    with manifest.open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    return [
+        Kind(
+            LabelledClip(manifest.parent / row["path"], row["label"], row["source_group"], "", ""),
+            f"{row['label']}/{row['detail']}",
+            hashlib.sha256(row["source_group"].encode()).digest()[0] % 2,
+        )
+        for row in rows
+    ]
+
+
+def compose(clips: Sequence[Kind], embedder: Embedder, seed: int) -> Scene:
+    """Lay clips into noise, each once, and ask the network.
+
+    Parameters
+    ----------
+    clips : sequence of Kind
+    embedder : Embedder
+    seed : int
+    """
+    rng = np.random.default_rng(seed)
+    laid: list[Laid] = []
+    parts: list[tuple[int, np.ndarray]] = []
+    place = 40
+    for number in rng.permutation(len(clips)):
+        clip, kind, _ = clips[number]
+        frames = clip_frames(clip)[:_LONGEST] * 10 ** (rng.uniform(_FAINTEST, 0.0) / 20)
+        laid.append(Laid(kind, clip.source_group, place, place + len(frames)))
+        parts.append((place, frames))
+        place += len(frames) + int(rng.choice(_PAUSES)) + int(rng.integers(10))
+    noise = background((place + 1) * FRAME_SECONDS, _FLOOR, "white", seed)
+    sound = noise[: place * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+    for first, frames in parts:
+        sound[first : first + len(frames)] += frames
+    stamps = np.arange(len(sound), dtype=np.int64)
+    embeddings = EmbeddingStream(embedder).push(sound, np.ones(len(sound), bool), 0, stamps)
+    return Scene(embeddings, laid, len(sound) * FRAME_SECONDS / 3600)
+
+
+def count(name: SoundName, sounds: Sequence[NamedSound], scene: Scene) -> Counts:
+    """Count how often a name was right and wrong in a scene.
+
+    Parameters
+    ----------
+    name : SoundName
+    sounds : sequence of NamedSound
+        That were given the name.
+    scene : Scene
+    """
+    right, like = _right_for(name, scene)
+    is_right = [_inside(sound, right) for sound in sounds]
+    wrong = sum(
+        not good and not _inside(sound, [*right, *like])
+        for good, sound in zip(is_right, sounds, strict=True)
+    )
+    heard = sum(
+        any(good and _overlap(sound, each) for good, sound in zip(is_right, sounds, strict=True))
+        for each in right
+    )
+    frames = sum(each.end - each.first for each in {*right, *like})
+    hours = scene.hours - frames * FRAME_SECONDS / 3600
+    return Counts(len(right), heard, sum(is_right), wrong, hours)
+
+
+def _is_of(kind: str, kinds: Sequence[str]) -> bool:
+    return kind in kinds or kind.partition("/")[0] in kinds
+
+
+def _right_for(name: SoundName, scene: Scene) -> tuple[list[Laid], list[Laid]]:
+    """Return the clips that a name is right for, and those of which it may be; short ones may."""
+    right = [each for each in scene.laid if _is_of(each.kind, KINDS.get(name.name, ()))]
+    like = [each for each in scene.laid if _is_of(each.kind, LIKE.get(name.name, ()))]
+    frames = name.windows * HOP_FRAMES
+    short = [each for each in right if each.end - each.first < frames]
+    return [each for each in right if each.end - each.first >= frames], like + short
+
+
+def _inside(sound: NamedSound, clips: Sequence[Laid]) -> bool:
+    """Tell whether half of a sound or more is in clips, give or take half a second."""
+    parts = (_overlap(sound, each, _EDGE) for each in clips)
+    return 2 * sum(part for part in parts if part > 0) >= sound.end - sound.first
+
+
+def _overlap(sound: NamedSound, laid: Laid, edge: int = 0) -> int:
+    return max(0, min(sound.end, laid.end + edge) - max(sound.first, laid.first - edge))
+
+
+def measure(scenes: Sequence[Sequence[Scene]], projection: Projection) -> list[SoundName]:
+    """Choose the threshold of each name on each half, and try it on the other.
+
+    Parameters
+    ----------
+    scenes : sequence of sequence of Scene
+        Of the two halves of the sources.
+    projection : Projection
+    """
+    names = audioset_names()
+    tried = [name._replace(threshold=float(each)) for name in names for each in _THRESHOLDS]
+    sounds: dict[tuple[str, float, Scene], list[NamedSound]] = defaultdict(list)
+    for scene in chain(*scenes):
+        for sound in named_sounds(scene.embeddings, projection, tried):
+            sounds[sound.name.name, sound.name.threshold, scene].append(sound)
+
+    def counts(name: SoundName, half: Sequence[Scene]) -> list[Counts]:
+        totals = []
+        for each in _THRESHOLDS:
+            said = [(sounds[name.name, float(each), scene], scene) for scene in half]
+            totals.append(sum((count(name, *one) for one in said), Counts()))
+        return totals
+
+    return [_measured(name, [counts(name, half) for half in scenes], scenes) for name in names]
+
+
+def _measured(
+    name: SoundName, counts: Sequence[Sequence[Counts]], scenes: Sequence[Sequence[Scene]]
+) -> SoundName:
+    laid = [_right_for(name, half[0])[0] for half in scenes]
+    name = SoundName(*name[: SoundName._fields.index("threshold")])._replace(
+        clips=sum(map(len, laid)), sources=len({each.source for each in chain(*laid)})
+    )
+    if min(map(len, laid)) < _FEWEST:
+        return name
+    first, second = map(_chosen, counts)
+    if first is None or second is None:
+        both = [a + b for a, b in zip(*counts, strict=True)]
+        place = max(range(len(both)), key=lambda place: _f1(both[place]))
+        tried, is_event = both[place], False
+    else:
+        place = max(first, second)
+        tried = counts[0][second] + counts[1][first]
+        is_event = tried.good(_PRECISION, _FALSE_AN_HOUR)
+    return name._replace(
+        threshold=float(_THRESHOLDS[place]),
+        is_event=is_event,
+        precision=round(tried.precision, 2),
+        recall=round(tried.recall, 2),
+        false_an_hour=round(tried.false_an_hour, 1),
+    )
+
+
+def _chosen(counts: Sequence[Counts]) -> int | None:
+    """Return the threshold that hears most of those that are right often enough."""
+    for precision, false_an_hour in _CHOSEN:
+        good = [
+            place
+            for place, each in enumerate(counts)
+            if each.good(precision, false_an_hour) and each.recall >= _LEAST_RECALL
+        ]
+        if good:
+            return max(good, key=lambda place: counts[place].recall)
+    return None
+
+
+def _f1(counts: Counts) -> float:
+    found = counts.precision + counts.recall
+    return 2 * counts.precision * counts.recall / found if found > 0 else 0.0
+
+
+def table(measured: Sequence[SoundName]) -> str:
+    """Make the table of the documentation.
+
+    Parameters
+    ----------
+    measured : sequence of SoundName
+    """
+    head = (
+        "| name | in words | says it | threshold | clips, sources | precision | recall "
+        "| false an hour |\n|---|---|---|---|---|---|---|---|"
+    )
+    rows = sorted(measured, key=lambda name: (not name.is_event, math.isnan(name.precision)))
+    return "\n".join([head, *map(_row, rows)])
+
+
+def _row(name: SoundName) -> str:
+    figures = [f"{each:.2f}" for each in (name.precision, name.recall)]
+    figures.append(f"{name.false_an_hour:.1f}")
+    shown = ["-"] * 3 if math.isnan(name.recall) else figures
+    kind = "event" if name.is_event else "hint"
+    cells = [f"`{name.name}`", name.words, kind, f"{name.threshold:g}"]
+    cells += [f"{name.clips}, {name.sources}", *shown]
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    typer.run(names)
