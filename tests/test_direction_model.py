@@ -134,7 +134,7 @@ def labels_of(model, sound, microphone="mic"):
         if isinstance(event, Gap):
             messages += pipeline.push(event)
         else:
-            part = event.values, event.first, event.stamps, event.directions
+            part = event.values, event.first, event.stamps, event.auxiliary
             messages += pipeline.push_features(*part)
     return [one.data for one in messages if one.topic == f"/{microphone}/label"]
 
@@ -188,8 +188,9 @@ def test_directions_change_labels_of_their_microphone_and_weights_of_zero_change
 def test_after_a_gap_nothing_is_left_of_the_directions_before_it(recorded):
     model, (first, *_) = taking(strong()), [e for e in events(recorded) if isinstance(e, Features)]
     half = first.part(slice(0, 109))  # a burst ends with frame 107
-    elsewhere = np.full(len(half.directions.azimuths), DOOR, np.float32)
-    half = half._replace(directions=half.directions._replace(azimuths=elsewhere))
+    elsewhere = np.full(len(half.auxiliary.directions.azimuths), DOOR, np.float32)
+    directions = half.auxiliary.directions._replace(azimuths=elsewhere)
+    half = half._replace(auxiliary=half.auxiliary._replace(directions=directions))
     gap = Gap(int(first.stamps[109]), int(first.stamps[110]), "lost", 1)
     behind = first.part(slice(110, len(first.stamps)))
     together = labels_of(model, [half, gap, behind])
@@ -205,7 +206,7 @@ def test_a_model_that_takes_over_knows_the_directions_of_the_second_before(recor
     for number, part in enumerate((first.part(slice(0, 118)), first.part(slice(118, None)))):
         if number:
             pipeline.change_model(model, Classifier(model), 118, int(part.stamps[0]))
-        messages += pipeline.push_features(part.values, part.first, part.stamps, part.directions)
+        messages += pipeline.push_features(part.values, part.first, part.stamps, part.auxiliary)
     labels = [one.data for one in messages if one.topic == "/mic/label"]
     assert labels[-100:] == whole[-100:]
     assert labels[105:] == whole[105:]
@@ -220,7 +221,7 @@ def test_states_begin_to_converge_once_a_second_of_directions_is_known(recorded,
     for place in range(60):
         frame = sound.part(slice(place, place + 1))
         floors = Floors(powers[place : place + 1], powers[place : place + 1], converged=True)
-        labeller.push(frame.values, floors, frame.first, frame.stamps, frame.directions)
+        labeller.push(frame.values, floors, frame.first, frame.stamps, frame.auxiliary)
     assert forgotten == [sound.first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)]
 
 
@@ -373,7 +374,7 @@ def test_nothing_is_learned_from_directions_that_no_array_has(recorded, tmp_path
         (lambda _, d: d.update(direction_microphones=["mic", "mic"]), "name one twice"),
         (lambda _, d: d.update(direction_microphones=["a\nb"]), "direction_microphones"),
         (lambda _, d: d.update(format=5), "format: is 5; those with directions are 6"),
-        (lambda _, d: d.update(format=7), "format 7, newer than this version"),
+        (lambda _, d: d.update(format=8), "format 8, newer than this version"),
     ],
 )
 def test_a_hostile_model_is_refused_in_one_line(model_path, tmp_path, change, complaint):
