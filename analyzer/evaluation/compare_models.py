@@ -7,8 +7,12 @@ from itertools import compress
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_model import check_classes, segment_probabilities
-from hearthlog.analyzer.training.dataset import Recording, cut_recordings
+from hearthlog.analyzer.evaluation.evaluate_model import (
+    check_classes,
+    said_of_segments,
+    segment_probabilities,
+)
+from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import (
@@ -22,7 +26,7 @@ from hearthlog.analyzer.training.sightings import evidence_of
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.window_inputs import of_segments
-from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.arrays import Bool, Float32, Float64
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,9 @@ def compare_models(
     target, group = data.target[kept], data.group[kept]
     sightings = list(compress(data.sightings, kept))
     probabilities = [
-        _probabilities(one, i[kept], evidence_of(one, sightings), data.classes)
+        _probabilities(
+            one, i[kept], evidence_of(one, sightings), _said(one, data, kept), data.classes
+        )
         for one, i in zip((first, second), inputs, strict=True)
     ]
     judged = [
@@ -147,8 +153,17 @@ def check_features(a: Model, b: Model) -> None:
         )
 
 
+def _said(classifier: Classifier, data: Dataset, kept: Bool) -> Float64 | None:
+    said = said_of_segments(classifier, data)
+    return None if said is None else said[kept]
+
+
 def _probabilities(
-    classifier: Classifier, inputs: Float32, evidence: Float64 | None, classes: Sequence[str]
+    classifier: Classifier,
+    inputs: Float32,
+    evidence: Float64 | None,
+    said: Float64 | None,
+    classes: Sequence[str],
 ) -> Float64:
     order = [classifier.classes.index(name) for name in classes]
-    return segment_probabilities(classifier, inputs, evidence)[:, order]
+    return segment_probabilities(classifier, inputs, evidence, said)[:, order]

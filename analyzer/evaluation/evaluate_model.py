@@ -7,22 +7,37 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
+from hearthlog.analyzer.training.clip_embeddings import AS_IT_IS
 from hearthlog.analyzer.training.cross_validation import softmax
-from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
+from hearthlog.analyzer.training.dataset import (
+    Dataset,
+    Recording,
+    clip_recordings,
+    cut_recordings,
+)
+from hearthlog.analyzer.training.installed import model_embedder
 from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of
 from hearthlog.analyzer.training.rooms import captured, steady_noise
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding.embeddings import (
+    HOP_FRAMES,
+    NO_EMBEDDINGS,
+    WINDOW_FRAMES,
+    Embeddings,
+)
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
+from hearthlog.schemas.messages.topics import EmbeddingSource
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -66,8 +81,9 @@ def evaluate_model(
     """
     scenario = fitted(scenario, model)
     classifier = Classifier(model)
-    features, listener = classifier.feature_set, _Listener(classifier)
-    recordings = clip_recordings(clips, scenario, progress, features)
+    features, embedder = classifier.feature_set, model_embedder(model)
+    listener = _Listener(classifier, None if embedder is None else embedder.source)
+    recordings = clip_recordings(clips, scenario, progress, features, embedder=embedder)
     data = cut_recordings(listener.overhear(recordings, scenario), scenario, features)
     if not len(data):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
@@ -75,7 +91,9 @@ def evaluate_model(
             f"no clip has a segment to test on ({reasons[:300]}{example_of(data.left_out)})"
         )
     probabilities = segment_probabilities(
-        classifier, of_segments(classifier.inputs, data.windows, data.floor)
+        classifier,
+        of_segments(classifier.inputs, data.windows, data.floor),
+        said=said_of_segments(classifier, data),
     )
     scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
     return ModelEvaluation(
@@ -137,8 +155,33 @@ def check_classes(model: Model, scenario: Scenario) -> None:
         )
 
 
+def said_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
+    """Return what the heads of a classifier say of segments, as `Classifier.classify` takes it.
+
+    Parameters
+    ----------
+    classifier : Classifier
+    data : Dataset
+        Of n segments.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64, or None
+        NaN of segments without an embedding; None without heads.
+    """
+    heads = classifier.embedding_heads
+    if heads is None or not data.is_embedded.any():
+        return None
+    said = np.full((len(data), len(classifier.classes)), np.nan)
+    said[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
+    return said
+
+
 def segment_probabilities(
-    classifier: Classifier, inputs: Float32, evidence: Float64 | None = None
+    classifier: Classifier,
+    inputs: Float32,
+    evidence: Float64 | None = None,
+    said: Float64 | None = None,
 ) -> Float64:
     """Compute the probability of each class in each segment, by all windows in it.
 
@@ -147,8 +190,8 @@ def segment_probabilities(
     classifier : Classifier
     inputs : np.ndarray [shape=(n, places, width)], float32
         As of `of_segments`.
-    evidence : np.ndarray [shape=(n, C)], float64, optional
-        As of `Classifier.classify`.
+    evidence, said : np.ndarray [shape=(n, C)], float64, optional
+        As of `Classifier.classify`: of directions, and of heads.
 
     Returns
     -------
@@ -157,7 +200,9 @@ def segment_probabilities(
     """
     if evidence is not None:
         evidence = evidence.repeat(inputs.shape[1], axis=0)
-    rows, _ = classifier.classify(inputs.reshape(-1, inputs.shape[-1]), evidence)
+    if said is not None:
+        said = said.repeat(inputs.shape[1], axis=0)
+    rows, _ = classifier.classify(inputs.reshape(-1, inputs.shape[-1]), evidence, said)
     logarithms = np.log(np.maximum(rows, _LEAST, dtype=np.float64))
     return softmax(logarithms.reshape(*inputs.shape[:2], -1).mean(axis=1))
 
@@ -174,8 +219,9 @@ class _Listener:
         Time of the recordings and of the room, in nanoseconds.
     """
 
-    def __init__(self, classifier: Classifier) -> None:
+    def __init__(self, classifier: Classifier, source: EmbeddingSource | None) -> None:
         self.duration = 0
+        self._source = source
         self._classifier = classifier
         self._silence, self._room = -1, _quiet_room(classifier.feature_set)
         if SILENCE in classifier.classes:
@@ -203,8 +249,10 @@ class _Listener:
         end = length - begin
         if begin == end:
             return
-        labeller, floors = Labeller(self._classifier), self._floors(recording, len(features))
-        segments = [*labeller.push(features, floors, 0, stamps)[1], *labeller.close(length)]
+        labeller = Labeller(self._classifier, embedding=self._source)
+        floors, heard = self._floors(recording, len(features)), self._heard(recording, stamps)
+        pushed = labeller.push(features, floors, 0, stamps, Auxiliary(embeddings=heard))[1]
+        segments = [*pushed, *labeller.close(length)]
         self._add(self._reference, begin, end, self._classifier.classes.index(label))
         for one in segments:
             if one.label == self._silence:
@@ -217,6 +265,16 @@ class _Listener:
     def _add(self, events: list[tuple[int, int, int]], start: int, end: int, label: int) -> None:
         if start < end:
             events.append((self._place + start, self._place + end, label))
+
+    def _heard(self, recording: Recording, stamps: Int64) -> Embeddings:
+        """Return what a network hears of a recording, at the frames of the room around it."""
+        if recording.embedded is None or self._source is None:
+            return NO_EMBEDDINGS
+        windows = recording.embedded
+        frames = windows.starts + len(self._room)
+        fit = (windows.version == AS_IT_IS) & (frames % HOP_FRAMES == 0) & (frames >= 0)
+        fit &= frames + WINDOW_FRAMES <= len(stamps)
+        return Embeddings(frames[fit], stamps[frames[fit]], windows.values[fit])
 
     def _floors(self, recording: Recording, frames: int) -> Floors | None:
         """Return the floor of the room in a recording at each of some frames."""

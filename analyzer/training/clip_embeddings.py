@@ -13,6 +13,7 @@ from hearthlog.analyzer.training.rooms import other_room, steady_noise
 from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Int8
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.messages.topics import EmbeddingSource
 
 AS_IT_IS, IN_A_ROOM, SHORT = 0, 1, 2  # versions of windows
 
@@ -91,10 +92,16 @@ class ClipEmbedder:
     ----------
     embed : callable
         Turns a window into integers.
+
+    Attributes
+    ----------
+    source : EmbeddingSource or None
+        The network and the projection, if it is one.
     """
 
     def __init__(self, embed: Embeds) -> None:
         self._embed = embed
+        self.source: EmbeddingSource | None = getattr(embed, "source", None)
         self._done: dict[bytes, ClipEmbeddings] = {}
 
     def __call__(self, frames: Float32, segments: Indices, *, silence: bool) -> ClipEmbeddings:

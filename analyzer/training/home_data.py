@@ -14,6 +14,7 @@ from hearthlog.analyzer.training.dataset import Recording, spread
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.sightings import sighting_of
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classifiers.description import EmbeddingMix
 from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
@@ -31,7 +32,10 @@ HOME = "this home"
 
 
 def home_recordings(
-    folder: Path, features: FeatureSet = DEFAULT, gate: float = 0.0
+    folder: Path,
+    features: FeatureSet = DEFAULT,
+    gate: float = 0.0,
+    mix: EmbeddingMix | None = None,
 ) -> Iterator[Recording]:
     """Read the features of all marks in the logs of a folder.
 
@@ -43,6 +47,8 @@ def home_recordings(
         Marks in logs of another set give recordings without features.
     gate : float
         As of `marked_recordings`.
+    mix : EmbeddingMix, optional
+        As of `read_reviewed_sound`.
 
     Yields
     ------
@@ -56,7 +62,7 @@ def home_recordings(
     DataError
         If there are marks, and all of them are in logs of other sets.
     """
-    sounds = read_reviewed_sound(folder, features)
+    sounds = read_reviewed_sound(folder, features, mix=mix)
     for recording in marked_recordings(sounds, folder, features, gate):
         yield recording._replace(most=None)
 

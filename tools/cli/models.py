@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.scenario import Scenario
     from hearthlog.models.classifiers.model import Model
-    from hearthlog.models.features.feature_set import FeatureSet
     from hearthlog.models.modelfile.registry import ModelEntry
 
 models = typer.Typer(
@@ -108,7 +107,6 @@ def compare(
     from hearthlog.analyzer.evaluation.compare_models import check_features, compare_models
     from hearthlog.analyzer.training.manifest import left_out_lines
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
-    from hearthlog.models.features.installed import feature_set
 
     if live:
         if data or scenario or (a, b) != ("champion", "candidate"):
@@ -121,9 +119,9 @@ def compare(
     first, second = _named(place, a), _named(place, b)
     check_features(first, second)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
-    features = feature_set(first.description.feature_set)
     left_out: list[LeftOut] = []
-    recordings = _recordings(data, logs, chosen, features, left_out)
+    heard = next((one for one in (first, second) if one.description.embedding), first)
+    recordings = _recordings(data, logs, chosen, heard, left_out)
     if logs is not None and not recordings:
         tell("nothing is marked: it is said how the models differ, not which is better")
         shares = _minutes_in_logs(first, second, logs)
@@ -264,20 +262,25 @@ def _recordings(
     data: Path | None,
     logs: Path | None,
     scenario: "Scenario",
-    features: "FeatureSet",
+    model: "Model",
     left_out: "list[LeftOut]",
 ) -> "list[Recording]":
     from hearthlog.analyzer.training.dataset import UNREADABLE, clip_recordings
     from hearthlog.analyzer.training.home_data import home_recordings
+    from hearthlog.analyzer.training.installed import model_embedder
     from hearthlog.analyzer.training.manifest import LeftOut
+    from hearthlog.models.features.installed import feature_set
     from hearthlog.tools.cli.progress import share_done
 
+    features = feature_set(model.description.feature_set)
     if logs is not None:
-        return list(home_recordings(logs, features))
+        return list(home_recordings(logs, features, mix=model.description.embedding))
     assert data is not None
     clips = labelled_clips([data], scenario.labels, left_out)
     with share_done(f"listening to {len(clips)} clips") as report:
-        recordings = list(clip_recordings(clips, scenario, report, features))
+        recordings = list(
+            clip_recordings(clips, scenario, report, features, embedder=model_embedder(model))
+        )
     left_out += [LeftOut(UNREADABLE, each.fault) for each in recordings if each.fault]
     return recordings
 

@@ -239,17 +239,28 @@ def scenario_files(given: list[str] | None) -> dict[str, Path]:
 def chosen_method(name: str | None, **parameters: float | None) -> "Method":
     """Return a way to learn, with other parameters where they are given; by default the best."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.training.installed import default_method, method_named
+    from hearthlog.analyzer.training.installed import method_named
 
     chosen = {key: value for key, value in parameters.items() if value is not None}
     for key, value in chosen.items():
         if not 0 < value < float("inf"):
             wrong_use(f"--{key} {value:g}: it must be more than 0")
     try:
-        method = default_method() if name is None else method_named(name)
+        method = _best_method() if name is None else method_named(name)
         return method.with_parameters(chosen)
     except DataError as error:
         wrong_use(str(error))
+
+
+def _best_method() -> "Method":
+    """Return the default way to learn; a home whose recorder wants no network needs none."""
+    from hearthlog.analyzer.training.installed import DEFAULT, default_method
+    from hearthlog.recorder.config import load_settings
+    from hearthlog.recorder.embedder_probe import NO_NETWORK
+
+    if load_settings(None, {}, {}).embedding == NO_NETWORK:
+        return DEFAULT
+    return default_method()
 
 
 def reviewer_name(option: str | None) -> str:

@@ -9,6 +9,7 @@ from hearthlog.analyzer.training.installed import (
     clip_embedder,
     default_method,
     method_named,
+    model_embedder,
 )
 from hearthlog.analyzer.training.manifest import LeftOut, left_out_lines, read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
@@ -114,7 +115,8 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
     left_out: list[LeftOut] = []
     clips = read_manifest(Path(manifest), scenario.labels, left_out)
     features = feature_set(a.description.feature_set)
-    recordings = list(clip_recordings(clips, scenario, ignore_progress, features))
+    heard = model_embedder(a) or model_embedder(b)
+    recordings = list(clip_recordings(clips, scenario, ignore_progress, features, embedder=heard))
     left_out += [LeftOut(UNREADABLE, each.fault) for each in recordings if each.fault]
     for line in left_out_lines(left_out):
         warnings.warn(line, stacklevel=2)
