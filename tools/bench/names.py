@@ -15,6 +15,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -156,9 +157,9 @@ _FLOOR = -70.0  # dBFS
 _FAINTEST = -12.0  # dB, by which a clip is laid fainter
 _THRESHOLDS = np.arange(-3.5, 12.1, 0.5)
 _PRECISION, _FALSE_AN_HOUR = 0.8, 1.0  # of an event
-_CHOSEN = ((0.9, 0.5), (_PRECISION, _FALSE_AN_HOUR))  # with a margin, if it can be had
+_MARGIN = 1  # thresholds that the chosen one is above the lowest that would do
 _FEWEST = 2  # clips of a name in each half
-_LEAST_RECALL = 0.1
+_LEAST_RECALL = 0.2
 _EDGE = 10  # frames
 
 
@@ -229,13 +230,21 @@ class Counts(NamedTuple):
         """Wrong ones in an hour without it."""
         return self.wrong / self.hours if self.hours else math.nan
 
-    def good(self, precision: float, false_an_hour: float) -> bool:
-        """Tell whether it is right often enough."""
-        return self.precision >= precision and self.false_an_hour <= false_an_hour
+    @property
+    def good(self) -> bool:
+        """Whether it is heard, and right often enough, to be an event."""
+        right = self.precision >= _PRECISION and self.false_an_hour <= _FALSE_AN_HOUR
+        return right and self.recall >= _LEAST_RECALL
 
-    def __add__(self, other: tuple[object, ...]) -> "Counts":
+    def plus(self, other: "Counts") -> "Counts":
         """Count both."""
-        return Counts(*(a + b for a, b in zip(self, other, strict=True)))  # type: ignore[operator]
+        return Counts(
+            self.clips + other.clips,
+            self.heard + other.heard,
+            self.right + other.right,
+            self.wrong + other.wrong,
+            self.hours + other.hours,
+        )
 
 
 def names(
@@ -367,7 +376,7 @@ def measure(scenes: Sequence[Sequence[Scene]], projection: Projection) -> list[S
         totals = []
         for each in _THRESHOLDS:
             said = [(sounds[name.name, float(each), scene], scene) for scene in half]
-            totals.append(sum((count(name, *one) for one in said), Counts()))
+            totals.append(reduce(Counts.plus, (count(name, *one) for one in said)))
         return totals
 
     return [_measured(name, [counts(name, half) for half in scenes], scenes) for name in names]
@@ -377,20 +386,26 @@ def _measured(
     name: SoundName, counts: Sequence[Sequence[Counts]], scenes: Sequence[Sequence[Scene]]
 ) -> SoundName:
     laid = [_right_for(name, half[0])[0] for half in scenes]
-    name = SoundName(*name[: SoundName._fields.index("threshold")])._replace(
-        clips=sum(map(len, laid)), sources=len({each.source for each in chain(*laid)})
+    name = SoundName(
+        name.name,
+        name.words,
+        name.group,
+        name.seconds,
+        name.windows,
+        clips=sum(map(len, laid)),
+        sources=len({each.source for each in chain(*laid)}),
     )
     if min(map(len, laid)) < _FEWEST:
         return name
     first, second = map(_chosen, counts)
     if first is None or second is None:
-        both = [a + b for a, b in zip(*counts, strict=True)]
+        both = [a.plus(b) for a, b in zip(*counts, strict=True)]
         place = max(range(len(both)), key=lambda place: _f1(both[place]))
         tried, is_event = both[place], False
     else:
         place = max(first, second)
-        tried = counts[0][second] + counts[1][first]
-        is_event = tried.good(_PRECISION, _FALSE_AN_HOUR)
+        tried = counts[0][second].plus(counts[1][first])
+        is_event = tried.good
     return name._replace(
         threshold=float(_THRESHOLDS[place]),
         is_event=is_event,
@@ -401,16 +416,11 @@ def _measured(
 
 
 def _chosen(counts: Sequence[Counts]) -> int | None:
-    """Return the threshold that hears most of those that are right often enough."""
-    for precision, false_an_hour in _CHOSEN:
-        good = [
-            place
-            for place, each in enumerate(counts)
-            if each.good(precision, false_an_hour) and each.recall >= _LEAST_RECALL
-        ]
-        if good:
-            return max(good, key=lambda place: counts[place].recall)
-    return None
+    """Return the threshold a step above the one that hears most of those that would do."""
+    good = [place for place, each in enumerate(counts) if each.good]
+    if not good:
+        return None
+    return min(max(good, key=lambda place: counts[place].recall) + _MARGIN, len(counts) - 1)
 
 
 def _f1(counts: Counts) -> float:
