@@ -12,7 +12,7 @@ names'.
 import csv
 import hashlib
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -164,11 +164,10 @@ _EDGE = 10  # frames
 
 
 class Kind(NamedTuple):
-    """A clip, the kind of its sound, and the half that its source is in."""
+    """A clip, and the kind of its sound."""
 
     clip: LabelledClip
     kind: str
-    half: int
 
 
 class Laid(NamedTuple):
@@ -254,30 +253,45 @@ def names(
     seeds: Annotated[int, typer.Option(help="Scenes of each half.")] = 2,
 ) -> None:
     """Measure each name, and print the table."""
-    clips = [kind for manifest in manifests for kind in _kinds(manifest)]
+    halves = read_halves(manifests)
     embedder = Embedder(YAMNET, network)
-    halves = [[one for one in clips if one.half == half] for half in (0, 1)]
     scenes = [[compose(half, embedder, seed) for seed in range(seeds)] for half in halves]
     hours = [sum(scene.hours for scene in half) for half in scenes]
-    print(f"{len(clips):,} clips; {hours[0]:.1f} and {hours[1]:.1f} hours of scenes")
+    print(f"{sum(map(len, halves)):,} clips; {hours[0]:.1f} and {hours[1]:.1f} hours of scenes")
     measured = measure(scenes, embedder.projection)
     print(table(measured))
     if output is not None:
         write_names(measured, output)
 
 
-def _kinds(manifest: Path) -> list[Kind]:
-    """Read the clips of a manifest; its labels are free."""
-    with manifest.open(newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    return [
-        Kind(
-            LabelledClip(manifest.parent / row["path"], row["label"], row["source_group"], "", ""),
-            f"{row['label']}/{row['detail']}",
-            hashlib.sha256(row["source_group"].encode()).digest()[0] % 2,
-        )
-        for row in rows
-    ]
+def read_halves(manifests: Sequence[Path]) -> list[list[Kind]]:
+    """Read the clips of manifests, whose labels are free, in halves with as many of each kind.
+
+    Parameters
+    ----------
+    manifests : sequence of Path
+
+    Returns
+    -------
+    list of list of Kind
+        The two halves; no source is in both.
+    """
+    of_source: dict[str, list[Kind]] = defaultdict(list)
+    for manifest in manifests:
+        with manifest.open(newline="", encoding="utf-8") as stream:
+            for row in csv.DictReader(stream):
+                path, source = manifest.parent / row["path"], row["source_group"]
+                clip = LabelledClip(path, row["label"], source, "", "")
+                of_source[source].append(Kind(clip, f"{row['label']}/{row['detail']}"))
+    halves: list[list[Kind]] = [[], []]
+    counts: tuple[Counter[str], Counter[str]] = Counter(), Counter()
+    for source in sorted(of_source, key=lambda source: hashlib.sha256(source.encode()).digest()):
+        clips = of_source[source]
+        more = [sum(counts[half][clip.kind] for clip in clips) for half in (0, 1)]
+        half = int(more[1] < more[0])
+        halves[half] += clips
+        counts[half].update(clip.kind for clip in clips)
+    return halves
 
 
 def compose(clips: Sequence[Kind], embedder: Embedder, seed: int) -> Scene:
@@ -294,7 +308,7 @@ def compose(clips: Sequence[Kind], embedder: Embedder, seed: int) -> Scene:
     parts: list[tuple[int, np.ndarray]] = []
     place = 40
     for number in rng.permutation(len(clips)):
-        clip, kind, _ = clips[number]
+        clip, kind = clips[number]
         frames = clip_frames(clip)[:_LONGEST] * 10 ** (rng.uniform(_FAINTEST, 0.0) / 20)
         laid.append(Laid(kind, clip.source_group, place, place + len(frames)))
         parts.append((place, frames))
