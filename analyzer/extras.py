@@ -17,6 +17,7 @@ _EXTRAS = {
     "rerun": "viewer",
     "rerun_cli": "viewer",
     "foxglove": "foxglove",
+    "ai_edge_litert": "embedding",
     "onnx": "onnx",
     "onnxruntime": "onnx",
     "paho": "bridge",
@@ -24,6 +25,7 @@ _EXTRAS = {
     "prometheus_client": "bridge",
 } | dict.fromkeys(_CLUSTER, "cluster")
 _NAMES = {"sklearn": "scikit-learn", "paho": "paho-mqtt", "rerun": "Rerun", "rerun_cli": "Rerun"}
+_NAMES["ai_edge_litert"] = "LiteRT"
 
 
 class MissingModuleError(HearthlogError, ModuleNotFoundError):

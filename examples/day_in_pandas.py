@@ -2,9 +2,12 @@
 
 import sys
 
-import pandas as pd
-
 import hearthlog
+
+try:
+    import pandas as pd
+except ModuleNotFoundError as error:
+    sys.exit(f"{error}; try, in the clone of hearthlog: pip install '.[headless]'")
 
 
 def main(path: str, day: str, zone: str = "UTC") -> None:

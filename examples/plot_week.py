@@ -2,10 +2,14 @@
 
 import sys
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 import hearthlog
+
+try:
+    import matplotlib.pyplot as plt
+except ModuleNotFoundError as error:
+    sys.exit(f"{error}; try, in the clone of hearthlog: pip install '.[headless]'")
 
 DAY = 86_400 * 1_000_000_000  # nanoseconds, of UTC
 

@@ -169,6 +169,13 @@ class Settings(BaseModel):
     feature_set: str = Field(
         default="", examples=["home33"], description="Empty: that of the model, or the default one."
     )
+    embedding: str = Field(
+        default="",
+        max_length=64,
+        examples=["yamnet"],
+        description="Network of sounds that listens too, which `hearthlog models fetch` brings; "
+        "none: no network. Empty: yamnet if it is there.",
+    )
     microphone: list[MicrophoneSettings] = Field(
         default=[MicrophoneSettings()],
         min_length=1,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import partial
 from threading import Event as Flag
 
-from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
-from hearthlog.models.errors import ModelError
+from hearthlog.models.embedding.networks import Embedder
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.embedder_probe import check_network, open_embedder
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
@@ -183,6 +183,7 @@ def recording_problems(settings: Settings) -> list[HearthlogError]:
                     settings, sources, open_models(settings, list(sources), None, stack)
                 )
             )
+    check(partial(check_network, settings.embedding, len(settings.microphone)))
     check(partial(check_writable, settings.output))
     return list(problems.values())
 
@@ -249,14 +250,12 @@ def record(
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 
 
-def _embedder() -> Embedder | None:
-    """Return the network of sounds that is there, if it can be used."""
-    path = find_network(YAMNET.name)
-    try:
-        return None if path is None else load_embedder(YAMNET.name, path)
-    except ModelError as error:
-        say(str(error))
-        return None
+def _embedder(settings: Settings, microphones: int) -> Embedder | None:
+    """Return the network of sounds, if there is one; say why it is not used."""
+    embedder, why = open_embedder(settings.embedding, microphones)
+    if why:
+        say(why)
+    return embedder
 
 
 def _record(  # noqa: PLR0913, PLR0917
@@ -271,7 +270,8 @@ def _record(  # noqa: PLR0913, PLR0917
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
         models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
-        session = RecordingSession(settings, sources, models, lock, state, _embedder())
+        embedder = _embedder(settings, len(sources))
+        session = RecordingSession(settings, sources, models, lock, state, embedder)
         manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):

@@ -51,6 +51,7 @@ __all__ = [
 _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
 _CLIPS = Path(__file__).parent / "data" / "household"
 os.environ["HEARTHLOG_MODEL"] = "none"  # unless a test names one
+os.environ["HEARTHLOG_EMBEDDING"] = "none"  # whatever networks this machine has
 HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 
 

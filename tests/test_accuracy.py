@@ -333,6 +333,48 @@ def test_coughs_beside_a_television_are_counted_apart(tmp_path):
     assert day.beside_television("speech") == 0
 
 
+def test_the_page_says_of_a_night_what_its_table_counts(tmp_path):
+    talking = [(at("02:00") + 20 * i, 15, "speech", 0.9) for i in range(60)]
+    coughs = [(at(t), 2, "coughing", 0.9) for t in ("02:05:16", "02:15:16", "05:00:00")]
+    logs = write_day(tmp_path / "home", DAY, [*talking, *coughs])
+    for minute in (5, 6, 7, 8, 9, 50):
+        check(logs, at(f"02:{minute:02}"))
+    make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), tmp_path / "day.html")
+    text = (tmp_path / "day.html").read_text()
+    assert "Coughing as labelled: 1 from 05:00. 0.1 an hour." in text
+    assert "bouts of coughing 2, as labelled. In how long they are." in text
+    assert "Coughing, crying, laughing and shouting are left out of 5 of these minutes" in text
+    assert "Counts over 3 days, up to this one (1 of them heard)" in text
+    assert "Most of the sound, as labelled: talking." in text
+    lines = list(Accuracy(find_home_logs([tmp_path / "home"])).lines())
+    assert lines[2].startswith("coughing, crying, laughing and shouting are left out of 5 of these")
+    assert "coughing right" not in lines[0]
+
+
+def test_a_day_of_which_little_was_heard_is_said_to_be_heard_in_part(tmp_path):
+    write_day(tmp_path / "home", DAY, [(at("08:00"), 120, "speech", 0.9)])
+    write_day(tmp_path / "home", DAY - timedelta(days=1), hours=[22, 23])
+    make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), tmp_path / "day.html")
+    assert "(2 of them heard, 1 only in part)" in (tmp_path / "day.html").read_text()
+
+
+def test_neither_quiet_nor_what_a_model_does_not_know_is_said_to_be_right_or_wrong(tmp_path):
+    sounds = [(at(f"{h:02}:00:05"), 2, "unknown", 0.9) for h in range(8, 20)]
+    logs = write_day(tmp_path / "home", DAY, sounds)
+    for hour in range(8, 14):
+        check(logs, at(f"{hour:02}:00"), [(5, 7, "speech")])
+    make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), tmp_path / "day.html")
+    text = (tmp_path / "day.html").read_text()
+    assert re.findall(r">(Not sure|Quiet)</th>.*<td>([^<]*)</td></tr>", text) == [
+        ("Not sure", ""),
+        ("Quiet", ""),
+    ]
+    lines = list(Accuracy(find_home_logs([tmp_path / "home"])).lines())
+    assert (
+        lines[0] == "checked here, 6 minutes drawn at random: talking missed 6 of 6 (74 to 100 %)"
+    )
+
+
 def test_what_a_person_has_gone_through_is_certain_in_parts_of_minutes_too(tmp_path):
     coughs = [(at(f"{h:02}:00:{s:02}"), 2, "coughing", 0.9) for h in range(8, 20) for s in (5, 40)]
     logs = write_day(tmp_path, DAY, coughs)

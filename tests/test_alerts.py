@@ -544,9 +544,11 @@ def test_a_replay_says_that_no_model_knows_the_class_of_a_rule(two_days, hearthl
     (tmp_path / "home.toml").write_text(CONFIG.replace("coughing", "couhging"))
     options = ["--config", tmp_path / "home.toml"]
     done = hearthlog("alerts", "replay", two_days / "logs", *options)
-    assert done.stderr == (
-        "hearthlog: coughs: no model here knows the class 'couhging', so that it cannot be heard\n"
+    assert done.stderr.startswith(
+        "hearthlog: coughs: no model here knows the class 'couhging', so that it cannot be heard; "
+        "there are "
     )
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("table", ["", '[[microphone]]\nname = "kitchen"\n'])
@@ -575,9 +577,10 @@ def test_a_bridge_says_that_no_model_knows_the_class_of_a_rule(tmp_path, monkeyp
                 time.sleep(0.1)
     finally:
         recorder.close()
-    assert {*said} == {
-        "alerts: wrong: no model here knows the class 'couhging', so that it cannot be heard"
-    }
+    (line,) = {*said}
+    assert line.startswith(
+        "alerts: wrong: no model here knows the class 'couhging', so that it cannot be heard; there"
+    )
 
 
 def test_a_replay_goes_by_the_time_zone_of_the_configuration_before_that_of_the_logs(

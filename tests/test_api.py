@@ -254,6 +254,21 @@ def test_a_package_that_is_missing_is_named(method, module, folder, monkeypatch)
     assert isinstance(it.value, ModuleNotFoundError)  # as it was said once
 
 
+def test_learning_without_its_packages_names_them():
+    code = """if True:
+        import sys
+        sys.modules["sklearn"] = None
+        import hearthlog
+        try:
+            hearthlog.train
+        except hearthlog.HearthlogError as error:
+            print(error)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert re.fullmatch(r"scikit-learn is not installed; try: .*\[headless\].*\n", done.stdout)
+    assert done.stderr == ""
+
+
 def test_a_damaged_log_is_left_out_of_the_segments_with_a_warning(day, model_file, tmp_path):
     make_logs(tmp_path / "logs", model_file, [day], max_bag_duration=60)
     (first, *_) = find_logs(tmp_path / "logs")

@@ -77,6 +77,7 @@ NEEDS = {
     "bridge": ("bridge logs --config broker.toml",),
 }
 EITHER = ("devices", "voices")  # there may be no microphone, and too little speech
+WRONG = "bridge nowhere/logs"
 FILES = {
     "rules.toml": '[[bridge.alert]]\nname = "cough"\nrule = "more_than"\nclass = "coughing"\n'
     'count = 1\nwindow = "1h"\n',
@@ -145,7 +146,7 @@ def done(tmp_path_factory):
             sound, rate = soundfile.read(path)
             parts += [sound, np.random.default_rng(0).normal(0, 1e-3, 4 * rate)]
     soundfile.write(folder / "evening.flac", np.concatenate(parts), rate)
-    commands = [*RUNS, *(command for group in NEEDS.values() for command in group), *EITHER]
+    commands = [*RUNS, *(command for group in NEEDS.values() for command in group), *EITHER, WRONG]
     own = {
         "PATH": f"{folder / 'bin'}:{os.environ['PATH']}",
         "HOME": str(folder),
@@ -185,6 +186,12 @@ def test_what_it_lacks_is_named_with_the_command_that_installs_it_before_anythin
     assert re.match(r"hearthlog: \w[\w, -]+ not installed; try: ", line)
     assert "install" in line
     assert f"[{extra}]'" in line
+
+
+def test_a_bridge_that_is_told_nothing_leaves_nothing_behind(done):
+    status, out, err, made = done[WRONG]
+    assert (status, out, made) == (2, "", [])
+    assert err.startswith("hearthlog: no --config is given: ")
 
 
 @pytest.mark.parametrize("command", EITHER)

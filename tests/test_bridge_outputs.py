@@ -85,7 +85,7 @@ def test_a_table_that_contradicts_itself_closes_its_own_output_alone(home, tmp_p
             broker.accept()
     assert said[0].startswith(line)
     assert said[0].endswith("; trying again")
-    problems, _ = output_problems(settings, [])
+    problems, _ = output_problems(settings)
     assert any(each.startswith(line) for each in problems)
 
 
@@ -106,7 +106,7 @@ def test_a_text_file_that_cannot_be_looked_at_is_no_reason_to_refuse_the_configu
     (tmp_path / "file").touch()
     file = tmp_path / name
     settings = BridgeSettings.model_validate({"prometheus": {"text_file": file}})
-    (line,), _ = output_problems(settings, [])
+    (line,), _ = output_problems(settings)
     assert problem.format(file) in line
     said = []
     with_readers = settings.prometheus.model_copy(update={"readable_by": "all"})

@@ -64,7 +64,7 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     minutes = figures["segment_minutes"]["hall"].values()
     assert sum(minutes) == pytest.approx(3, abs=0.1)
     assert re.findall(r"([\d.]+) min", heard) == [f"{each:.1f}" for each in minutes]
-    assert heard.startswith("hall heard (how often): ")
+    assert heard.startswith("hall heard, as labelled (segments): ")
     rattles = figures["segments"]["hall"]["objects_activity"]
     assert re.search(rf"household sounds [\d.]+ min \({rattles}\)", heard)
     amounts = figures["unsure"]["hall"]

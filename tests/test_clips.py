@@ -82,7 +82,9 @@ def push(finder, first, private, unlabelled=0, blocks=(7, 20, 1)):
 def labels_of(probabilities, novelty, *, elsewhere=False):
     frames = np.arange(len(novelty))
     stamps = START + frames * FRAME_NANOSECONDS
-    return FrameLabels(CLASSES, frames, stamps, stamps, probabilities, novelty, elsewhere)
+    return FrameLabels(
+        CLASSES, frames, stamps, stamps, probabilities, probabilities, novelty, elsewhere
+    )
 
 
 def numbers_of(sounds):

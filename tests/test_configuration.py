@@ -2,9 +2,12 @@
 
 import json
 import re
+import sys
 import tomllib
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from shutil import copyfile
 from typing import get_args
 
 import pytest
@@ -21,6 +24,7 @@ from hearthlog.analyzer.bridge.settings import (
     PrometheusSettings,
     load_bridge_settings,
 )
+from hearthlog.models.starter import BATHROOM, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.config_origins import key_lines
 from hearthlog.recorder.disk.keeping import keep_disk
@@ -355,6 +359,7 @@ count = 3
 window = "1h"
 microphone = "kitchn"
 """
+DAILY = "[bridge.mqtt]\nhost = 'x'\n[[bridge.alert]]\nname = 'a'\n"
 
 
 @pytest.mark.parametrize(
@@ -385,6 +390,36 @@ microphone = "kitchn"
             3,
             "a: there is no microphone 'kitchn', so that it hears nothing; there is mic",
         ),
+        (
+            ALERT.replace("kitchn", "mic"),
+            3,
+            "a: the microphone 'mic' has no model, so that no sound of it has a class",
+        ),
+        (
+            "[bridge.prometheus]\ntext_file = '/tmp/home.txt'\n",
+            3,
+            'home.txt does not end in .prom, so that node_exporter does not read it; write "/tmp/h',
+        ),
+        (
+            ALERT.replace("count = 3", "minutes = 60"),
+            3,
+            "a: there cannot be more than 60 minutes in a window of 1 h, so that it never rings",
+        ),
+        (
+            ALERT.replace("count = 3", "count = 362"),
+            3,
+            "a: there cannot be more than 362 events in a window of 1 h, so that it never rings",
+        ),
+        (
+            f"retention_days = 8\n{DAILY}rule = 'unlike_usual'\n",
+            3,
+            "a: retention_days = 8 leaves it no 7 days to compare with, so that it never rings; ke",
+        ),
+        (
+            f"retention_days = 15\n{DAILY}rule = 'unusual_day'\n",
+            3,
+            "days to compare with, so that it never rings; keep 16 or more",
+        ),
     ],
 )
 def test_what_the_bridge_could_not_tell_of_is_named_before_it_starts(
@@ -395,6 +430,73 @@ def test_what_the_bridge_could_not_tell_of_is_named_before_it_starts(
     result = hearthlog("config", "check", file)
     assert result.returncode == status
     assert words in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (
+            "coughng",
+            "a: no model here knows the class 'coughng', so that it cannot be heard; there",
+        ),
+        (
+            "silent cough",
+            "there are coughing, music, objects_activity, phone_ring, speech, unknown",
+        ),
+        ("cough", ""),
+        ("tap_water", ""),  # of a model that may be promoted
+        ("doorbell", "'doorbell'"),
+    ],
+)
+def test_a_class_that_no_model_knows_is_named_before_the_bridge_starts(
+    hearthlog, tmp_path, monkeypatch, name, words
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HEARTHLOG_MODEL", raising=False)
+    rule = ALERT.replace('"coughing"', f'"{name}"').replace("kitchn", "mic")
+    (tmp_path / "models").mkdir()
+    if name == "tap_water":
+        copyfile(starter_file(BATHROOM), tmp_path / "models" / "other.safetensors")
+    file = tmp_path / "home.toml"
+    file.write_text(f'output = "{tmp_path}/logs"\n{rule}')
+    result = hearthlog("config", "check", file)
+    assert result.returncode == (3 if words else 0)
+    lines = [line for line in result.stderr.splitlines() if " a: " in line]
+    assert len(lines) == bool(words)
+    assert words in "".join(lines)
+
+
+def test_a_class_that_nothing_hears_is_known_for_a_scenario(hearthlog, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HEARTHLOG_MODEL", raising=False)
+    rule = ALERT.replace('"coughing"', '"flushing_water"').replace("kitchn", "mic")
+    file = tmp_path / "home.toml"
+    file.write_text(f'output = "{tmp_path}/logs"\nscenarios = {{water = "bathroom"}}\n{rule}')
+    assert hearthlog("config", "check", file).returncode == 0
+
+
+@pytest.mark.parametrize(("absent", "name"), [("paho", "paho-mqtt"), ("prometheus_client",) * 2])
+def test_a_package_that_an_output_lacks_is_named_with_all_else(
+    hearthlog, tmp_path, monkeypatch, absent, name
+):
+    def find(module):
+        return None if module == absent else find_spec(module)
+
+    monkeypatch.setattr("hearthlog.analyzer.bridge.outputs.find_spec", find)
+    for module in [each for each in sys.modules if each.partition(".")[0] == absent]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, absent, None)
+    monkeypatch.delitem(sys.modules, "hearthlog.analyzer.bridge.mqtt.connection", raising=False)
+    file = tmp_path / "home.toml"
+    file.write_text(
+        f'model = "none"\noutput = "{tmp_path}/logs"\n'
+        '[bridge.mqtt]\nhost = "x"\nuser = "x"\npassword_file = "/dev/null"\ntls = true\n'
+        '[bridge.prometheus]\ntext_file = "/tmp"\n'
+    )
+    result = hearthlog("config", "check", file)
+    assert result.returncode == 1
+    assert f"hearthlog: {name} is not installed; try: " in result.stderr
+    assert "text_file: /tmp is a folder" in result.stderr
 
 
 @pytest.mark.parametrize("tables", ["", "node = 'flat'\n", "[bridge.page]\n"])

@@ -47,9 +47,10 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 # a second program, or sound of many collections.
 NOT_HERE = re.compile(
     r"hearthlog( record( --model \S+)?( --keep-audio \w+)?( --config \S+)?$| devices| watch| demo"
-    r"| install-service| bridge|.*--start 2026-03-10 | evaluate (adaptation|paper)|.* s3://"
-    r"|.*tcp:|.* --web|.* --microphone USB|.* --folds collection| discover| voices|.* speakers "
-    r"|.* mood.toml|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
+    r"| models fetch yamnet| install-service| bridge|.*--start 2026-03-10 "
+    r"| evaluate (adaptation|paper)|.* s3://|.*tcp:|.* --web"
+    r"|.* --microphone USB|.* --folds collection| discover| voices|.* speakers |.* mood.toml"
+    r"|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
     r"| review(?!.* --save))"
 )
 

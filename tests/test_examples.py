@@ -111,3 +111,24 @@ def test_an_example_ends_at_an_error_with_its_line(tmp_path):
     command = [sys.executable, EXAMPLES / "plot_week.py", tmp_path, tmp_path / "week.png"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, f"{tmp_path}: no log (*.mcap) in this folder\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "lacks"),
+    [
+        ("day_in_pandas.py", "pandas"),
+        ("plot_week.py", "matplotlib"),
+        ("train_and_compare.py", "sklearn"),
+    ],
+)
+def test_an_example_that_lacks_something_says_in_a_line_what_to_install(name, lacks, tmp_path):
+    code = (
+        f"import runpy, sys; sys.modules[{lacks!r}] = None; sys.argv = [{name!r}, *'abc']\n"
+        f"runpy.run_path({str(EXAMPLES / name)!r}, run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "[headless]'" in line

@@ -124,6 +124,15 @@ def test_at_a_terminal_it_asks(log, tmp_path, answer, status):
     assert [mark.label for mark in read_marks(log)] == ["tap_water"] * (status == 0)
 
 
+def test_where_the_input_is_closed_nobody_is_asked(log, tmp_path):
+    labels = tmp_path / "labels.txt"
+    labels.write_text("1\t2\tTap Water\n")
+    command = ["sh", "-c", '"$@" <&-', "sh", *HEARTHLOG, "annotate", "import", log, labels]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "--yes takes them so" in done.stderr
+
+
 def test_with_a_map_only_classes_that_it_or_hearthlog_knows_are_guessed(take):
     content = "1\t2\tDoor Bell\n3\t4\tDing-dong\n5\t6\tEurasian Blackbird\n7\t8\tLaughter\n"
     result, marks = take("labels.txt", content, "--yes", class_map='"ding-dong" = "door_bell"')

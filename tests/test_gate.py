@@ -25,7 +25,7 @@ from hearthlog.analyzer.gate.evidence import (
     _taught,
     gather_evidence,
 )
-from hearthlog.analyzer.gate.judge import find_champion
+from hearthlog.analyzer.gate.judge import Verdict, find_champion
 from hearthlog.analyzer.gate.recent_time import (
     Part,
     RecentLog,
@@ -58,6 +58,7 @@ from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.tools.cli.verdict import print_verdict
 from hearthlog.tools.home.simulate import write_day
 
 OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
@@ -240,7 +241,7 @@ def test_time_that_a_model_has_learned_from_does_not_speak_for_it(capfd):
     assert done.returncode == 1
     assert done.stdout.splitlines()[-1:] != ["learned is the champion"]
     assert "only 4.0 min are recorded and not learned from, and it takes 10 min" in done.stderr
-    assert "record 7 minutes more, then promote it" in done.stderr
+    assert "record 7 more minutes, then promote it" in done.stderr
 
 
 @pytest.mark.usefixtures("place")
@@ -472,6 +473,13 @@ def evidence(minutes, right=NOTHING_KNOWN, sure=None):
     return Evidence(60.0, 14 * 1440.0, changes, certain, right, Right(), [])
 
 
+@pytest.mark.parametrize(("minutes", "more"), [(9.6, "1 more minute,"), (8.2, "2 more minutes,")])
+def test_how_much_more_has_to_be_recorded_is_said(minutes, more):
+    short = replace(evidence([[1, 0], [0, 1]]), minutes=minutes)
+    (line,) = damages(short, "one")
+    assert f" judge it: record {more} then promote it" in line
+
+
 def test_a_model_that_changes_much_has_to_be_right_about_more():
     much = [[1300, 0, 0], [0, 70, 30], [0, 0, 40]]
     (said,) = damages(evidence(much, Right(40, 30, 30, 3, 3)), "one")
@@ -480,6 +488,17 @@ def test_a_model_that_changes_much_has_to_be_right_about_more():
     assert damages(evidence(much), "one") == []  # nothing was drawn at random
     little = [[1300, 0, 0], [0, 80, 20], [0, 0, 40]]
     assert damages(evidence(little, Right(40, 30, 30, 3, 3)), "one") == []
+
+
+def test_a_day_of_which_hours_were_recorded_is_said_to_be_one(capsys):
+    for hours, words in (
+        (13, " (a day: the 13 h 00 min that a mean day with logs has):"),
+        (24, ":"),
+    ):
+        table = [[hours * 60.0 - 40, 0, 0], [0, 10, 30], [0, 0, 0]]
+        print_verdict(Verdict(None, "new", "one", evidence(table)), [], "new")
+        first = capsys.readouterr().out.splitlines()[1]
+        assert first.endswith(f"that it has not learned from{words}")
 
 
 COUGHING_BECOMES_NEW = [[1300, 0, 0, 0], [0, 10, 0, 50], [0, 0, 40, 0], [0, 0, 0, 0]]
@@ -524,6 +543,22 @@ def test_a_new_class_may_take_what_marks_say_was_wrong_and_not_what_a_person_lef
     reasons = damages(with_new_class(known), "one")
     assert harmless or "most becomes laughing" in reasons[0]
     assert len(reasons) == (not harmless)
+
+
+def test_an_old_class_may_take_what_marks_say_was_wrong_where_what_was_right_is_known_and_stays():
+    def reasons(known):
+        table = [[1300, 0, 0], [0, 40, 40], [0, 0, 60]]
+        return damages(replace(evidence(table, sure=table), known=known), "one")
+
+    wrong = {("music", "speech", "music"): 3}
+    right = {("speech", "speech", "speech"): 3}
+    assert reasons(wrong | right) == [], "talking was a telephone, say, and talk stays talk"
+    assert reasons(wrong | right | {("speech", "speech", "music"): 1}) == []
+    assert reasons(wrong | right | {("speech", "speech", "music"): 2}) != []
+    assert reasons(wrong) != [], "all of it may be wrong marks: nothing is known to be talking"
+    assert reasons(wrong | {("speech", "music", "speech"): 9}) != [], "nor was that called so"
+    assert reasons(right | {("music", "speech", "music"): 2}) != [], "a slip, or two"
+    assert reasons(right | {("music", "music", "music"): 9}) != []
 
 
 def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refused():

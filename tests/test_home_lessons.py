@@ -237,6 +237,15 @@ def test_a_pause_that_is_marked_as_silence_does_not_teach_the_sounds_around_it(h
     assert one.label == "silence"
 
 
+def test_pauses_that_are_marked_as_silence_and_teach_nothing_are_counted(home, model_file):
+    begin = segments(home)[0][0]
+    loud = next(one for one in segments(home) if one[2] != "silence" and one[0] > begin)
+    write(home, [(begin, begin + SECOND // 2, "silence"), loud])
+    _, notes, _ = home_lessons([home], load_model(model_file))
+    pauses = "1 of 2 marks are of silence for less than a second: not learned from"
+    assert any(note.startswith(pauses) for note in notes)
+
+
 def test_a_mark_of_time_that_was_not_recorded_is_left_out_and_counted(home):
     loud = next(one for one in segments(home) if one[2] != "silence")
     end = max(one[1] for one in segments(home))

@@ -41,8 +41,9 @@ def state_of(**microphones):
     for name, amplitude in microphones.items():
         samples = np.full((10, FRAME_SAMPLES), amplitude, np.float32)
         state.sound[name] = Frames(0, samples, NO_TIME)
+        times = NO_TIME, NO_TIME, NO_TIME
         state.labels[name] = FrameLabels(
-            ("silence", "speech"), NO_TIME, NO_TIME, NO_TIME, probabilities, np.zeros(10), True
+            ("silence", "speech"), *times, probabilities, probabilities, np.zeros(10), True
         )
     return state
 

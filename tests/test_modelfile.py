@@ -322,7 +322,7 @@ def test_an_array_too_many_is_refused(tmp_path):
     ("key", "value", "reason"),
     [
         ("format", 1, "format"),
-        ("format", 7, "format 7, newer"),
+        ("format", 8, "format 8, newer"),
         ("format", "1", "format"),
         ("format", [3], "format"),
         ("label_frame", 8, "label_frame"),

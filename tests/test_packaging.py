@@ -20,6 +20,7 @@ DATA = {"page.html", "page.css", "page.js", "voice_space.safetensors"}
 APART = {("tools", "bench"), ("tools", "month"), ("tools", "ros")}  # measured, or built, by itself
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"
+EMBEDDING = "models/embedding"
 CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = CONFIGURATION["project"]
 
@@ -32,7 +33,7 @@ def installed_as(path):
     if path.parts[:2] == ("tools", "package"):
         own = path.is_relative_to(PACKAGE)
         return f"hearthlog/{path.relative_to(PACKAGE)}" if own else None
-    kept = path.name in DATA or path.is_relative_to(CLIPS) or path.is_relative_to(STARTERS)
+    kept = path.name in DATA or any(map(path.is_relative_to, (CLIPS, STARTERS, EMBEDDING)))
     if path.suffix not in {".py", ".msg", ".toml", ".service"} and not kept:
         return None
     return f"hearthlog/{path}"
@@ -184,7 +185,8 @@ def imported(folders):
 
 
 @pytest.mark.parametrize(
-    ("folders", "extras"), [(BOX, ("onnx",)), (("analyzer", "tools/cli", "tools/home"), EXTRAS)]
+    ("folders", "extras"),
+    [(BOX, ("embedding", "onnx")), (("analyzer", "tools/cli", "tools/home"), EXTRAS)],
 )
 def test_what_is_imported_is_asked_for(folders, extras):
     names = {name.partition(".")[0] for name in imported(folders)}

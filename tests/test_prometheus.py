@@ -218,6 +218,16 @@ def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, mon
     assert said
 
 
+def test_a_text_file_that_node_exporter_does_not_read_is_said_to_be_none(home, tmp_path):
+    said = []
+    path = tmp_path / "hearthlog.txt"
+    settings = PrometheusSettings(text_file=path, readable_by="owner")
+    PrometheusOutput(settings, Home(home.folder, "home", UTC), tmp_path, 0, said.append).close()
+    (line,) = said
+    assert line.startswith(f"bridge.prometheus: text_file: {path} does not end in .prom")
+    assert line.endswith(f'write "{tmp_path}/hearthlog.prom"')
+
+
 def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):
     said = []
     path = tmp_path / "hearthlog.prom"

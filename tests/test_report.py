@@ -75,6 +75,13 @@ def text_of(page: str) -> str:
     return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page.partition("<body>")[2]))
 
 
+def test_on_a_phone_the_picture_keeps_its_letters_and_is_moved_sideways(tmp_path):
+    write_day(tmp_path, DAY, [(at("10:00"), 60, "speech", 0.8)])
+    (rule,) = re.findall(r"@media screen and .*", page_of(tmp_path, tmp_path))
+    assert "figure { overflow-x: auto; }" in rule
+    assert "figure img { width: 50rem; }" in rule
+
+
 # Spans
 
 spans = st.lists(st.tuples(st.integers(0, 60), st.integers(1, 9)), max_size=8).map(

@@ -26,7 +26,11 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.segments import LabelledFrames, Segmenter
-from hearthlog.models.labels.smoothing import FixedLagSmoother, log_likelihoods
+from hearthlog.models.labels.smoothing import (
+    ClassesApart,
+    FixedLagSmoother,
+    log_likelihoods,
+)
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
@@ -387,3 +391,38 @@ def test_a_segment_that_is_written_too_late_or_before_it_is_over_is_found(
     log.change(segment, header__stamp=time_message(begin), duration=duration_message(duration))
     (findings,) = examine(log.write(tmp_path / path.name))
     assert {rule for level, rule in findings.counts if level == "error"} == rules
+
+
+def test_doubts_about_the_class_of_a_sound_do_not_make_it_silent():
+    doubtful = np.full((60, 5), 0.15, np.float32)
+    doubtful[:, 0], doubtful[:, 1] = 0.36, 0.19  # sound by 0.64, of which class is doubtful
+    quiet = np.tile(np.float32([0.96, 0.01, 0.01, 0.01, 0.01]), (40, 1))
+    probabilities = np.concatenate([quiet, doubtful, quiet])
+    as_before = decided(FixedLagSmoother(default_transitions(CLASSES), LAG, 0.5), probabilities, 50)
+    assert (as_before == 0).all()
+    apart = ClassesApart(0, 0.2)
+    smoother = FixedLagSmoother(default_transitions(CLASSES), LAG, 0.5, apart)
+    states = decided(smoother, probabilities, 50)
+    assert (states[45:95] == 1).mean() > 0.9
+    assert (states[:30] == 0).all()
+
+
+def test_silence_apart_from_the_classes_gives_the_same_states_in_blocks_of_any_size():
+    probabilities = made_up(11)
+    probabilities[100:140] = [1, 0, 0, 0, 0]
+    probabilities[300:340] = [0, 1, 0, 0, 0]
+    smoother = FixedLagSmoother(default_transitions(CLASSES), LAG, 0.5, ClassesApart(0, 0.2))
+    whole = decided(smoother, probabilities, len(probabilities))
+    for size in (1, 13, 1024):
+        assert decided(smoother, probabilities, size).tolist() == whole.tolist()
+    likely = log_likelihoods(probabilities, 0.5, ClassesApart(0, 0.2))
+    assert np.isfinite(likely).all()
+    best = np.delete(likely, 0, axis=1).max(axis=1)
+    expected = 0.5 * np.log(np.maximum(1.0 - probabilities[:, 0].astype(float), 1e-38))
+    np.testing.assert_allclose(best, np.maximum(expected, np.log(1e-6)), atol=1e-9)
+
+
+def test_without_an_exponent_the_likelihoods_are_as_ever_to_the_bit():
+    probabilities = made_up(12)
+    before = np.round(np.maximum(0.5 * np.log(probabilities.astype(float)), np.log(1e-6)) * 2**30)
+    np.testing.assert_array_equal(log_likelihoods(probabilities, 0.5) * 2**30, before)

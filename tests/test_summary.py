@@ -338,6 +338,20 @@ def test_health_is_the_worst_that_was_said_and_of_that_the_last(tmp_path):
     assert summarise(paths).health == summarise(paths[::-1]).health == worst
 
 
+def test_of_a_log_that_is_still_written_the_latest_health_is_that_of_its_end(tmp_path):
+    writer = LogWriter(tmp_path / "a.mcap", [Topic(DIAGNOSTICS, message_types.DIAGNOSTICS)], {})
+    said = [status(2, "a", "lost"), status(1, "b", "late")], [status(0, "a", "listening")]
+    for i, statuses in enumerate(said):
+        array = message(message_types.DIAGNOSTICS, header=header(START, "mic"), status=statuses)
+        writer.write(DIAGNOSTICS, START + i, encode(array))
+    writer.flush()
+    (path,) = tmp_path.iterdir()
+    summary = summarise([path])
+    assert summary.health == Status("a", START, 2, "lost")
+    assert summary.latest_health == Status("b", START, 1, "late")
+    assert summarise([writer.finish()]).health == summary.health
+
+
 def test_a_type_that_only_has_the_name_of_ours_is_counted(tmp_path):
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:

@@ -2,6 +2,7 @@ import csv
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from hearthlog.analyzer.training.train import calibration_error, group_folds, tr
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.cli.train import train
+from hearthlog.tools.cli.train import print_figures, train
 from hearthlog.tools.home.simulate import write_training_set
 
 pytestmark = pytest.mark.fast
@@ -296,6 +298,20 @@ def test_sources_shared_so_that_nothing_is_left_to_learn_from_are_refused():
     group = (data.target + np.arange(len(data.target)) % 2) % 3
     with pytest.raises(DataError, match="no division into folds"):
         train_model(dataclasses.replace(data, group=group), scenario, ignore_progress)
+
+
+def test_the_mean_of_f1_says_of_which_class_it_is_not(capsys):
+    general = load_model(Path("general"))
+    print_figures(general)
+    rows = re.findall(
+        r"^(\w+) .* (\d\.\d+)$", capsys.readouterr().out.partition("\n\n")[0], re.MULTILINE
+    )
+    known = [float(f1) for name, f1 in rows if name != "unknown"]
+    assert len(known) == len(general.classes) - 1
+    said = f"macro F1 without unknown: {np.mean(known):.3f}"
+    assert said in model_card(general)
+    print_figures(general)
+    assert f"macro F1 {np.mean(known):.3f} without unknown, " in capsys.readouterr().out
 
 
 def test_metrics_agree_with_each_other_and_with_the_data():

@@ -36,7 +36,9 @@ WINDOW, BEHIND = 20, 12
 def labels_of(said):
     probabilities = np.stack([1 - said, said], axis=1)
     times = np.arange(len(said))
-    return FrameLabels(CLASSES, times, times, times, probabilities, times * 0.0, False)
+    return FrameLabels(
+        CLASSES, times, times, times, probabilities, probabilities, times * 0.0, False
+    )
 
 
 def veiled(first, said, features, blocks):

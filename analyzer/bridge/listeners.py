@@ -18,8 +18,19 @@ def listener_of(topic: TopicName) -> str | None:
     if topic.labelling == LIVE:
         return topic.microphone
     if is_scenario(topic.labelling):
-        return f"{topic.microphone}{_BETWEEN}{topic.labelling.removeprefix(f'{SCENARIO}/')}"
+        return listener_name(topic.microphone, topic.labelling.removeprefix(f"{SCENARIO}/"))
     return None
+
+
+def listener_name(microphone: str, scenario: str) -> str:
+    """Name the model of a scenario that hears by a microphone.
+
+    Parameters
+    ----------
+    microphone, scenario : str
+        Their names.
+    """
+    return f"{microphone}{_BETWEEN}{scenario}"
 
 
 def microphone_of_listener(listener: str) -> str:

@@ -2,12 +2,12 @@
 
 import stat
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from hearthlog.analyzer.bridge.alerts.rules import unknown_microphone
 from hearthlog.analyzer.bridge.alerts.settings import NO_LISTENER
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.errors import BridgeError
@@ -16,9 +16,9 @@ from hearthlog.analyzer.bridge.output import News, Output
 from hearthlog.analyzer.bridge.page.page_token import figures_token, page_secrets, read_token
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
+from hearthlog.analyzer.bridge.settings import BridgeSettings, MqttSettings, PageSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
-from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.extras import missing, remedy
 from hearthlog.analyzer.ping import has_password, read_ping_address
 from hearthlog.analyzer.ports import ip_of, listen
 from hearthlog.recorder.log.folder_lock import check_writable
@@ -150,27 +150,38 @@ def open_outputs(
     return outputs, since
 
 
-def output_problems(
-    settings: BridgeSettings, microphones: Collection[str]
-) -> tuple[list[str], list[str]]:
+def needed_modules(settings: BridgeSettings) -> dict[str, bool]:
+    """Name the modules that outputs need, and tell which of them are installed."""
+    needed = {
+        "paho": settings.mqtt,
+        "prometheus_client": settings.prometheus,
+        "apprise": settings.alert and settings.delivery.urls_file,
+    }
+    return {name: find_spec(name) is not None for name, table in needed.items() if table}
+
+
+def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
     """Look for what the outputs would refuse at their start, and open nothing.
 
     Parameters
     ----------
     settings : BridgeSettings
-    microphones : collection of str
-        The names of those that are recorded; without any nothing is known.
 
     Returns
     -------
     problems : list of str
         Why an output could not be opened, a line each.
     warnings : list of str
-        Files that may be credentials of the service, which are not here, and alerts of microphones
-        that are not recorded.
+        Files that may be credentials of the service, which are not here, and figures that nobody
+        would read.
     """
     problems: list[str] = []
-    warnings = [line for rule in settings.alert if (line := unknown_microphone(rule, microphones))]
+    warnings: list[str] = []
+    there = needed_modules(settings) | {"apprise": True}  # whose absence is said below
+    if lacking := [name for name, is_there in there.items() if not is_there]:
+        problems.append(missing(*lacking))
+    if (figures := settings.prometheus) is not None and (line := figures.unread_text_file()):
+        warnings.append(line)
     if settings.alert and settings.mqtt is None and settings.delivery.urls_file is None:
         problems.append(NO_LISTENER)
     for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:
@@ -179,6 +190,9 @@ def output_problems(
             continue
         try:
             step()
+        except ModuleNotFoundError as error:
+            if (error.name or "").partition(".")[0] not in lacking:
+                raise
         except (HearthlogError, OSError) as error:
             problems.append(str(error))
     return problems, warnings
@@ -190,9 +204,7 @@ _Step = tuple[Path | None, Callable[[], object]]  # the file of a secret, and wh
 def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_Step]:
     """Yield how each file of secrets is read at the start."""
     if (mqtt := settings.mqtt) is not None:
-        from hearthlog.analyzer.bridge.mqtt.connection import read_password  # noqa: PLC0415
-
-        yield mqtt.password_file, partial(read_password, mqtt)
+        yield mqtt.password_file, partial(_check_password, mqtt)
     if (page := settings.page) is not None and page.token_file is not None:
         yield page.token_file, partial(read_token, page.token_file)
     if (figures := settings.prometheus) is not None and figures.port is not None:
@@ -210,9 +222,7 @@ def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
     if (mqtt := settings.mqtt) is not None:
         yield None, mqtt.check_files
         if mqtt.tls:
-            from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
-
-            yield None, partial(tls_context, mqtt)
+            yield None, partial(_check_certificates, mqtt)
     if (page := settings.page) is not None:
         yield None, lambda: listen(bind=page.bind).close()
     if (figures := settings.prometheus) is not None:
@@ -223,6 +233,18 @@ def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
         yield None, partial(_check_ports, page)
     if settings.state is not None:
         yield None, partial(check_writable, settings.state)
+
+
+def _check_password(settings: MqttSettings) -> None:
+    from hearthlog.analyzer.bridge.mqtt.connection import read_password  # noqa: PLC0415
+
+    read_password(settings)
+
+
+def _check_certificates(settings: MqttSettings) -> None:
+    from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
+
+    tls_context(settings)
 
 
 def _check_text_file(file: Path) -> None:

@@ -88,6 +88,8 @@ class PrometheusOutput:
                 'write readable_by = "all" if that is meant, else "owner" or "group": the next '
                 'release takes "owner" if it says nothing'
             )
+        if line := settings.unread_text_file():
+            say(line)
         self._server: _Server | None = None
         self._open_port()
 

@@ -1,5 +1,7 @@
 """The table `bridge` of the configuration: what a home is told, and where."""
 
+import json
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -31,6 +33,7 @@ from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.storage.small_file import read_toml
 
 _MOST_OF_TOPIC = 200  # characters
+_COLLECTED = ".prom"  # ends the names that the textfile collector of node_exporter reads
 
 
 def _check_topic(topic: str) -> str:
@@ -183,6 +186,16 @@ class PrometheusSettings(_Table):
             raise BridgeError(
                 "bridge.prometheus: gives the figures to nobody; name a text_file, or a port"
             )
+
+    def unread_text_file(self) -> str:
+        """Say that nobody reads the text file, by its name; empty if somebody may."""
+        file = self.text_file
+        if file is None or file.suffix == _COLLECTED or os.path.isdir(file):  # noqa: PTH112  raises nothing
+            return ""
+        return (
+            f"bridge.prometheus: text_file: {file} does not end in {_COLLECTED}, so that "
+            f"node_exporter does not read it; write {json.dumps(str(file.with_suffix(_COLLECTED)))}"
+        )
 
 
 class PageSettings(_Table):

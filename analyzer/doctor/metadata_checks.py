@@ -180,7 +180,8 @@ class MetadataChecks:
             beside: dict[str, list[str]] = {name: [] for name in (*candidates, *own)}
             is_array = f"/{microphone}/{DIRECTION}" in self._channels
             channel = self._channels.get(f"/{microphone}/{EMBEDDING}")
-            embedding = channel and EmbeddingSource.from_metadata(channel.metadata)
+            metadata = {} if channel is None else channel.metadata
+            embedding = EmbeddingSource.from_metadata(metadata)
             names = list(info["feature_names"])
             topics = topics_of(
                 microphone, names, classes, beside, directions=is_array, embedding=embedding

@@ -1,17 +1,22 @@
 """A way to learn, tried on segments that it has not learned from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
 from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.calibration import nested_probabilities
-from hearthlog.analyzer.training.cross_validation import Fold, cross_validate
+from hearthlog.analyzer.training.calibration import inverse_temperature, nested_probabilities
+from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import Method, prepare
+from hearthlog.analyzer.training.mixture import Tried, best_mix, hearing_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
+from hearthlog.models.classes import UNKNOWN
+from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.progress import Progress
 
 Kind = Literal["segment", "source", "collection"]
@@ -55,12 +60,22 @@ def evaluate_method(
     examples = prepare(method, data)
     [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
     probabilities = nested_probabilities(decisions, data.target, folds)
+    if method.network and len(data.heard.target):
+        probabilities = _mixed(data, method, folds, decisions)
     return CrossValidation(
         len(folds),
         score(data.target, probabilities.argmax(axis=1), data.group, data.classes),
         calibration_error(probabilities, data.target),
         reliability(probabilities, data.target),
     )
+
+
+def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Float64) -> Float64:
+    """Return the probabilities of a classifier and heads together."""
+    inverse = inverse_temperature(decisions, data.target)
+    known = np.array([name != UNKNOWN for name in data.classes])[data.target]
+    way = Tried(folds, inverse * decisions, known)
+    return softmax(best_mix(data, hearing_of(method.network), [way]).left_out[0])
 
 
 def divide(data: Dataset, kind: Kind) -> list[Fold]:

@@ -96,7 +96,7 @@ class Evidence:
         Classes that the second model has from marks of the home, and the first has not.
     known : mapping of (str, str, str) to int
         Known sounds, also those that were learned from, by the class that a person gives them, and
-        those of the first and of the second model; empty if no class is taught.
+        those of the first and of the second model; empty if the second has not learned here.
     """
 
     minutes: float
@@ -141,7 +141,8 @@ def gather_evidence(
     models = TwoModels(before, after)
     taught = _taught(models, after)
     count = len(chosen) + len(places)
-    if taught:
+    of_home = any(one.segments for one in after.description.training_data.home.values())
+    if of_home:
         rest = [
             (log, [*left_alone(log.path), *(s for s in own if s not in new)])
             for (log, own), new in zip(known, unlearned, strict=True)
@@ -165,7 +166,7 @@ def gather_evidence(
         losses=losses,
         quiet=_right(one for one in right if one.random and one.label == SILENCE),
         taught=taught,
-        known=Counter(one[1:] for each in outcomes for one in each) if taught else {},
+        known=Counter(one[1:] for each in outcomes for one in each) if of_home else {},
     )
 
 

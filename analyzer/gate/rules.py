@@ -47,7 +47,7 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
         text = (
             f"of the last two weeks only {time_words(evidence.minutes)} are recorded and not "
             f"learned from, and it takes {time_words(LEAST_MINUTES)} to judge it{loss}: record "
-            f"{missing} minutes more, then promote it"
+            f"{missing} more minute{'s' * (missing > 1)}, then promote it"
         )
         return [text]
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
@@ -145,14 +145,21 @@ def _sure_lost(evidence: Evidence, champion: str) -> Iterator[str]:
 
 
 def _is_correction(evidence: Evidence, name: str, new: str) -> bool:
-    """See whether marks of a new class say that a class was wrong, and none that it was right."""
-    if new not in evidence.taught:
-        return False
+    """See whether marks say that a class was wrong where it becomes another one.
+
+    None may say that it was right. What another old class takes is harder to tell from wrong marks:
+    there sounds have to be known that the first model calls so rightly, and the second too.
+    """
     wrong = sum(n for (true, old, _), n in evidence.known.items() if (true, old) == (new, name))
-    own = [(after, n) for (true, _, after), n in evidence.known.items() if true == name]
-    lost = sum(n for after, n in own if after == new)
-    enough = 1 if own else _MARKS_ALONE
-    return wrong >= enough and lost <= (1.0 - _KEPT) * sum(n for _, n in own)
+    of_home = new in evidence.taught
+    own = [
+        (after, n)
+        for (true, old, after), n in evidence.known.items()
+        if true == name and (of_home or old == name)
+    ]
+    count, lost = sum(n for _, n in own), sum(n for after, n in own if after == new)
+    enough = wrong >= (1 if own else _MARKS_ALONE) if of_home else min(wrong, count) >= _MARKS_ALONE
+    return enough and lost <= (1.0 - _KEPT) * count
 
 
 def _swallowed(evidence: Evidence, champion: str) -> Iterator[str]:

@@ -3,13 +3,14 @@
 import struct
 from collections import Counter
 from collections.abc import Iterable
+from functools import reduce
 from pathlib import Path
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.logs.selection import Damages
-from hearthlog.analyzer.logs.summary import Summary, TopicSummary
+from hearthlog.analyzer.logs.summary import Summary, TopicSummary, worse
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -167,4 +168,6 @@ def _add_contents(summary: Summary, contents: Contents) -> None:
         summary.label_seconds[microphone] = Counter(frames)
     summary.gaps = contents.gaps
     summary.streams = contents.streams
-    summary.health = summary.latest_health = contents.health
+    summary.health = contents.health
+    last = contents.last.values()  # of a finished log, which is not read, the worst has to do
+    summary.latest_health = reduce(worse, last, None) if last else contents.health

@@ -76,7 +76,7 @@ class Summary:
     # what the files say of themselves: microphone, device, feature set, model
     streams: list[dict[str, Any]] = field(default_factory=list)
     health: Status | None = None  # the worst that was said, and of that the last
-    latest_health: Status | None = None  # the same of the latest file
+    latest_health: Status | None = None  # of the latest file; while it is written, of its end
 
     @property
     def span(self) -> Span | None:

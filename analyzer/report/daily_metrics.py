@@ -96,7 +96,7 @@ class Day:
         return self.home.events_in(name, self.span)
 
     def night_events(self, name: str) -> Int64:
-        """Return when the events of a class began in the night.
+        """Return when the events of a class began in the night that `night_count` counts.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Day:
         np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         """
-        return self.home.events_in(name, self.night)
+        return self.home.minutes.counted(name, self.home.events_in(name, self.night))
 
     def count(self, name: str) -> Count | None:
         """Return how often a class was heard on this day; None if it is not known.

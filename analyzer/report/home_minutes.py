@@ -79,6 +79,21 @@ class HomeMinutes:
             rates,
         )
 
+    def counted(self, name: str, starts: Int64) -> Int64:
+        """Return those of the events of a class that `count` counts.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        starts : np.ndarray [shape=(n,)], int64
+            When they began, within these minutes.
+        """
+        if name not in SET_APART:
+            return starts
+        television = self.starts[self.television]
+        return starts[~np.isin(starts // MINUTE * MINUTE, television)]
+
     def beside_television(self, name: str) -> int:
         """Count the labelled events of a class where something sounds like a television.
 

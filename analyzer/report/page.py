@@ -123,9 +123,15 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
         days_before=DAYS,
         interrai=_interrai(account, days),
         interrai_days=interrai.DAYS,
-        interrai_heard=len(days),
+        interrai_heard=_heard(days),
         **parts,
     )
+
+
+def _heard(days: Sequence[Day]) -> str:
+    """Say how many days were heard, and how many of them not for the most part: `2 heard`."""
+    partly = sum(day.share < MOST for day in days)
+    return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
 
 
 def _television(account: Account) -> str:

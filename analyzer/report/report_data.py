@@ -13,6 +13,7 @@ from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes
 from hearthlog.analyzer.report.sections import Figure
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
 from hearthlog.analyzer.routine.compare import Judgement
+from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.text import listed
 
 _CHANGES = {
@@ -72,8 +73,11 @@ class Account:
         Parameters
         ----------
         name : str
-            Of the class.
+            Of the class; of quiet, and of what is not sure, nothing is said: they are no sounds
+            that one can count right or missed.
         """
+        if name in {SILENCE, UNKNOWN}:
+            return ""
         check = self.checks.check(name)
         if not (check.labelled or check.true):
             return "\u2013"

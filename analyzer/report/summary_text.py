@@ -180,7 +180,7 @@ def _loudest(day: Day) -> str:
     ]
     sounds = listed(most[:3], "and")
     quiet = "It was quiet." if day.share >= MOST else ""
-    return f"Most of the sound: {sounds}." if most else quiet
+    return f"Most of the sound, as labelled: {sounds}." if most else quiet
 
 
 def _changes(account: Account, day: Day) -> str:

@@ -39,13 +39,24 @@ def collection_folds(data: Dataset) -> list[Fold]:
         for number in np.unique(fold)
     ]
     several = all(len(np.unique(data.target[seen])) > 1 for seen, _ in folds)
-    tried = np.unique(data.target[_taught(data, folds)])
+    tried = np.unique(data.target[taught_elsewhere(data, folds)])
     enough = 2 * len(tried) >= sum(name != UNKNOWN for name in data.classes)
     return folds if len(folds) >= _FEWEST_COLLECTIONS and several and enough else []
 
 
-def _taught(data: Dataset, folds: Sequence[Fold]) -> Bool:
-    """Tell which segments are of a class of which the other folds have five sources."""
+def taught_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
+    """Tell which segments are of a known class of which the other folds have five sources.
+
+    Parameters
+    ----------
+    data : Dataset
+    folds : sequence of Fold
+        As of `collection_folds`.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
     taught = np.zeros(len(data), bool)
     for seen, unseen in folds:
         pairs = np.unique(np.stack([data.target[seen], data.group[seen]]), axis=1)
@@ -79,13 +90,29 @@ def calibrate_elsewhere(
     elsewhere : Elsewhere
         Scores of each fold with the temperature from the others.
     """
-    taught = _taught(data, folds)
+    taught = taught_elsewhere(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
+    elsewhere = scores_elsewhere(probabilities, data, taught)
+    return inverse_temperature(decisions[taught], data.target[taught]), elsewhere
+
+
+def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Elsewhere:
+    """Score what is said of collections of which nothing was learned.
+
+    Parameters
+    ----------
+    probabilities : np.ndarray [shape=(n, C)], float64
+        Of classifiers that were not learned from the collection of the segment.
+    data : Dataset
+        Of n segments.
+    taught : np.ndarray [shape=(n,)], bool
+        As `taught_elsewhere` tells.
+    """
     predicted, scored = probabilities.argmax(axis=1), taught.copy()
     if UNKNOWN in data.classes:
         scored |= data.target == data.classes.index(UNKNOWN)
     scores = score(data.target[scored], predicted[scored], data.group[scored], data.classes)
-    elsewhere = Elsewhere(
+    return Elsewhere(
         collections=len(np.unique(data.collection)),
         segments=int(taught.sum()),
         right=float((predicted == data.target)[taught].mean()),
@@ -94,7 +121,6 @@ def calibrate_elsewhere(
         macro_f1_interval=scores.macro_f1_interval and list(scores.macro_f1_interval),
         classes={name: one.f1 for name, one in scores.per_class.items() if one.f1 is not None},
     )
-    return inverse_temperature(decisions[taught], data.target[taught]), elsewhere
 
 
 def home_temperature(decisions: Float64, target: Indices, base: float) -> float:

@@ -10,6 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.clip_embeddings import (
+    AS_IT_IS,
+    SHORT,
+    SHORT_PARTS,
+    ClipEmbedder,
+    ClipEmbeddings,
+)
 from hearthlog.analyzer.training.clip_sound import NO_NUMBERS, ClipSound, read_clip
 from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
 from hearthlog.analyzer.training.rooms import RoomCopy, in_room
@@ -17,16 +24,18 @@ from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.sightings import Sighting
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.description import Amount
+from hearthlog.models.embedding.embeddings import Int8
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.errors import SourceError
-from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
+_HEARD_PER_GROUP = 32  # windows of each version
 UNREADABLE = "cannot be read, or not all of it"
 CONFIRMED = "this home, as it was labelled"  # a collection
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
@@ -60,6 +69,8 @@ class Recording(NamedTuple):
         Frames that do not follow the one before them.
     hole : str
         What is missing there; empty if nothing is.
+    embedded : ClipEmbeddings or None
+        Windows of it as a network hears them; None without a network.
     """
 
     label: str
@@ -76,6 +87,43 @@ class Recording(NamedTuple):
     fault: str = ""
     breaks: Sequence[int] = ()
     hole: str = ""
+    embedded: ClipEmbeddings | None = None
+
+
+class HeardWindows(NamedTuple):
+    """Windows of sound as a network hears them, to learn heads from.
+
+    Attributes
+    ----------
+    values : np.ndarray [shape=(m, W)], int8
+        As they are logged.
+    target, group, collection : np.ndarray [shape=(m,)], intp
+        As those of segments.
+    tried : np.ndarray [shape=(m,)], bool
+        Whether it is a window as it is, by which it is found how sure a head may be.
+    """
+
+    values: Int8
+    target: Indices
+    group: Indices
+    collection: Indices
+    tried: Bool
+
+    def rows(self, chosen: Indices | Bool) -> "HeardWindows":
+        """Return some of the windows."""
+        return HeardWindows(
+            self.values[chosen],
+            self.target[chosen],
+            self.group[chosen],
+            self.collection[chosen],
+            self.tried[chosen],
+        )
+
+
+_NO_NUMBERS = np.empty(0, np.intp)
+_NOTHING_HEARD = HeardWindows(
+    np.empty((0, 0), np.int8), _NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, np.empty(0, bool)
+)
 
 
 @dataclass(frozen=True)
@@ -112,6 +160,12 @@ class Dataset:
         Whence the recording of each segment came, if that is known; empty if it is of none.
     left_out : sequence of LeftOut
         Recordings that could not be read, which `skipped` counts too, and parts of others.
+    embedded : np.ndarray [shape=(n, W)], int8
+        The segments as a network hears them; W is 0 without a network.
+    is_embedded : np.ndarray [shape=(n,)], bool
+        Of which segments that is known.
+    heard : HeardWindows
+        What heads are learned from.
     """
 
     windows: Float32
@@ -130,6 +184,9 @@ class Dataset:
     spans: Int64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
     sightings: Sequence[Sighting | None] = ()
     left_out: Sequence[LeftOut] = ()
+    embedded: Int8 = field(default_factory=lambda: np.empty((0, 0), np.int8))
+    is_embedded: Bool = field(default_factory=lambda: np.empty(0, bool))
+    heard: HeardWindows = _NOTHING_HEARD
 
     def __len__(self) -> int:
         return len(self.target)
@@ -167,6 +224,7 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     home: Iterable[Recording] = (),
     features: FeatureSet = DEFAULT,
     rooms: int = 0,
+    embedder: ClipEmbedder | None = None,
 ) -> Dataset:
     """Cut clips, and recordings of a home, into the segments of a scenario.
 
@@ -182,6 +240,8 @@ def build_dataset(  # noqa: PLR0913, PLR0917
         The features to compute; those of `home` are of the same set.
     rooms : int
         Number of copies of each clip in other rooms.
+    embedder : ClipEmbedder, optional
+        Hears the windows of clips, for methods with heads.
 
     Returns
     -------
@@ -193,7 +253,7 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     DataError
         If a class is left without segments.
     """
-    recordings = chain(clip_recordings(clips, scenario, progress, features, rooms), home)
+    recordings = chain(clip_recordings(clips, scenario, progress, features, rooms, embedder), home)
     data = cut_recordings(recordings, scenario, features)
     for name, amount in data.amounts.items():
         if not amount.segments:
@@ -205,12 +265,13 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     return data
 
 
-def clip_recordings(
+def clip_recordings(  # noqa: PLR0913, PLR0917
     clips: Sequence[LabelledClip],
     scenario: Scenario,
     progress: Progress,
     features: FeatureSet = DEFAULT,
     rooms: int = 0,
+    embedder: ClipEmbedder | None = None,
 ) -> Iterator[Recording]:
     """Read clips and compute their features.
 
@@ -226,6 +287,8 @@ def clip_recordings(
         The features to compute.
     rooms : int
         Number of copies in other rooms; the same clips get the same ones.
+    embedder : ClipEmbedder, optional
+        Hears the windows of clips, for methods with heads.
 
     Yields
     ------
@@ -241,7 +304,14 @@ def clip_recordings(
             except SourceError as error:
                 fault = str(error)
         rng = np.random.default_rng([_SEED, number])
-        yield _recording(clip, sound, features, rooms, rng)._replace(fault=fault)
+        recording = _recording(clip, sound, features, rooms, rng)._replace(fault=fault)
+        if embedder is not None and len(sound.frames):
+            segments = _segments(recording, features)[1]
+            if len(segments) or len(sound.frames) < features.window_frames:
+                silence = class_name(clip.label) == SILENCE
+                heard = embedder(sound.frames, segments, silence=silence)
+                recording = recording._replace(embedded=heard)
+        yield recording
     progress(1.0)
 
 
@@ -277,6 +347,7 @@ def cut_recordings(
     seconds: dict[str, float] = {}
     left_out: list[LeftOut] = []
     chosen: list[_Chosen] = []
+    heard: list[tuple[ClipEmbeddings, Indices]] = []
     spans: list[tuple[int, int]] = []
     rows = [np.empty((0, 3), np.intp)]
     weights = [np.empty(0)]
@@ -290,22 +361,28 @@ def cut_recordings(
             left_out.append(LeftOut(reason, item.fault))
         if item.hole:
             left_out.append(LeftOut(f"parts of clips, in which {NO_NUMBERS}", item.hole))
-        if reason:
-            skipped[reason] += 1
+        skipped[reason] += bool(reason)
+        if reason and item.embedded is None:
             continue
+        group = groups.setdefault(item.group, len(groups))
+        collection = collections.setdefault(item.collection, len(collections))
+        key = np.array([classes.index(name), group, collection])
         used[item.collection, item.licence] += 1
+        if item.embedded is not None:
+            heard.append((item.embedded, key))
+        if reason:
+            continue
         spans += [item.span] if item.span else []
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
         chosen += [_Chosen(item, start) for start in starts.tolist()]
         weights.append(np.full(len(starts), item.weight))
-        group = groups.setdefault(item.group, len(groups))
-        collection = collections.setdefault(item.collection, len(collections))
-        rows.append(np.tile([classes.index(name), group, collection], (len(starts), 1)))
+        rows.append(np.tile(key, (len(starts), 1)))
     target, group_of, collection_of = np.concatenate(rows).T
     weight = np.concatenate(weights)
     kept = _thinned((target * len(groups) + group_of) * len(collections) + collection_of, weight)
     segments = [chosen[place] for place in kept.tolist()]
     windows, floors = _cut(segments, features)
+    embedded, is_embedded = _embedded(segments)
     return Dataset(
         windows=windows[0],
         target=target[kept],
@@ -319,10 +396,13 @@ def cut_recordings(
         seconds=seconds,
         collection_names=tuple(collections),
         collections=dict(used),
-        skipped=dict(sorted(skipped.items())),
+        skipped={why: count for why, count in sorted(skipped.items()) if why},
         spans=np.array(spans, np.int64).reshape(-1, 2),
         sightings=[one.recording.sighting for one in segments],
         left_out=left_out,
+        embedded=embedded,
+        is_embedded=is_embedded,
+        heard=_joined(heard),
     )
 
 
@@ -351,6 +431,42 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
         for place, copy in enumerate(recording.copies, 1):
             windows[place, number], floors[place, number] = copy.features[frames], copy.floor
     return windows, floors
+
+
+def _joined(heard: Sequence[tuple[ClipEmbeddings, Indices]]) -> HeardWindows:
+    """Join the windows that teach heads, evenly spaced ones where a source has many.
+
+    Each recording is of a class, a group and a collection.
+    """
+    parts = [(one.values[one.taught], one.version[one.taught], key) for one, key in heard]
+    parts = [part for part in parts if len(part[1])]
+    if not parts:
+        return _NOTHING_HEARD
+    values = np.concatenate([part[0] for part in parts])
+    version = np.concatenate([part[1] for part in parts])
+    keys = np.repeat([part[2] for part in parts], [len(part[1]) for part in parts], axis=0)
+    target, group, collection = keys.T
+    columns = np.column_stack([keys, version])
+    key = np.unique(columns, axis=0, return_inverse=True)[1].ravel()
+    most = np.where(version == SHORT, SHORT_PARTS, 1.0) * (_HEARD_PER_GROUP / SEGMENTS_PER_GROUP)
+    kept = _thinned(key, most)
+    heard_windows = HeardWindows(values, target, group, collection, version == AS_IT_IS)
+    return heard_windows.rows(kept)
+
+
+def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:
+    """Return segments as a network hears them, and of which that is known; zeros elsewhere."""
+    rows: list[tuple[int, Int8]] = []
+    for number, (recording, start) in enumerate(segments):
+        if recording.embedded is not None:
+            same = recording.embedded.version == AS_IT_IS
+            place = np.flatnonzero(same & (recording.embedded.starts == start))
+            rows += [(number, recording.embedded.values[one]) for one in place[:1]]
+    embedded = np.zeros((len(segments), len(rows[0][1]) if rows else 0), np.int8)
+    is_embedded = np.zeros(len(segments), bool)
+    for number, values in rows:
+        embedded[number], is_embedded[number] = values, True
+    return embedded, is_embedded
 
 
 def _recording(

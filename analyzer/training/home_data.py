@@ -92,7 +92,7 @@ def marked_recordings(
                 unheard.append(f"{mark.label} in {sound.log.name}")
                 continue
             silence = class_name(mark.label) == SILENCE
-            if silence and mark.end - mark.start < features.window_seconds * NANOSECONDS:
+            if is_short_silence(mark, features):
                 continue
             floored = silence or not sound.enrolled
             pieces = list(_recordings(sound, mark, features, floored=floored))
@@ -112,6 +112,19 @@ def marked_recordings(
             f"is {quiet[0]}: they are left out; mark what can be heard, or mark it as silence"
         )
         warnings.warn(HearthlogWarning(text, folder), stacklevel=2)
+
+
+def is_short_silence(mark: Mark, features: FeatureSet) -> bool:
+    """Tell whether a mark of silence is shorter than what is learned from, and so teaches nothing.
+
+    Parameters
+    ----------
+    mark : Mark
+    features : FeatureSet
+        Of the sound that it is of.
+    """
+    is_short = mark.end - mark.start < features.window_seconds * NANOSECONDS
+    return is_short and class_name(mark.label) == SILENCE
 
 
 def lesson_recordings(

@@ -17,7 +17,12 @@ from hearthlog.analyzer.training.confirmed import (
     confirmed_segments,
 )
 from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, Recording, cut_recordings
-from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
+from hearthlog.analyzer.training.home_data import (
+    HOME,
+    is_short_silence,
+    marked_recordings,
+    teaching,
+)
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.unreviewed import unreviewed_silence, unreviewed_sounds
@@ -91,7 +96,8 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> L
     candidates: list[Candidates] = []
     counts, window = _Counts(), features.window_frames
     for folder in folders:
-        sounds = list(_counted(read_reviewed_sound(folder, features, scenario), counts))
+        read = read_reviewed_sound(folder, features, scenario)
+        sounds = list(_counted(read, counts, features))
         marked += marked_recordings(sounds, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
     taught, notes, unlearned = _with_new_classes(marked, model, features)
@@ -122,6 +128,7 @@ class _Counts:
     def __init__(self) -> None:
         self.marks = 0
         self.left_out = 0  # as they teach nothing
+        self.short = 0  # pauses that are marked as silence
         self.looked_at = False
 
     def notes(self) -> list[str]:
@@ -132,15 +139,23 @@ class _Counts:
                 f"{self.left_out} of {self.marks} marks are not learned from: they say `unknown`, "
                 "or lie in time that was drawn at random to measure how right the labels are"
             )
+        if self.short:
+            notes.append(
+                f"{self.short} of {self.marks} marks are of silence for less than a second: not "
+                "learned from, for there are other sounds beside it"
+            )
         return notes
 
 
-def _counted(sounds: Iterable[HomeSound], counts: _Counts) -> Iterator[HomeSound]:
+def _counted(
+    sounds: Iterable[HomeSound], counts: _Counts, features: FeatureSet
+) -> Iterator[HomeSound]:
     """Leave out the marks that teach nothing, and count them."""
     for sound in sounds:
         taught = teaching(sound)
         counts.marks += len(sound.marks)
         counts.left_out += len(sound.marks) - len(taught.marks)
+        counts.short += sum(is_short_silence(mark, features) for mark in taught.marks)
         counts.looked_at |= any(span.chosen != RANDOM for span in sound.reviewed)
         yield taught
 

@@ -1,11 +1,24 @@
 """The methods that are installed."""
 
+from functools import lru_cache
+from importlib.util import find_spec
+
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.clip_embeddings import ClipEmbedder
 from hearthlog.analyzer.training.layer_methods import LOGISTIC, PERCEPTRON
 from hearthlog.analyzer.training.method import Method
-from hearthlog.analyzer.training.svm_method import BANDS, PAPER, ROOM, ROOM21, network_method
+from hearthlog.analyzer.training.svm_method import (
+    BANDS,
+    EMBEDDING,
+    PAPER,
+    ROOM,
+    ROOM21,
+    network_method,
+)
 from hearthlog.analyzer.training.tree_methods import BOOSTING, EXTRA_TREES, FOREST
 from hearthlog.analyzer.training.vector_methods import NEIGHBOURS_VOTE, ONE_CLASS_MACHINES
+from hearthlog.models.embedding.networks import find_network, load_embedder
+from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.installed import is_network
 
@@ -19,8 +32,39 @@ OTHERS: tuple[Method, ...] = (
     BOOSTING,
     ONE_CLASS_MACHINES,
 )
-_INSTALLED = [ROOM, ROOM21, BANDS, PAPER, *OTHERS]
+_INSTALLED = [ROOM, EMBEDDING, ROOM21, BANDS, PAPER, *OTHERS]
 _METHODS = Extensions("hearthlog.methods", Method, "method", _INSTALLED, DataError)  # type: ignore[type-abstract]
+
+
+def default_method() -> Method:
+    """Return the method that is best with what is installed: with a network where there is one."""
+    runtime = find_spec("ai_edge_litert") is not None
+    return EMBEDDING if runtime and find_network(EMBEDDING.network) is not None else DEFAULT
+
+
+def clip_embedder(method: Method) -> ClipEmbedder | None:
+    """Return what hears the clips that a method learns from; None if it takes no embeddings.
+
+    Parameters
+    ----------
+    method : Method
+
+    Raises
+    ------
+    ModelError
+        If its network is not known, not there, another file, or cannot be used.
+    """
+    return _clip_embedder(method.network) if method.network else None
+
+
+@lru_cache(maxsize=2)
+def _clip_embedder(network: str) -> ClipEmbedder:
+    path = find_network(network)
+    if path is None:
+        raise ModelError(
+            f"the network {network} is not here; fetch it: hearthlog models fetch {network}"
+        )
+    return ClipEmbedder(load_embedder(network, path))
 
 
 def method_named(name: str) -> Method:
@@ -29,8 +73,8 @@ def method_named(name: str) -> Method:
     Parameters
     ----------
     name : str
-        `room`, `room21`, `bands`, `paper`, one of `OTHERS`, the name of an entry point in the group
-        `hearthlog.methods`, or that of a network that has a card.
+        `embedding`, `room`, `room21`, `bands`, `paper`, one of `OTHERS`, the name of an entry point
+        in the group `hearthlog.methods`, or that of a network that has a card.
 
     Raises
     ------

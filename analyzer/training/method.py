@@ -131,7 +131,12 @@ class Method(ABC):
     gate : float
         As in `Description`.
     observation_weight : float
-        Weight of a frame's decision values in the hidden Markov model.
+        Weight of a frame's decision values in the hidden Markov model; with a network, of the
+        logarithms of its probabilities.
+    network : str
+        The one whose embeddings heads beside the classifier take, by its name; empty for none.
+    class_exponent : float or None
+        As in `Smoothing`.
     """
 
     name: str
@@ -142,6 +147,8 @@ class Method(ABC):
     rooms: int = 0
     gate: float = 0.0
     observation_weight: float = 1.5
+    network: str = ""
+    class_exponent: float | None = None
 
     @property
     def features(self) -> FeatureSet:

@@ -2,13 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import FORMAT_OF_DIRECTIONS, MOST_ARRAYS
+from hearthlog.models.classifiers.description import (
+    FORMAT,
+    FORMAT_OF_DIRECTIONS,
+    MOST_ARRAYS,
+)
 from hearthlog.models.classifiers.directions import SECTORS, Directions, sectors_of
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64, Indices, Int64
@@ -83,7 +87,9 @@ def with_directions(model: Model, target: Indices, sightings: Sequence[Sighting 
         weights[number] = _weights(np.array(classes), own, len(model.classes))
     if not weights.any():
         return model
-    update = {"format": FORMAT_OF_DIRECTIONS, "direction_microphones": arrays}
+    update: dict[str, Any] = {"direction_microphones": arrays}
+    if model.description.format == FORMAT:
+        update["format"] = FORMAT_OF_DIRECTIONS
     description = model.description.model_copy(update=update)
     return replace(model, description=description, direction_weights=weights)
 

@@ -338,6 +338,9 @@ ROOM = SvmMethod(
     gamma=0.5,
 )
 ROOM21 = replace(ROOM, name="room21", feature_set="auros21")
+EMBEDDING = replace(
+    ROOM, name="embedding", network="yamnet", observation_weight=0.5, class_exponent=0.2
+)
 
 
 def network_method(name: str) -> SvmMethod:

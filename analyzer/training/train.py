@@ -15,6 +15,8 @@ from hearthlog.analyzer.training.calibration import (
     calibrate_elsewhere,
     collection_folds,
     inverse_temperature,
+    scores_elsewhere,
+    taught_elsewhere,
     unknown_bias,
 )
 from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
@@ -23,6 +25,7 @@ from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import DEFAULT
 from hearthlog.analyzer.training.learned_segments import segment_digests
 from hearthlog.analyzer.training.method import Learned, Method, prepare
+from hearthlog.analyzer.training.mixture import Mixture, Tried, hearing_of, learn_mixture
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import calibration_error
 from hearthlog.analyzer.training.sightings import with_directions
@@ -35,6 +38,7 @@ from hearthlog.analyzer.training.transitions import (
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import (
     FORMAT,
+    FORMAT_OF_EMBEDDINGS,
     MOST_WEIGHT,
     ClassMetrics,
     Collection,
@@ -107,14 +111,23 @@ def train_model(  # noqa: PLR0913, PLR0917
     bias = unknown_bias(decisions, data.target, data.classes)
     decisions += bias
     inverse, elsewhere = inverse_temperature(decisions, data.target), None
+    left_out = None
     if collections:
         left_out = decide(collections, len(sources)) + bias
         inverse, elsewhere = calibrate_elsewhere(left_out, data, collections)
+    mixture, measured, sure = None, decisions, inverse
+    if method.network and len(data.heard.target):
+        mixture = _mixture(data, method, inverse, (sources, decisions), (collections, left_out))
+        measured, sure = mixture.of_sources, 1.0
+        if mixture.of_collections is not None:
+            probabilities = softmax(mixture.of_collections)
+            taught = taught_elsewhere(data, collections)
+            elsewhere = scores_elsewhere(probabilities, data, taught)
     learned = method.fit(examples)
     progress(1.0)
     model = Model(
         Description(
-            **_method_fields(method, learned, data.classes),
+            **_method_fields(method, learned, data.classes, mixture),
             **_scenario_fields(scenario, data),
             calibration="temperature",
             inverse_temperature=inverse,
@@ -123,13 +136,16 @@ def train_model(  # noqa: PLR0913, PLR0917
             },
             novelty="doubt",
             elsewhere=elsewhere,
-            smoothing=_smoothing(smoothing, method, inverse),
-            metrics=_metrics(data, decisions, inverse, len(sources)),
+            smoothing=_smoothing(smoothing, method, sure, mixture),
+            metrics=_metrics(data, measured, sure, len(sources)),
         ),
         learned.arrays(),
         transitions=(default_transitions(data.classes) if smoothing == "hmm" else np.empty((0, 0))),
         training_digests=segment_digests(data.windows),
     )
+    if mixture is not None:
+        heads = mixture.heads
+        model = replace(model, embedding_weights=heads[0], embedding_bias=heads[1])
     model = with_directions(model, data.target, data.sightings)
     if method.remembered(model) is not None:
         return model
@@ -222,7 +238,24 @@ def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Me
     )
 
 
-def _smoothing(name: str, method: Method, inverse: float) -> Smoothing:
+def _mixture(
+    data: Dataset,
+    method: Method,
+    inverse: float,
+    sources: tuple[list[Fold], Float64],
+    collections: tuple[list[Fold], Float64 | None],
+) -> Mixture:
+    """Learn heads beside a classifier, whose decision values for segments left out are known."""
+    folds, decisions = sources
+    known = np.array([name != UNKNOWN for name in data.classes])[data.target]
+    of_sources, of_collections = Tried(folds, inverse * decisions, known), None
+    folds, left_out = collections
+    if left_out is not None:
+        of_collections = Tried(folds, inverse * left_out, taught_elsewhere(data, folds))
+    return learn_mixture(data, hearing_of(method.network), of_sources, of_collections)
+
+
+def _smoothing(name: str, method: Method, inverse: float, mixture: Mixture | None) -> Smoothing:
     if name == "merge":
         return Smoothing(method="merge")
     return Smoothing(
@@ -231,14 +264,18 @@ def _smoothing(name: str, method: Method, inverse: float) -> Smoothing:
         weight=min(method.observation_weight / inverse, MOST_WEIGHT),
         reach_seconds=REACH_SECONDS,
         shortest_seconds=SHORTEST_SECONDS,
+        class_exponent=None if mixture is None else method.class_exponent,
     )
 
 
-def _method_fields(method: Method, learned: Learned, classes: Sequence[str]) -> dict[str, Any]:
+def _method_fields(
+    method: Method, learned: Learned, classes: Sequence[str], mixture: Mixture | None
+) -> dict[str, Any]:
     features = method.features
     window = features.inputs[method.inputs].window_frames
     return {
-        "format": FORMAT,
+        "format": FORMAT if mixture is None else FORMAT_OF_EMBEDDINGS,
+        "embedding": None if mixture is None else mixture.mix,
         "kind": method.kind,
         "parameters": learned.parameters(),
         "method": method.name,

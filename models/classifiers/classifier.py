@@ -3,6 +3,7 @@
 import numpy as np
 
 from hearthlog.models.classes import UNKNOWN
+from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.timing import label_timing
@@ -11,6 +12,7 @@ from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
 _ROWS_AT_ONCE = 256
+_TINY = 1e-38
 _STEPS = 1 << 16  # of a probability; what is finer is noise, of the processor too
 
 
@@ -39,6 +41,8 @@ class Classifier:
         Those of the model.
     calibrated_elsewhere : bool
         Whether probabilities hold in homes of which nothing was learned.
+    embedding_heads : EmbeddingHeads or None
+        Of a model that takes the embeddings of a network.
 
     Raises
     ------
@@ -61,10 +65,14 @@ class Classifier:
         self._bias = np.array([description.decision_bias.get(name, 0.0) for name in self.classes])
         self._doubts = description.novelty == "doubt"
         self._known = np.array([name != UNKNOWN for name in self.classes])
-        self.heads = None
         self._machine = classifier_kind(description.kind).machine(model)
         arrays = description.direction_microphones
         self._direction_weights = dict(zip(arrays, model.direction_weights, strict=True))
+        self._mix = description.embedding
+        self.embedding_heads: EmbeddingHeads | None = None
+        if self._mix is not None:
+            heads = model.embedding_weights, model.embedding_bias
+            self.embedding_heads = EmbeddingHeads(self._mix, *heads, self.classes)
 
     def direction_weights(self, microphone: str) -> Float64 | None:
         """Return what the directions of an array say, as `DirectionEvidence` takes it.
@@ -82,10 +90,16 @@ class Classifier:
         return self._direction_weights.get(microphone)
 
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
-        """Return whether the model was learned on the embeddings of a network and a projection."""
-        return False
+        """Return whether the model was learned on embeddings of the same network and projection."""
+        mix = self._mix
+        if source is None or mix is None:
+            return False
+        theirs = source.network, source.projection_sha256, len(source.names)
+        return theirs == (mix.network, mix.projection_sha256, mix.values)
 
-    def mix(self, probabilities: Float32, embedded: Float64) -> tuple[Float32, Float32]:
+    def mix(
+        self, probabilities: Float32, embedded: Float64, evidence: Float64 | None = None
+    ) -> tuple[Float32, Float32]:
         """Let embeddings say which class a sound is of; whether it is silence, features say.
 
         Parameters
@@ -94,6 +108,8 @@ class Classifier:
             As `classify` gives them.
         embedded : np.ndarray [shape=(n, C)], float64
             Of the heads; NaN where there is no embedding, and the probabilities stay.
+        evidence : np.ndarray [shape=(n, C)], float64, optional
+            Of something else, as `classify` takes it.
 
         Returns
         -------
@@ -101,7 +117,14 @@ class Classifier:
         novelty : np.ndarray [shape=(n,)], float32
             As of `classify`.
         """
-        raise NotImplementedError
+        decision = np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
+        self._add_heads(decision, embedded)
+        if evidence is not None:
+            decision += evidence
+        decision -= decision.max(axis=1, keepdims=True)
+        np.exp(decision, out=decision)
+        mixed = (decision / decision.sum(axis=1, keepdims=True)).astype(np.float32)
+        return self._in_steps(mixed)
 
     def probabilities(self, inputs: Float32) -> Float32:
         """Compute the probability of each class in each window.
@@ -118,7 +141,12 @@ class Classifier:
         """
         return self.classify(inputs)[0]
 
-    def classify(self, inputs: Float32, evidence: Float64 | None = None) -> tuple[Float32, Float32]:
+    def classify(
+        self,
+        inputs: Float32,
+        evidence: Float64 | None = None,
+        embedded: Float64 | None = None,
+    ) -> tuple[Float32, Float32]:
         """Compute the probability of each class, and the novelty of each window.
 
         Parameters
@@ -127,6 +155,9 @@ class Classifier:
             Finite.
         evidence : np.ndarray [shape=(n, C)], float64, optional
             Of something else: what is added to the logarithms of the probabilities.
+        embedded : np.ndarray [shape=(n, C)], float64, optional
+            What the heads say at each window, as of `EmbeddingHeads.log_probabilities`. Rows of NaN
+            where they say nothing: there the classifier decides alone, as without heads.
 
         Returns
         -------
@@ -144,13 +175,25 @@ class Classifier:
             decision, novelty[rows] = self._machine.decide(inputs[rows])
             decision += self._bias
             decision *= self._inverse_temperature
+            if embedded is not None:
+                self._add_heads(decision, embedded[rows])
             if evidence is not None:
                 decision += evidence[rows]
             decision -= decision.max(axis=1, keepdims=True)
             np.exp(decision, out=decision)
             result[rows] = decision / decision.sum(axis=1, keepdims=True)
         if self._doubts:  # models of hearthlog 0.1 label as they did, to the last bit
-            np.rint(_STEPS * result, out=result)
-            result /= _STEPS
-            novelty = 1.0 - result[:, self._known].max(axis=1, initial=0.0)
+            return self._in_steps(result)
         return result, novelty
+
+    def _in_steps(self, probabilities: Float32) -> tuple[Float32, Float32]:
+        """Round probabilities, and return them with the novelty."""
+        np.rint(_STEPS * probabilities, out=probabilities)
+        probabilities /= _STEPS
+        return probabilities, 1.0 - probabilities[:, self._known].max(axis=1, initial=0.0)
+
+    def _add_heads(self, decision: Float64, said: Float64) -> None:
+        """Mix the decision values of windows with what heads say there."""
+        heard = ~np.isnan(said).any(axis=1)
+        if self._mix is not None and heard.any():
+            decision[heard] = mixed(decision[heard], said[heard], self._mix, self.classes)

@@ -4,7 +4,15 @@ import json
 import re
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    ValidationError,
+    model_serializer,
+)
 
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.errors import ModelError
@@ -17,6 +25,9 @@ MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs am
 MOST_FEATURES = 5000  # those of a network have 4097 at most
 FORMAT: Final = 5
 FORMAT_OF_DIRECTIONS: Final = 6  # which a version that cannot use them refuses
+FORMAT_OF_EMBEDDINGS: Final = 7  # as well
+MOST_HEADS = 8
+MOST_VALUES = 1024  # of a window of sound, as a network hears it
 MOST_ARRAYS = 16  # of microphones, in a home
 MOST_WEIGHT: Final = 10.0
 SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
@@ -154,6 +165,9 @@ class Smoothing(_Record):
         Time by which a border of silence is moved at most, to where the level changes.
     shortest_seconds : float
         States that are shorter give way to the one before.
+    class_exponent : float or None
+        Exponent of how likely a class other than silence is, relative to the likeliest of them;
+        then the probability of silence counts by itself. None: the probabilities count as they are.
     """
 
     method: Literal["merge", "hmm"]
@@ -161,6 +175,72 @@ class Smoothing(_Record):
     weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)] = 1.0
     reach_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
     shortest_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
+    class_exponent: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)] | None = None
+
+
+class NamesHead(_Record):
+    """A head that has learned nothing: what the names of a network say as they are.
+
+    Attributes
+    ----------
+    weight : float
+        In the mix.
+    slope : float
+        Decision value of a step of a logged value.
+    classes : dict of str to list of int
+        Numbers of the logged values of each class, of which the highest counts.
+    bias : dict of str to float
+        What is added to the decision values of classes.
+    """
+
+    weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]
+    slope: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]
+    classes: Annotated[
+        dict[
+            _ClassName,
+            Annotated[
+                list[Annotated[int, Field(ge=0, lt=MOST_VALUES)]],
+                Field(min_length=1, max_length=MOST_VALUES),
+            ],
+        ],
+        Field(min_length=2, max_length=MOST_CLASSES),
+    ]
+    bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
+
+
+class EmbeddingMix(_Record):
+    """How a model mixes its classifier with heads on what a network hears.
+
+    Attributes
+    ----------
+    network : str
+        Its name.
+    projection_sha256 : str
+        SHA-256 of the projection from its output onto what is logged.
+    values : int
+        Number of the logged values of a window.
+    head_weights : list of float
+        Of the linear heads, in the mix.
+    names : list of NamesHead
+    machine_weight : float
+        Of the classifier.
+    inverse_temperature : float
+        Of the mix, the weighted mean of the logarithms of probabilities.
+    bias : dict of str to float
+        What is added to the mean, by class.
+    """
+
+    network: _Text
+    projection_sha256: _Digest
+    values: Annotated[int, Field(ge=1, le=MOST_VALUES)]
+    head_weights: Annotated[
+        list[Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]],
+        Field(min_length=1, max_length=MOST_HEADS),
+    ]
+    names: Annotated[list[NamesHead], Field(max_length=MOST_HEADS)] = []
+    machine_weight: Annotated[float, Field(ge=0.0, le=MOST_WEIGHT)]
+    inverse_temperature: Annotated[float, Field(gt=0.0, le=100.0)]
+    bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
 
 
 class Description(_Record):
@@ -199,9 +279,11 @@ class Description(_Record):
         left out, for want of collections.
     direction_microphones : list of str
         The arrays of a home whose directions the model takes, by name; with any, the format is 6.
+    embedding : EmbeddingMix or None
+        What it takes of a network's embeddings; with any, the format is 7.
     """
 
-    format: Literal[5, 6]
+    format: Literal[5, 6, 7]
     kind: _Text
     parameters: dict[_Text, Any]
     method: _Text
@@ -227,8 +309,18 @@ class Description(_Record):
     training_data: TrainingData
     metrics: Metrics
     direction_microphones: Annotated[list[_Text], Field(max_length=MOST_ARRAYS)] = []
-    embedding: None = None
+    embedding: EmbeddingMix | None = None
     versions: dict[_Text, _Text]
+
+    @model_serializer(mode="wrap")
+    def _as_older_versions_read_it(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what models without heads have not; older versions refuse fields they lack."""
+        content: dict[str, Any] = handler(self)
+        if self.embedding is None:
+            content.pop("embedding", None)
+        if self.smoothing.class_exponent is None and "smoothing" in content:
+            content["smoothing"].pop("class_exponent", None)
+        return content
 
 
 def read_description(text: str) -> Description:
@@ -257,7 +349,7 @@ def read_description(text: str) -> Description:
 
 def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
     number = content.get("format")
-    if isinstance(number, int) and number > FORMAT_OF_DIRECTIONS:
+    if isinstance(number, int) and number > FORMAT_OF_EMBEDDINGS:
         raise ModelError(f"is of format {number}, newer than this version of hearthlog: update it")
     if number == 2:
         inputs = content.get("inputs", "statistics")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.description import Description
-from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Int32, Int64
 
 Array = NDArray[Any]
 
@@ -36,6 +36,11 @@ class Model:
     direction_weights : np.ndarray [shape=(M, C, S)], float64
         For each array of the description, logarithms of how much likelier each class is with each
         sector of the circle; empty without arrays.
+    embedding_weights : np.ndarray [shape=(H, W, C)], int32
+        Of H linear heads on the W values that are logged of a window of sound, in units of
+        `hearthlog.models.classifiers.embedding_heads.UNIT`; empty without heads.
+    embedding_bias : np.ndarray [shape=(H, C)], int32
+        In the same units.
     name : str
         Stem of the model file.
     sha256 : str
@@ -51,6 +56,8 @@ class Model:
     training_target: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     training_group: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     direction_weights: Float64 = field(default_factory=lambda: np.empty((0, 0, 0)))
+    embedding_weights: Int32 = field(default_factory=lambda: np.empty((0, 0, 0), np.int32))
+    embedding_bias: Int32 = field(default_factory=lambda: np.empty((0, 0), np.int32))
     name: str = ""
     sha256: str = ""
 

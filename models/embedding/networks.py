@@ -2,20 +2,45 @@
 
 import hashlib
 import os
+import time
+import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from hearthlog.models.embedding.embeddings import Int8
+from hearthlog.models.embedding.folders import network_folders
 from hearthlog.models.embedding.projection import Projection, read_projection
-from hearthlog.models.embedding.session import TfliteSession
+from hearthlog.models.embedding.runtimes import session_type
+from hearthlog.models.embedding.session import NetworkOutput
+from hearthlog.models.embedding.sounds import BURSTS, NOISE, SILENCE, TONE, synthetic_sounds
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.messages.topics import EmbeddingSource
 from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.text import printable
 
-_SIZE_LIMIT = 512 << 20
+__all__ = [
+    "NETWORKS",
+    "YAMNET",
+    "Embedder",
+    "EmbeddingNetwork",
+    "KnownAnswer",
+    "NetworkFile",
+    "find_network",
+    "load_embedder",
+    "network_folders",
+    "read_network_file",
+]
+
+ANSWER_TOLERANCE = 1.5  # logits; conversions differ by a few tenths, other networks by many
+_PATIENCE_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +61,26 @@ class NetworkFile:
     url: str = ""
 
 
+class KnownAnswer(NamedTuple):
+    """What a network is known to say of a synthetic sound.
+
+    Attributes
+    ----------
+    sound : str
+        Of `synthetic_sounds`.
+    number : int
+        Of a score.
+    name : str
+        What it is of.
+    logit : float
+    """
+
+    sound: str
+    number: int
+    name: str
+    logit: float
+
+
 @dataclass(frozen=True)
 class EmbeddingNetwork:
     """A pretrained network whose embedding and names are logged.
@@ -43,7 +88,7 @@ class EmbeddingNetwork:
     Attributes
     ----------
     name : str
-        Also that of its file, with `.tflite`.
+        Also that of its file.
     files : tuple of NetworkFile
         Conversions of the same weights; the first is the one to fetch.
     window : int
@@ -53,6 +98,10 @@ class EmbeddingNetwork:
     projection : Path
         Of its output onto what is logged.
     licence, attribution : str
+    suffix : str
+        Of its file: `.tflite`, or `.onnx`.
+    answers : tuple of KnownAnswer
+        By which a file whose numbers differ is told when it is fetched.
     """
 
     name: str
@@ -63,11 +112,13 @@ class EmbeddingNetwork:
     projection: Path
     licence: str
     attribution: str
+    suffix: str = ".tflite"
+    answers: tuple[KnownAnswer, ...] = ()
 
     @property
     def filename(self) -> str:
         """Name of its file."""
-        return f"{self.name}.tflite"
+        return f"{self.name}{self.suffix}"
 
 
 YAMNET = EmbeddingNetwork(
@@ -87,6 +138,12 @@ YAMNET = EmbeddingNetwork(
     projection=Path(__file__).parent / "yamnet.safetensors",
     licence="Apache-2.0",
     attribution="YAMNet, Google LLC, https://github.com/tensorflow/models",
+    answers=(  # of the second file: the first could not be had where this was written
+        KnownAnswer(TONE, 475, "beep", 2.2),
+        KnownAnswer(NOISE, 514, "white noise", 1.3),
+        KnownAnswer(BURSTS, 132, "music", -1.1),
+        KnownAnswer(BURSTS, 158, "drum machine", -1.1),
+    ),
 )
 
 NETWORKS = Extensions(
@@ -96,6 +153,8 @@ NETWORKS = Extensions(
 
 class Embedder:
     """Computes what is logged for a window of sound.
+
+    It is tried with synthetic sounds first.
 
     Parameters
     ----------
@@ -117,19 +176,17 @@ class Embedder:
     """
 
     def __init__(self, network: EmbeddingNetwork, path: Path) -> None:
-        data = read_whole(path, "network", _SIZE_LIMIT, ModelError)
-        self.network, self.sha256 = network, hashlib.sha256(data).hexdigest()
-        known = {each.sha256 for each in network.files}
-        if self.sha256 not in known:
-            raise ModelError(
-                f"{path}: is not the network {network.name} (its sha256 begins with "
-                f"{self.sha256[:12]}); fetch it: hearthlog models fetch {network.name}"
-            )
+        data, self.sha256 = read_network_file(network, path)
+        self.network = network
         self.projection: Projection = read_projection(network.projection)
+        self._path = path
         try:
-            self._session = TfliteSession(data, network.window, network.width, network.names)
+            _check_projection(network, self.projection)
+            open_session = session_type(network.suffix)
+            self._session = open_session(data, network.window, network.width, network.names)
+            self._of_silence = self._tried()
         except ModelError as error:
-            raise ModelError(f"{path}: {error}") from error
+            raise ModelError(f"{path}: {printable(str(error))[:300]}") from error
 
     @property
     def source(self) -> EmbeddingSource:
@@ -149,23 +206,96 @@ class Embedder:
         Returns
         -------
         np.ndarray [shape=(W,)], int8
+            Those of silence where the network fails, with a `HearthlogWarning`.
         """
         samples = window.reshape(-1)
         start = (len(samples) - self.network.window) // 2
-        output = self._session(samples[start : start + self.network.window])
+        try:
+            output = self._session(samples[start : start + self.network.window])
+            self._check_shape(output)
+        except Exception:  # noqa: BLE001  runtimes raise many; no sound may end a recording
+            text = "the network fails at some sound, which counts as silence"
+            warnings.warn(HearthlogWarning(text, self._path), stacklevel=2)
+            return self._of_silence
         return self.projection.quantise(output)
 
+    def different_answers(self) -> list[str]:
+        """Return a line for each known answer that this file gives otherwise.
 
-def network_folders() -> list[Path]:
-    """Return the folders of networks: `hearthlog/networks` of the folders of data.
+        Models were made with the answers of one file; another conversion of the same weights may
+        round otherwise, but not much.
+        """
+        sounds = synthetic_sounds(self.network.window)
+        lines = []
+        for sound, number, name, expected in self.network.answers:
+            value = float(self._session(sounds[sound]).logits[number])
+            if abs(value - expected) > ANSWER_TOLERANCE:
+                lines.append(f"{name} of {sound}: {value:.2f}, where {expected:.2f} is known")
+        return lines
 
-    Those are `$XDG_DATA_HOME` (`~/.local/share`) and `$XDG_DATA_DIRS` (`/usr/local/share` and
-    `/usr/share`), as in the XDG Base Directory Specification.
+    def _tried(self) -> Int8:
+        """Try it with sounds up to full scale, and with silence; return the integers of that."""
+        sounds = synthetic_sounds(self.network.window)
+        for window in (10.0 * sounds[NOISE], sounds[BURSTS], sounds[SILENCE]):
+            begin = time.monotonic()
+            try:
+                output = self._session(window)
+            except Exception as error:  # as above
+                raise ModelError(f"fails ({error})") from error
+            if time.monotonic() - begin > _PATIENCE_SECONDS:
+                raise ModelError(f"takes more than {_PATIENCE_SECONDS:g} s for a window")
+            self._check_shape(output)
+            if not all(np.isfinite(each).all() for each in output):
+                raise ModelError("gives values that are not finite")
+        return self.projection.quantise(output)
+
+    def _check_shape(self, output: NetworkOutput) -> None:
+        shapes = [list(each.shape) for each in output]
+        wanted = [[self.network.width], [self.network.names]]
+        if shapes != wanted:
+            raise ModelError(f"gives values of shapes {shapes}, not {wanted}")
+
+
+def _check_projection(network: EmbeddingNetwork, projection: Projection) -> None:
+    """Refuse a projection that is of another network's output."""
+    numbers = [number for group in projection.groups.values() for number in group]
+    fits = projection.components.shape[0] == projection.mean.shape[0] == network.width
+    of_names = all(group for group in projection.groups.values())
+    if not fits or not of_names or not all(0 <= each < network.names for each in numbers):
+        raise ModelError(f"{network.projection} is no projection of its output")
+
+
+def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str]:
+    """Read a file of a network; return it, and its SHA-256.
+
+    Parameters
+    ----------
+    network : EmbeddingNetwork
+    path : Path
+
+    Raises
+    ------
+    ModelError
+        If it is missing, cannot be read, or is none of those that are known.
     """
-    of_user = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")  # noqa: PTH111  that of Path raises where there is no home
-    of_all = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
-    folders = [Path(text) for text in [of_user, *of_all.split(":")]]
-    return [folder / "hearthlog" / "networks" for folder in folders if folder.is_absolute()]
+    sizes = {each.size for each in network.files}
+    remedy = f"fetch it: hearthlog models fetch {network.name}"
+    with suppress(OSError):  # which is told when it is read
+        size = path.stat().st_size
+        if path.is_file() and size not in sizes:
+            known = " or ".join(f"{each:,}" for each in sorted(sizes))
+            raise ModelError(
+                f"{path}: is not the network {network.name}, or not all of it: it has {size:,} "
+                f"bytes, not {known}; {remedy}"
+            )
+    data = read_whole(path, "network", max(sizes), ModelError)
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 not in {each.sha256 for each in network.files}:
+        raise ModelError(
+            f"{path}: is not the network {network.name} (its sha256 begins with {sha256[:12]}); "
+            f"{remedy}"
+        )
+    return data, sha256
 
 
 def find_network(name: str) -> Path | None:

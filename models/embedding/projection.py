@@ -97,8 +97,7 @@ class Projection:
         -------
         np.ndarray [shape=(n, W)], float64
         """
-        values: Float64 = quantised * self.steps.astype(np.float64)
-        return values
+        return quantised.astype(np.float64) * self.steps.astype(np.float64)
 
 
 def write_projection(projection: Projection, path: Path) -> None:

@@ -1,8 +1,12 @@
 """A network of sounds in memory, by LiteRT: samples in, embedding and scores out."""
 
+import os
 import struct
+import tempfile
+import threading
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from contextlib import ExitStack, contextmanager
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,6 +17,8 @@ from hearthlog.schemas.arrays import Float32
 _SUBGRAPHS, _TENSORS, _OUTPUTS, _OPERATORS = 2, 0, 2, 3
 _SHAPE, _OPERATOR_INPUTS, _OPERATOR_OUTPUTS = 0, 1, 2
 _MOST_STEPS = 64
+_NOTICE = b"XNNPACK delegate"  # in the line of LiteRT that says how it computes
+_loading = threading.Lock()
 
 
 class NetworkOutput(NamedTuple):
@@ -29,8 +35,23 @@ class NetworkOutput(NamedTuple):
     logits: Float32
 
 
+class Session(Protocol):
+    """A network in memory."""
+
+    def __call__(self, window: Float32) -> NetworkOutput:
+        """Compute the output for a window.
+
+        Parameters
+        ----------
+        window : np.ndarray [shape=(window,)], float32
+            Samples, -1 to 1.
+        """
+
+
 class TfliteSession:
-    """A network of a TFLite file, whose embedding and logits need not be among its outputs.
+    """A network of a TFLite file, as `Session`.
+
+    Its embedding and logits need not be among its outputs.
 
     The file is not unpacked: a longer list of outputs is appended to it, as the library that
     rewrites such files takes 50 MB.
@@ -57,8 +78,9 @@ class TfliteSession:
         except (struct.error, ValueError, IndexError) as error:
             raise ModelError(f"is no TFLite file that can be used ({error})") from error
         try:
-            self._interpreter = interpreter_type(model_content=data, num_threads=1)
-            self._interpreter.allocate_tensors()
+            with _without_notice():
+                self._interpreter = interpreter_type(model_content=data, num_threads=1)
+                self._interpreter.allocate_tensors()
             (given,) = self._interpreter.get_input_details()
         except (ValueError, RuntimeError) as error:
             raise ModelError(f"is no network that LiteRT takes ({error})") from error
@@ -80,6 +102,32 @@ class TfliteSession:
         self._interpreter.invoke()
         tensors = (self._interpreter.get_tensor(each) for each in (self._embedding, self._logits))
         return NetworkOutput(*(each.reshape(-1) for each in tensors))
+
+
+@contextmanager
+def _without_notice() -> Iterator[None]:
+    """Keep from standard error the line in which LiteRT says how it computes.
+
+    LiteRT has no switch for it. What else is written in the meantime, by whichever thread, comes
+    when the block ends.
+    """
+    with _loading, ExitStack() as stack:
+        try:
+            error = os.dup(2)
+            stack.callback(os.close, error)
+            lines = stack.enter_context(tempfile.TemporaryFile(buffering=0))
+        except OSError:  # no standard error, or no room: then the line may come
+            yield
+            return
+        os.dup2(lines.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(error, 2)
+            lines.seek(0)
+            kept = [line for line in lines.read().splitlines(keepends=True) if _NOTICE not in line]
+            if kept:
+                os.write(2, b"".join(kept))
 
 
 def _interpreter_type() -> Any:

@@ -12,13 +12,14 @@ from hearthlog.models.embedding.networks import Embedder
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES
 
+_SOUND_FROM = 4  # frame of a window; what ends before it is more than half a second from the middle
+
 
 class EmbeddingStream:
     """Embeds the windows of one stream of frames in which there is sound.
 
-    Windows begin at frames whose number is a multiple of ten. A frame above the floor is in the
-    middle of a second of sound; all windows have one that end with it or up to nine frames later,
-    so that the frames from the middle of one window to that of the next have both of them.
+    Windows begin at frames whose number is a multiple of ten. One is embedded if there is sound
+    within half a second of its middle.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ class EmbeddingStream:
         ----------
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         sound : np.ndarray [shape=(n,)], bool
-            Whether the second that ends with each frame is above the floor of the room.
+            Whether what ends with each frame, 0.4 s at most, is above the floor of the room.
         first : int
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
@@ -63,7 +64,7 @@ class EmbeddingStream:
         chosen = [
             begin
             for begin, last in zip(begins.tolist(), lasts.tolist(), strict=True)
-            if sound[last - HOP_FRAMES : last].any()
+            if sound[begin + _SOUND_FROM : last].any()
         ]
         self._frames = samples[1 - WINDOW_FRAMES :].copy()
         self._sound, self._stamps = sound[1 - WINDOW_FRAMES :], stamps[1 - WINDOW_FRAMES :]

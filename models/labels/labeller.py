@@ -38,6 +38,8 @@ class FrameLabels(NamedTuple):
         From 0 to 1; NaN where the classifier has none.
     calibrated_elsewhere : bool
         As of the classifier.
+    ahead : int
+        Frames behind the window that they waited for.
     """
 
     classes: tuple[str, ...]
@@ -48,6 +50,7 @@ class FrameLabels(NamedTuple):
     by_features: Float32
     novelty: Float32
     calibrated_elsewhere: bool
+    ahead: int = 0
 
     def columns(self, microphone: str) -> dict[str, Column]:
         """Return the fields of one `AudioLabel` for each frame.
@@ -109,9 +112,10 @@ class Labeller:
         weights = classifier.direction_weights(microphone)
         self._evidence = None if weights is None else DirectionEvidence(weights)
         self._embedded: EmbeddingEvidence | None = None
-        if classifier.takes_embeddings(embedding) and classifier.heads is not None:
-            self._embedded = EmbeddingEvidence(classifier.heads, len(self.classes))
+        if classifier.embedding_heads and classifier.takes_embeddings(embedding):
+            self._embedded = EmbeddingEvidence(classifier.embedding_heads, len(self.classes))
         self._pending: LabelledFrames | None = None  # that embeddings to come say something of
+        self._pending_evidence: Float64 | None = None  # of directions, for them
         self._inputs_converged = (
             not self.timing.needs_floor and self._evidence is None and self._embedded is None
         )
@@ -204,7 +208,8 @@ class Labeller:
         if self._evidence is not None:
             directions = auxiliary.directions
             evidence = self._evidence.push(directions, first, len(features), len(inputs))
-        probabilities, novelty = self._classify(inputs, window, room, evidence)
+        ahead = self.timing.ahead
+        probabilities, novelty = self._classify(inputs, window, room, None if ahead else evidence)
         count, spoken = len(inputs), self.timing.label_frame
         by_features = LabelledFrames(
             probabilities,
@@ -213,11 +218,11 @@ class Labeller:
             window.stamps[self.timing.window_frames - 1 :],
         )
         labelled, end = by_features, first + len(features) - self.timing.delay
-        if self.timing.ahead:
+        if ahead:
             if self._embedded is not None:
                 self._embedded.push(auxiliary.embeddings, first)
-            by_features = self._complete(by_features)
-            labelled, novelty = self._mixed(by_features, end - len(by_features.stamps))
+            by_features, evidence = self._complete(by_features, evidence)
+            labelled, novelty = self._mixed(by_features, end - len(by_features.stamps), evidence)
         count, first = len(labelled.stamps), end - len(labelled.stamps)
         again = max(self._first_label - first, 0)  # frames that were labelled before
         labels = FrameLabels(
@@ -229,6 +234,7 @@ class Labeller:
             by_features.probabilities[again:],
             novelty[again:],
             self._classifier.calibrated_elsewhere,
+            self.timing.ahead,
         )
         labelled = labelled.part(slice(max(self._first_segment - first, 0), None))
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
@@ -251,7 +257,7 @@ class Labeller:
             self._evidence.restart()
         if self._embedded is not None:
             self._embedded.restart()
-        self._pending = None
+        self._pending = self._pending_evidence = None
         self._window, self._first_label, self._first_segment = None, 0, 0
         return self.segmenter.close(end)
 
@@ -266,22 +272,30 @@ class Labeller:
             self._inputs_converged = True
             self.segmenter.forget()
 
-    def _complete(self, frames: LabelledFrames) -> LabelledFrames:
+    def _complete(
+        self, frames: LabelledFrames, evidence: Float64 | None
+    ) -> tuple[LabelledFrames, Float64 | None]:
         """Add frames labelled by their features; return those whose embeddings are all known."""
         ahead = self.timing.ahead
         pending = frames if self._pending is None else self._pending.followed_by(frames)
+        if evidence is not None and self._pending_evidence is not None:
+            evidence = np.concatenate([self._pending_evidence, evidence])
         count = max(len(pending.stamps) - ahead, 0)
         self._pending = pending.part(slice(count, None))
-        known_at = pending.known_at[ahead:]
-        return pending.part(slice(count))._replace(known_at=known_at)
+        complete = pending.part(slice(count))._replace(known_at=pending.known_at[ahead:])
+        if evidence is not None:
+            evidence, self._pending_evidence = evidence[:count], evidence[count:]
+        return complete, evidence
 
-    def _mixed(self, frames: LabelledFrames, first: int) -> tuple[LabelledFrames, Float32]:
+    def _mixed(
+        self, frames: LabelledFrames, first: int, evidence: Float64 | None
+    ) -> tuple[LabelledFrames, Float32]:
         """Let embeddings say what the sound of frames is; return also its novelty."""
         count = len(frames.stamps)
         said = np.full((count, len(self.classes)), np.nan)
         if self._embedded is not None:
             said = self._embedded.at(first, count)
-        probabilities, novelty = self._classifier.mix(frames.probabilities, said)
+        probabilities, novelty = self._classifier.mix(frames.probabilities, said, evidence)
         return frames._replace(probabilities=probabilities), novelty
 
     def _advance(

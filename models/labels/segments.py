@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.labels.borders import Borders
-from hearthlog.models.labels.smoothing import FixedLagSmoother
+from hearthlog.models.labels.smoothing import ClassesApart, FixedLagSmoother
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
@@ -152,10 +152,13 @@ class Segmenter:
 
     def __init__(self, classes: Sequence[str], smoothing: Smoothing, transitions: Float64) -> None:
         self._smoother, lag = None, 0
-        if smoothing.method == "hmm":
-            lag = _frames(smoothing.lag_seconds)
-            self._smoother = FixedLagSmoother(transitions, lag, smoothing.weight)
         silence = classes.index(SILENCE) if SILENCE in classes else -1
+        if smoothing.method == "hmm":
+            lag, exponent = _frames(smoothing.lag_seconds), smoothing.class_exponent
+            apart = (
+                ClassesApart(silence, exponent) if exponent is not None and silence >= 0 else None
+            )
+            self._smoother = FixedLagSmoother(transitions, lag, smoothing.weight, apart)
         self._reach = _frames(smoothing.reach_seconds) if silence >= 0 else 0
         shortest = max(_frames(smoothing.shortest_seconds), 1)
         self._borders = Borders(silence, self._reach, shortest)

@@ -4,6 +4,8 @@ The algorithm is that of Viterbi, "Error bounds for convolutional codes", 1967, 
 decided a fixed number of frames after its own.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hearthlog.schemas.arrays import Float32, Float64, Indices
@@ -18,7 +20,24 @@ _LANE = 128  # frames
 _WARM_UP = 64  # frames; in real sound 99 of 100 beginnings are forgotten after 32
 
 
-def log_likelihoods(probabilities: Float32, weight: float) -> Float64:
+class ClassesApart(NamedTuple):
+    """How doubts about the class of a sound are kept from counting for silence.
+
+    Attributes
+    ----------
+    silence : int
+        Number of the class.
+    exponent : float
+        Of how likely each other class is, relative to the likeliest of them.
+    """
+
+    silence: int
+    exponent: float
+
+
+def log_likelihoods(
+    probabilities: Float32, weight: float, apart: ClassesApart | None = None
+) -> Float64:
     """Turn the probabilities of a classifier into the log-likelihoods of a hidden Markov model.
 
     Classes are trained with even weights, so their prior is uniform.
@@ -29,14 +48,31 @@ def log_likelihoods(probabilities: Float32, weight: float) -> Float64:
     weight : float
         Factor of the logarithms: successive windows overlap, so that each tells less than if it
         stood alone.
+    apart : ClassesApart, optional
+        Then the likeliest sound counts as much as silence leaves to all of them, which would each
+        lose to silence where it is doubtful which of them is heard.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
         Finite.
     """
-    logarithms = weight * np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
-    return _rounded(np.maximum(logarithms, _LEAST))
+    logarithms = np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
+    if apart is not None:
+        logarithms = _with_classes_apart(logarithms, probabilities, apart)
+    return _rounded(np.maximum(weight * logarithms, _LEAST))
+
+
+def _with_classes_apart(
+    logarithms: Float64, probabilities: Float32, apart: ClassesApart
+) -> Float64:
+    sounds = np.delete(np.arange(logarithms.shape[1]), apart.silence)
+    likeliest = logarithms[:, sounds].max(axis=1, keepdims=True)
+    sound = 1.0 - probabilities[:, apart.silence].astype(np.float64)
+    result = apart.exponent * (logarithms - likeliest)
+    result += np.log(np.maximum(sound, _TINY))[:, np.newaxis]
+    result[:, apart.silence] = logarithms[:, apart.silence]
+    return result
 
 
 class FixedLagSmoother:
@@ -54,6 +90,8 @@ class FixedLagSmoother:
     lag_frames : int
     weight : float
         As of `log_likelihoods`.
+    apart : ClassesApart, optional
+        As of `log_likelihoods`.
 
     Attributes
     ----------
@@ -62,11 +100,18 @@ class FixedLagSmoother:
         of these frames on do not depend on it. None if that is not reached yet.
     """
 
-    def __init__(self, transitions: Float64, lag_frames: int, weight: float = 1.0) -> None:
+    def __init__(
+        self,
+        transitions: Float64,
+        lag_frames: int,
+        weight: float = 1.0,
+        apart: ClassesApart | None = None,
+    ) -> None:
         with np.errstate(divide="ignore"):  # never: minus infinity
             self._transitions = _rounded(np.log(transitions))
         self._lag = lag_frames
         self._weight = weight
+        self._apart = apart
         self._restart()
 
     def forget(self) -> None:
@@ -92,7 +137,7 @@ class FixedLagSmoother:
         """
         starts = range(0, len(probabilities), _FRAMES_AT_ONCE)
         blocks = (probabilities[start : start + _FRAMES_AT_ONCE] for start in starts)
-        parts = [self._push(log_likelihoods(block, self._weight)) for block in blocks]
+        parts = [self._push(log_likelihoods(block, self._weight, self._apart)) for block in blocks]
         return np.concatenate([np.empty(0, np.intp), *parts])
 
     def close(self) -> Indices:

@@ -68,6 +68,7 @@ def model_card(model: Model) -> str:
         f"{description.window_seconds:g} s, from feature set {description.feature_set} "
         f"({description.kind}, {classifier_kind(description.kind).summary(model)})."
     )
+    rest = f" without {UNKNOWN}" * (UNKNOWN in description.classes)
     lines = [
         f"# Model {model.name or description.scenario_name}",
         "",
@@ -75,7 +76,7 @@ def model_card(model: Model) -> str:
         "",
         f"- sha256: {model.sha256 or 'not saved'}",
         f"- scenario: {description.scenario_name}",
-        f"- macro F1: {metrics.macro_f1:.3f} ({metrics.folds} folds, no source in two of them)",
+        f"- macro F1{rest}: {metrics.macro_f1:.3f} ({metrics.folds} folds, none splits a source)",
         f"- expected calibration error: {metrics.expected_calibration_error:.3f}",
         f"- training data sha256: {description.training_data.sha256}",
         f"- made with: {', '.join(f'{k} {v}' for k, v in sorted(description.versions.items()))}",
@@ -112,6 +113,12 @@ def model_card(model: Model) -> str:
     if arrays := description.direction_microphones:
         named = ", ".join(arrays)
         lines += ["", f"Takes the directions of {named}; other microphones are labelled without."]
+    if (mix := description.embedding) is not None:
+        wanted = (
+            f"Takes what the network {mix.network} hears (projection {mix.projection_sha256[:12]}) "
+            "where a log has it; elsewhere it labels by the features alone, and less often rightly."
+        )
+        lines += ["", wanted]
     if description.training_data.simulated:
         lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
     lines += [*_elsewhere(description), "", "Learned from recordings of:", ""]

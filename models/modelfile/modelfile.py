@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import (
     FORMAT_OF_DIRECTIONS,
+    FORMAT_OF_EMBEDDINGS,
     Description,
     first_problem,
     one_line,
@@ -47,6 +48,8 @@ _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are op
     "training_target": np.dtype(np.int64),
     "training_group": np.dtype(np.int64),
     "direction_weights": np.dtype(np.float64),
+    "embedding_weights": np.dtype(np.int32),
+    "embedding_bias": np.dtype(np.int32),
 }
 
 
@@ -267,6 +270,7 @@ def _problem(description: Description) -> str | None:
         _problem_of_labels(description, features)
         or _problem_of_classes(description)
         or _problem_of_arrays(description)
+        or _problem_of_heads(description)
     )
 
 
@@ -302,8 +306,29 @@ def _problem_of_arrays(description: Description) -> str | None:
     names = description.direction_microphones
     if len(set(names)) < len(names):
         return "its direction_microphones name one twice"
+    if description.format == FORMAT_OF_EMBEDDINGS:
+        return None
     if bool(names) != (description.format == FORMAT_OF_DIRECTIONS):
         return f"format: is {description.format}; those with directions are {FORMAT_OF_DIRECTIONS}"
+    return None
+
+
+def _problem_of_heads(description: Description) -> str | None:
+    """Return what is wrong with how a model takes the embeddings of a network."""
+    mix, classes = description.embedding, set(description.classes)
+    if (mix is not None) != (description.format == FORMAT_OF_EMBEDDINGS):
+        return f"format: is {description.format}; those with heads are {FORMAT_OF_EMBEDDINGS}"
+    if mix is None:
+        exponent = description.smoothing.class_exponent
+        return None if exponent is None else "smoothing: has a class_exponent without heads"
+    if len(classes - {SILENCE}) < 2:
+        return "embedding: there are no two sounds to tell apart"
+    named = {name for head in mix.names for name in [*head.classes, *head.bias]}
+    if not (named | mix.bias.keys()) <= classes - {SILENCE}:
+        return "embedding: has a class that the model has not, or silence"
+    numbers = [one for head in mix.names for same in head.classes.values() for one in same]
+    if max(numbers, default=0) >= mix.values:
+        return f"embedding: names values beyond the {mix.values} of a window"
     return None
 
 
@@ -360,6 +385,10 @@ def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, 
     if description.direction_microphones:
         count = len(description.direction_microphones)
         shapes["direction_weights"] = (count, classes, SECTORS)
+    if (mix := description.embedding) is not None:
+        heads = len(mix.head_weights)
+        shapes["embedding_weights"] = (heads, mix.values, classes)
+        shapes["embedding_bias"] = (heads, classes)
     digests = arrays.get("training_digests", np.empty(0))
     if digests.ndim and len(digests):
         shapes["training_digests"] = (len(digests),)

@@ -52,22 +52,26 @@ class ClipFinder:
         A second, or the length of the window of a label, if that is longer.
     late_frames : int
         Frames by which the log is later than its labels.
+    most_ahead : int
+        Frames behind its window that a label may wait for.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917
         self,
         keep: Keep,
         never: Sequence[str],
         pre_roll_frames: int,
         window_frames: int,
         late_frames: int = 0,
+        most_ahead: int = 0,
     ) -> None:
         self._window = window_frames
         self._keep = keep
-        self._guard = PrivateFrames(never, window_frames)
+        self._guard = PrivateFrames(never, window_frames, most_ahead)
         # How many frames before a label's own frame are kept because of the label.
         self._before = 0 if keep == "always" else self._window - 1 + pre_roll_frames
-        self._ahead = max(self._before, self._window - 1 + late_frames)
+        self._most_ahead = most_ahead
+        self._ahead = max(self._before, self._window - 1 + late_frames) + most_ahead
         self._begin()
 
     def _begin(self) -> None:
@@ -120,13 +124,13 @@ class ClipFinder:
 
     def _append(self, frames: Frames, labels: FrameLabels | None) -> None:
         count = len(frames.samples)
-        worth = np.zeros(count, bool)
+        self._worth = np.append(self._worth, np.zeros(count, bool))
         if labels is not None and len(labels.novelty):
-            worth[count - len(labels.novelty) :] = self._judge(labels)
+            end = len(self._worth) - min(labels.ahead, self._most_ahead)
+            self._worth[max(end - len(labels.novelty), 0) : end] = self._judge(labels)
         self._samples = np.concatenate([self._samples, _pcm(frames.samples)])
         self._stamps = np.append(self._stamps, frames.stamps)
         self._private = np.append(self._private, self._guard.push(count, labels))
-        self._worth = np.append(self._worth, worth)
 
     def _judge(self, labels: FrameLabels) -> Bool:
         """Return whether each window is worth keeping."""

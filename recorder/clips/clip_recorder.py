@@ -120,6 +120,7 @@ class _MicrophoneClips:
             frames,
             pipeline.feature_set.window_frames,
             TOGETHER if settings.privacy else 0,
+            pipeline.most_ahead,
         )
         self._classes: Sequence[str] | None = pipeline.classes
         self._refused = self._refusal()  # why no sound may be kept, or empty

@@ -13,7 +13,7 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
 from hearthlog.schemas.messages.topics import topic
 
-_GATE = 2.0  # dB above the floor, as of the models
+_GATE, _GATE_FRAMES = 2.0, 8  # dB above the floor, and the window, as of the models
 
 
 class MicrophoneEmbeddings:
@@ -54,25 +54,25 @@ class MicrophoneEmbeddings:
         """
         recent = np.concatenate([self._features, features])
         sound = np.zeros(len(frames), bool)
-        count = min(len(recent) - WINDOW_FRAMES + 1, len(frames))  # that end a whole second
+        count = min(len(recent) - _GATE_FRAMES + 1, len(frames))  # that end a whole window
         if count > 0:
-            sound[-count:] = self._is_sound(recent[-count - WINDOW_FRAMES + 1 :], floors)
-        self._features = recent[1 - WINDOW_FRAMES :].copy()
+            sound[-count:] = self._is_sound(recent[-count - _GATE_FRAMES + 1 :], floors)
+        self._features = recent[1 - _GATE_FRAMES :].copy()
         return self._stream.push(frames, sound, first, stamps)
 
     def _is_sound(self, features: Float32, floors: Floors | None) -> Bool:
-        """Return which seconds are above the floor, or where there is none, above -60 dBFS."""
-        count = len(features) - WINDOW_FRAMES + 1
+        """Return which windows are above the floor, or where there is none, above -60 dBFS."""
+        count = len(features) - _GATE_FRAMES + 1
         powers_of = self._feature_set.band_powers
         if floors is None or powers_of is None:
             powers = self._feature_set.power(features).astype(np.float64)
-            loud: Bool = np.convolve(powers > SILENCE_POWER, np.ones(WINDOW_FRAMES), "valid") > 0
+            loud: Bool = np.convolve(powers > SILENCE_POWER, np.ones(_GATE_FRAMES), "valid") > 0
             return loud
         sound = np.zeros(count, bool)
         known = min(len(floors.room), count)
         if known:
-            powers = powers_of(features[-known - WINDOW_FRAMES + 1 :])
-            sound[-known:] = ~is_quiet(powers, floors.room[-known:], WINDOW_FRAMES, _GATE)
+            powers = powers_of(features[-known - _GATE_FRAMES + 1 :])
+            sound[-known:] = ~is_quiet(powers, floors.room[-known:], _GATE_FRAMES, _GATE)
         return sound
 
 

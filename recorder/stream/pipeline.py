@@ -11,7 +11,7 @@ from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS
+from hearthlog.models.embedding.embeddings import DELAY_FRAMES, NO_EMBEDDINGS
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
@@ -31,7 +31,7 @@ from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.recorder.stream.sound_watch import SoundWatch, problem_of_file
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY, RollingStatistics
-from hearthlog.recorder.stream.veil import Veil
+from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames, Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.gaps import encode_gap
@@ -70,6 +70,8 @@ class Pipeline:
     ----------
     microphone : str
     feature_set : FeatureSet
+    most_ahead : int
+        Frames behind its window that a label may wait for.
     last_frames : Frames or None
         Those that were pushed last, without what is below hearing and stands out.
     """
@@ -102,7 +104,9 @@ class Pipeline:
         self._features = features.extractor()
         statistics = RollingStatistics(window, width)
         self._feature_messages = FeatureMessages(microphone, statistics, statistics_every)
-        self._veil = Veil(private, width, window) if private else None
+        self.most_ahead = 0 if self._source is None else DELAY_FRAMES
+        self._veil = Veil(private, width, window, self.most_ahead) if private else None
+        self._embedding_veil = EmbeddingVeil()
         self._held: list[EncodedMessage] = []
         self._recent: Float32 | None = None  # features of the last frames, one less than a window
         self._floor = None if features.band_powers is None else FloorTracker()
@@ -211,28 +215,35 @@ class Pipeline:
         ]
         logged = features, first, stamps
         if self._veil is not None:
-            logged = self._veil.push(*logged, self.last_labels)
-        logged_too = self._encoded(auxiliary, first, stamps)
-        messages = [*self._feature_messages(*logged), *logged_too, *labels]
+            self._embedding_veil.push(auxiliary.embeddings)
+            messages = self._veiled(self._veil.push(*logged, self.last_labels))
+        else:
+            known = stamps[auxiliary.embeddings.last_frames - first]
+            messages = self._feature_messages(*logged)
+            messages += embedding_messages(self.microphone, auxiliary.embeddings, known)
+        messages += [*self._located(auxiliary, first, stamps), *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
         return self.hold(messages)
 
-    def _encoded(self, auxiliary: Auxiliary, first: int, stamps: Int64) -> list[EncodedMessage]:
-        """Encode directions and embeddings, and remember the last ones."""
-        messages = []
+    def _veiled(self, frames: LoggedFrames) -> list[EncodedMessage]:
+        """Encode frames that may be logged, and the embeddings that end with them."""
+        embeddings = self._embedding_veil.release(frames)
+        known = frames.stamps[embeddings.last_frames - frames.first]
+        messages = self._feature_messages(frames.features, frames.first, frames.stamps)
+        return [*messages, *embedding_messages(self.microphone, embeddings, known)]
+
+    def _located(self, auxiliary: Auxiliary, first: int, stamps: Int64) -> list[EncodedMessage]:
+        """Encode the directions of frames, and remember the last ones, and the last embeddings."""
         directions, embeddings = auxiliary
-        if len(directions.frames):
-            recent = self._recent_directions.followed_by(directions)
-            self._recent_directions = recent.rows(slice(-MEMORY_BLOCKS, None))
-            known = stamps[directions.last_frames - first]
-            messages += direction_messages(self.microphone, directions, known)
-        if len(embeddings.frames):
-            latest = self._recent_embeddings.followed_by(embeddings)
-            self._recent_embeddings = latest.rows(slice(-_REMEMBERED_WINDOWS, None))
-            known = stamps[embeddings.last_frames - first]
-            messages += embedding_messages(self.microphone, embeddings, known)
-        return messages
+        latest = self._recent_embeddings.followed_by(embeddings)
+        self._recent_embeddings = latest.rows(slice(-_REMEMBERED_WINDOWS, None))
+        if not len(directions.frames):
+            return []
+        recent = self._recent_directions.followed_by(directions)
+        self._recent_directions = recent.rows(slice(-MEMORY_BLOCKS, None))
+        known = stamps[directions.last_frames - first]
+        return direction_messages(self.microphone, directions, known)
 
     def _remember(self, features: Float32, stamps: Int64) -> None:
         before = features[:0] if self._recent is None else self._recent
@@ -274,7 +285,7 @@ class Pipeline:
 
     def _unveil(self) -> list[EncodedMessage]:
         """Return the features that are held."""
-        return [] if self._veil is None else self._feature_messages(*self._veil.close())
+        return [] if self._veil is None else self._veiled(self._veil.close())
 
     def finish(self) -> list[EncodedMessage]:
         """End the open segment where the sound ends.
@@ -392,6 +403,7 @@ class Pipeline:
             self._directions.restart()
         if self._embeddings is not None:
             self._embeddings.restart()
+        self._embedding_veil.restart()
         self._feature_messages.restart()
         self._recent = None
         self._recent_floors = None

@@ -27,6 +27,8 @@ class PrivateFrames:
         Those that are private; if there are none, no frame is.
     window_frames : int
         A second, or the length of the window of a label, if that is longer.
+    ahead : int
+        Frames behind the window that labels may wait for.
 
     Attributes
     ----------
@@ -34,8 +36,9 @@ class PrivateFrames:
         Frames from one to that with which it is certain.
     """
 
-    def __init__(self, classes: Sequence[str], window_frames: int) -> None:
-        self.delay = window_frames - 1
+    def __init__(self, classes: Sequence[str], window_frames: int, ahead: int = 0) -> None:
+        self.delay = window_frames - 1 + ahead
+        self._window, self._ahead = window_frames, ahead
         self._classes = tuple(classes)
         self._begin()
 
@@ -50,17 +53,17 @@ class PrivateFrames:
         count : int
             At least one.
         labels : FrameLabels or None
-            Of the last of these frames; their classes include all that are private.
+            That became known with these frames; their classes include all that are private.
 
         Returns
         -------
         np.ndarray [shape=(m,)], bool
             Of the next m frames that are certain, whether they are private.
         """
-        likely = self._unlabelled(count)
+        self._likely = np.append(self._likely, self._unlabelled(count))
         if labels is not None and len(labels.novelty):
-            likely[count - len(labels.novelty) :] = self._judge(labels)
-        self._likely = np.append(self._likely, likely)
+            end = len(self._likely) - min(labels.ahead, self._ahead)
+            self._likely[max(end - len(labels.novelty), 0) : end] = self._judge(labels)
         return self._decide()
 
     def close(self) -> Bool:
@@ -79,7 +82,8 @@ class PrivateFrames:
         """Return whether each window may be of a private class."""
         columns = [labels.classes.index(name) for name in self._classes]
         limit = PRIVATE_LIMIT_ELSEWHERE if labels.calibrated_elsewhere else PRIVATE_LIMIT
-        likely: Bool = np.any(~(labels.probabilities[:, columns] < limit), axis=1)  # as NaN is
+        # A network hears some speech not at all: whatever it says, features may forbid.
+        likely: Bool = np.any(~(labels.by_features[:, columns] < limit), axis=1)  # as NaN is
         return likely
 
     def _unlabelled(self, count: int) -> Bool:
@@ -87,10 +91,11 @@ class PrivateFrames:
         return np.full(count, bool(self._classes))
 
     def _decide(self) -> Bool:
-        span = _BEHIND_FRAMES + self.delay + 1
-        count = len(self._likely) - span + 1
+        span = _BEHIND_FRAMES + self._window
+        known = self._likely[: len(self._likely) - self._ahead]
+        count = len(known) - span + 1
         if count <= 0:
             return np.zeros(0, bool)
-        private = np.asarray(sliding_window_view(self._likely, span).any(axis=1))
+        private = np.asarray(sliding_window_view(known, span).any(axis=1))
         self._likely = self._likely[count:]
         return private

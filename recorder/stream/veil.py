@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.stream.private_frames import PrivateFrames
 from hearthlog.schemas.arrays import Bool, Float32, Int64
@@ -13,6 +15,12 @@ from hearthlog.schemas.times import NANOSECONDS
 
 TOGETHER = NANOSECONDS // FRAME_NANOSECONDS  # frames that are averaged
 _NEVER = 2**63 - 1  # nanoseconds of UTC
+
+
+class _Frames(NamedTuple):
+    features: Float32
+    first: int
+    stamps: Int64
 
 
 class LoggedFrames(NamedTuple):
@@ -25,11 +33,14 @@ class LoggedFrames(NamedTuple):
         Number of the first frame.
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
+    private : np.ndarray [shape=(n,)], bool
+        Which of them somebody may be talking in.
     """
 
     features: Float32
     first: int
     stamps: Int64
+    private: Bool
 
 
 class Veil:
@@ -43,14 +54,16 @@ class Veil:
         Those that are private.
     width : int
         Number of features of a frame.
-    window_frames : int
+    window_frames, ahead : int
         As of `PrivateFrames`.
     """
 
-    def __init__(self, classes: Sequence[str], width: int, window_frames: int) -> None:
+    def __init__(
+        self, classes: Sequence[str], width: int, window_frames: int, ahead: int = 0
+    ) -> None:
         self._classes = frozenset(classes)
-        self._guard = PrivateFrames(classes, window_frames)
-        self._held = LoggedFrames(np.empty((0, width), np.float32), 0, np.empty(0, np.int64))
+        self._guard = PrivateFrames(classes, window_frames, ahead)
+        self._held = _Frames(np.empty((0, width), np.float32), 0, np.empty(0, np.int64))
         self._private: Bool = np.empty(0, bool)  # of the first frames that are held
 
     @property
@@ -89,7 +102,7 @@ class Veil:
             Those of the seconds that are certain; perhaps none.
         """
         held = self._held
-        self._held = LoggedFrames(
+        self._held = _Frames(
             np.concatenate([held.features, features]),
             held.first if len(held.stamps) else first,
             np.append(held.stamps, stamps),
@@ -113,10 +126,51 @@ class Veil:
     def _release(self, count: int) -> LoggedFrames:
         features, first, stamps = self._held
         private, self._private = self._private[:count], self._private[count:]
-        self._held = LoggedFrames(features[count:], first + count, stamps[count:])
+        self._held = _Frames(features[count:], first + count, stamps[count:])
         shown = features[:count].copy()
         second = (first + np.arange(count)) // TOGETHER
         for number in np.unique(second[private]):
             rows = private & (second == number)
             shown[rows] = shown[rows].mean(axis=0, dtype=np.float64)
-        return LoggedFrames(shown, first, stamps[:count])
+        return LoggedFrames(shown, first, stamps[:count], private)
+
+
+class EmbeddingVeil:
+    """Holds embeddings back until it is certain whether their windows are private, and drops those.
+
+    Frames that were not released are private.
+    """
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._held = NO_EMBEDDINGS
+        self._private: Bool = np.ones(WINDOW_FRAMES - 1, bool)  # of the last frames released
+
+    def push(self, embeddings: Embeddings) -> None:
+        """Add embeddings.
+
+        Parameters
+        ----------
+        embeddings : Embeddings
+        """
+        self._held = self._held.followed_by(embeddings)
+
+    def release(self, frames: LoggedFrames) -> Embeddings:
+        """Return the embeddings that may be logged, of those that end with some frames.
+
+        Parameters
+        ----------
+        frames : LoggedFrames
+            The next ones that the veil of features releases.
+        """
+        private = np.append(self._private, frames.private)
+        self._private = private[1 - WINDOW_FRAMES :]
+        ended = self._held.known_at(frames.first, len(frames.stamps))
+        self._held = self._held.rows(slice(len(ended.frames), None))
+        if not len(ended.frames):
+            return ended
+        windows = np.asarray(sliding_window_view(private, WINDOW_FRAMES).any(axis=1))
+        return ended.rows(np.flatnonzero(~windows[ended.last_frames - frames.first]))

@@ -67,6 +67,8 @@ class Contents:
     gaps: list[Gap] = field(default_factory=list)
     streams: list[dict[str, Any]] = field(default_factory=list)  # with the keys of `STREAM`
     health: Status | None = None  # the worst that was said, and of that the last
+    # the last that each part of the box said; not in what a log says of itself
+    last: dict[str, Status] = field(default_factory=dict, compare=False)
 
     def add(self, batch: Sequence[RawMessages], readable: IsReadable | None = None) -> None:
         """Count some messages.
@@ -96,7 +98,7 @@ class Contents:
         other : Contents
         """
         mine, theirs = (replace(each, gaps=sorted(each.gaps)) for each in (self, other))
-        names = [each.name for each in fields(Contents)]
+        names = [each.name for each in fields(Contents) if each.compare]
         return [name for name in names if getattr(mine, name) != getattr(theirs, name)]
 
     def _add_topic(self, raw: RawMessages) -> None:
@@ -142,8 +144,9 @@ class Contents:
                     unsure.update({"segments": 1, "seconds": durations[row]})
 
     def _add_health(self, columns: Columns) -> None:
-        said = [] if self.health is None else [self.health]
-        said += statuses_of(columns)
+        said = list(statuses_of(columns))
+        self.last |= {status.name: status for status in said}
+        said += [] if self.health is None else [self.health]
         self.health = max(said, key=lambda status: (status.level, status.time), default=None)
 
 

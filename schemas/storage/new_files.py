@@ -63,21 +63,18 @@ def private_folder(path: Path, *, readers: int = 0) -> None:
     OSError
         If it cannot be made.
     """
-    if path.is_dir():
-        return
-    if not path.parent.is_dir():
-        private_folder(path.parent, readers=readers)
-    path.mkdir(mode=0o700, exist_ok=True)
-    hand_over(path, 0o700 | readers | readers >> 2)
+    make_folders(path, 0o700 | readers | readers >> 2)
 
 
-def make_folders(path: Path) -> None:
-    """Make a folder, and those around it, with the rights that the umask leaves.
+def make_folders(path: Path, mode: int | None = None) -> None:
+    """Make a folder, and those around it; those that are there stay.
 
     Parameters
     ----------
     path : Path
         On this machine.
+    mode : int, optional
+        The rights of what is made; by default those that the umask leaves.
 
     Raises
     ------
@@ -86,10 +83,9 @@ def make_folders(path: Path) -> None:
     """
     if path.is_dir():
         return
-    if not path.parent.is_dir():
-        make_folders(path.parent)
-    path.mkdir(exist_ok=True)
-    hand_over(path)
+    make_folders(path.parent, mode)
+    path.mkdir(mode=0o777 if mode is None else 0o700, exist_ok=True)
+    hand_over(path, mode)
 
 
 def create_file(path: Path, mode: int = 0o600) -> BinaryIO:

@@ -22,6 +22,7 @@ import typer
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.bench import (
     bridge,
+    embedding,
     features,
     history,
     inference,
@@ -43,6 +44,7 @@ MEASUREMENTS = {
     module.__name__.rpartition(".")[2]: module.measure
     for module in (
         features,
+        embedding,
         recording,
         live,
         bridge,

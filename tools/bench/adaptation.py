@@ -103,7 +103,9 @@ def adaptation(
         yield Outcome(min(count, len(wrong)), share, before.f1(known), one.f1(known), *false)
 
 
-def wrong_sounds(logs: Sequence[RecentLog], truth: Labelling, end: int) -> list[Mark]:
+def wrong_sounds(
+    logs: Sequence[RecentLog], truth: Labelling, end: int, *, unsure: bool = False
+) -> list[Mark]:
     """Return marks of the sounds that a recorder labelled wrongly, in the order of time.
 
     Parameters
@@ -113,20 +115,21 @@ def wrong_sounds(logs: Sequence[RecentLog], truth: Labelling, end: int) -> list[
     truth : Labelling
     end : int
         In nanoseconds of UTC; what is later is left out.
+    unsure : bool, optional
+        Whether what has no class is marked as unknown.
 
     Returns
     -------
     list of Mark
-        As a person sets them; none of silence, nor of what has no class.
+        As a person sets them; none of silence.
     """
     sources = find_labellings(*[log.path for log in logs])
     microphone = sources.microphone(None)
     labelled = sources.read(microphone, LIVE).labelling
     rng = np.random.default_rng(0)  # draws nothing: this person is never wrong
     corrected = Person(truth).corrections(logs[0].start, end, labelled, rng)
-    return [
-        Mark(microphone, *one) for one in corrected if class_name(one[2]) not in {SILENCE, UNKNOWN}
-    ]
+    unmarked = {SILENCE} if unsure else {SILENCE, UNKNOWN}
+    return [Mark(microphone, *one) for one in corrected if class_name(one[2]) not in unmarked]
 
 
 def _drawn(marks: Sequence[Mark], base: Model, count: int, wrong: float) -> list[Mark]:

@@ -2,12 +2,14 @@
 
 Speech is synthesised from its features: as they are logged, in longer frames, and every 10 ms for a
 control that must be intelligible. A recogniser, PocketSphinx, hears it. Beside that, digits are
-guessed from the features themselves, by what is learned from other speakers.
+guessed from the features themselves, and from the embeddings where there is a network, by what is
+learned from other speakers; and speakers by what is learned from their other digits.
 """
 
 import csv
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -22,13 +24,16 @@ from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SPEECH
+from hearthlog.models.embedding.embeddings import WINDOW_FRAMES
+from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
+from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.auros21.names import ENERGY, FLUX
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.frames import SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench.recogniser import DIGITS, Recogniser, intelligibility, word_errors
 from hearthlog.tools.bench.vocoder import Logged, logged, sound_of
 
@@ -81,6 +86,8 @@ def privacy(
         f"{'features':10s} {'frame':>7s}  {'heard':10s} {'ESTOI':>5s} {'digits':>7s} {'words':>7s}"
     )
 
+    _print_guesses(digits)
+
     def score(make: Callable[[Float64], Float64]) -> str:
         made = [make(each.sound) for each in sentences]
         heard = [words.hear(sound) for sound in made]
@@ -102,9 +109,8 @@ def privacy(
                     return sound_of(values, len(sound), rng, voiced=voiced)  # noqa: B023
 
                 print(f"{name}  {way:10s} {score(make)}", flush=True)
-            print(
-                f"{name}  {'itself':10s} {'':5s} {guessed(digits, features, rate):6.0%}", flush=True
-            )
+            wrong = guessed(digits, partial(_row, features=features, rate=rate))
+            print(f"{name}  {'itself':10s} {'':5s} {wrong:6.0%}", flush=True)
 
 
 def _texts(manifest: Path) -> dict[Path, str]:
@@ -137,7 +143,31 @@ def _speakers(spoken: Sequence[Spoken]) -> int:
     return len({each.speaker for each in spoken})
 
 
-def guessed(digits: Sequence[Spoken], features: FeatureSet, rate: int) -> float:
+def _print_guesses(digits: Sequence[Spoken]) -> None:
+    """Print which digits, and which speakers, are guessed wrongly from what is logged."""
+    of_features = partial(_row, features=HOME33, rate=50)
+    ways: dict[str, Callable[[Float64, np.random.Generator], Float64]] = {"home33": of_features}
+    path = find_network(YAMNET.name)
+    if path is not None:
+        of_windows = partial(_windows, embedder=load_embedder(YAMNET.name, path))
+
+        def both(sound: Float64, rng: np.random.Generator) -> Float64:
+            return np.concatenate([of_features(sound, rng), of_windows(sound, rng)])
+
+        ways |= {"embedding": of_windows, "both": both}
+    print(f"{'guessed from':14s} {'digits':>7s} {'speakers':>9s}")
+    for name, describe in ways.items():
+        speakers = guessed(digits, describe, who=True)
+        print(f"{name:14s} {guessed(digits, describe):7.0%} {speakers:9.0%}", flush=True)
+    print()
+
+
+def guessed(
+    digits: Sequence[Spoken],
+    describe: Callable[[Float64, np.random.Generator], Float64],
+    *,
+    who: bool = False,
+) -> float:
     """Return the share of digits that are guessed wrongly by who knows other speakers.
 
     It is known when a digit begins and ends, but not how its frames lie in it.
@@ -146,27 +176,50 @@ def guessed(digits: Sequence[Spoken], features: FeatureSet, rate: int) -> float:
     ----------
     digits : sequence of Spoken
         Of at least two speakers.
-    features : FeatureSet
-    rate : int
-        Milliseconds from frame to frame.
+    describe : callable
+        Returns what a log has of a digit, as a row of numbers.
+    who : bool
+        Guess the speaker, knowing the speakers' other digits.
     """
     rng = np.random.default_rng(0)
-    rows = np.stack([_row(each.sound, features, rate, rng) for each in digits])
+    rows = np.stack([describe(each.sound, rng) for each in digits])
     texts = np.array([each.text for each in digits])
     speakers = np.array([each.speaker for each in digits])
+    targets, groups = (speakers, texts) if who else (texts, speakers)
     wrong = 0
-    for speaker in np.unique(speakers):
-        own = speakers == speaker
-        model = make_pipeline(StandardScaler(), SVC(C=5.0)).fit(rows[~own], texts[~own])
-        wrong += int((model.predict(rows[own]) != texts[own]).sum())
+    for group in np.unique(groups):
+        own = groups == group
+        model = make_pipeline(StandardScaler(), SVC(C=5.0)).fit(rows[~own], targets[~own])
+        wrong += int((model.predict(rows[own]) != targets[own]).sum())
     return wrong / len(digits)
 
 
-def _row(sound: Float64, features: FeatureSet, rate: int, rng: np.random.Generator) -> Float64:
-    """Describe a digit by the features of eight moments in it, and by its length."""
+def _in_room(sound: Float64, rng: np.random.Generator) -> tuple[Float64, int]:
+    """Lay a digit into the noise of a quiet room; return also where it begins."""
     before = int(rng.uniform(_PAUSE_SECONDS, 2 * _PAUSE_SECONDS) * SAMPLE_RATE)
     room = rng.standard_normal(before + len(sound) + SAMPLE_RATE) * 10 ** (_PAUSE_DBFS / 20)
     room[before : before + len(sound)] += sound * (0.3 / max(np.abs(sound).max(), _TINY))
+    return room, before
+
+
+def _windows(sound: Float64, rng: np.random.Generator, embedder: Embedder) -> Float64:
+    """Describe a digit by the embeddings around it, and by where it lies in them."""
+    room, before = _in_room(sound, rng)
+    count = len(room) // FRAME_SAMPLES
+    frames = room[: count * FRAME_SAMPLES].reshape(count, FRAME_SAMPLES).astype(np.float32)
+    stream, stamps = EmbeddingStream(embedder), np.arange(count) * FRAME_NANOSECONDS
+    windows = stream.push(frames, np.ones(count, bool), 0, stamps)
+    middle = (before + len(sound) / 2) / FRAME_SAMPLES
+    first = int(np.searchsorted(windows.frames + WINDOW_FRAMES / 2, middle)) - 1
+    first = min(max(first, 0), len(windows.frames) - 2)
+    values = embedder.projection.values(windows.values[first : first + 2]).ravel()
+    offset = middle - windows.frames[first]
+    return np.concatenate([values, [offset, len(sound) / SAMPLE_RATE]])
+
+
+def _row(sound: Float64, rng: np.random.Generator, features: FeatureSet, rate: int) -> Float64:
+    """Describe a digit by the features of eight moments in it, and by its length."""
+    room, before = _in_room(sound, rng)
     times, values = _logarithmic(logged(room, features, rate))
     moments = (before + np.linspace(0.0, 1.0, _PARTS) * len(sound)) / SAMPLE_RATE
     parts = [np.interp(moments, times, column) for column in values.T]

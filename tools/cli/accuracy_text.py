@@ -8,10 +8,11 @@ from hearthlog.analyzer.accuracy.checked_minutes import (
     checked_minutes,
 )
 from hearthlog.analyzer.accuracy.count_range import FEWEST
+from hearthlog.analyzer.accuracy.events import SET_APART
 from hearthlog.analyzer.accuracy.minute_kinds import quiet_weight
 from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged, read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.models.classes import in_words
+from hearthlog.models.classes import UNKNOWN, in_words
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.text import listed
 from hearthlog.tools.cli.text import number
@@ -46,6 +47,12 @@ class Accuracy:
                 "sounds of one kind with at most ten seconds between them count once here; in "
                 "brackets the share of all, nine times in ten"
             )
+            if beside := int(self.minutes.television.sum()):
+                names = listed([in_words(name).lower() for name in SET_APART], "and")
+                yield (
+                    f"{names} are left out of {beside} of these minutes, in which something like a "
+                    "television, a radio or company sounded"
+                )
         if 0 < len(self.minutes) < FEWEST:
             yield (
                 f"{number(FEWEST - len(self.minutes), 'more minute')}, and the report says in "
@@ -78,6 +85,8 @@ class Accuracy:
 
     def _classes(self) -> Iterator[str]:
         for name, check in self._checks():
+            if name == UNKNOWN:  # which nothing is truly
+                continue
             parts = []
             if check.precision is not None:
                 shares = _percent(check.precision)

@@ -59,11 +59,7 @@ def replay(
     """
     from hearthlog.analyzer.bridge.alerts.evaluate import rings
     from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-    from hearthlog.analyzer.bridge.alerts.rules import (
-        history,
-        unknown_class,
-        unrecorded_microphone,
-    )
+    from hearthlog.analyzer.bridge.alerts.rules import history, unknown_class, unknown_microphone
     from hearthlog.analyzer.bridge.listeners import microphone_of_listener
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -86,8 +82,8 @@ def replay(
     found = {rule.name: rings(rule, heard, first, last, zone)[0] for rule in own.alert}
     microphones = {microphone_of_listener(name) for name in heard.coverage}
     for rule in own.alert:
-        text = unrecorded_microphone(rule, microphones) or unknown_class(rule, heard.classes)
-        if text:
+        unheard = unknown_microphone(rule, microphones, recorded=True)
+        if text := unheard or unknown_class(rule, heard.classes):
             tell(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))

@@ -1,7 +1,6 @@
 """`hearthlog bridge`: what is heard, told to the systems of the home."""
 
 import signal
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
 from typing import Annotated
@@ -30,9 +29,9 @@ def bridge(
 
     The recorder takes no notice: only its logs are read. What cannot be told is tried again.
     """
-    from hearthlog.analyzer.bridge.alerts.rules import unknown_microphone
+    from hearthlog.analyzer.bridge.alerts.rule_doubts import rule_doubts
     from hearthlog.analyzer.bridge.home import Home
-    from hearthlog.analyzer.bridge.outputs import exposed_files, open_outputs
+    from hearthlog.analyzer.bridge.outputs import exposed_files, needed_modules, open_outputs
     from hearthlog.analyzer.bridge.run import Bridge
     from hearthlog.analyzer.bridge.saying import Saying
     from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
@@ -42,13 +41,15 @@ def bridge(
     from hearthlog.recorder.timezone import time_zone
 
     settings, own = load_bridge_settings(config)
-    needed = {
-        "paho": own.mqtt,
-        "prometheus_client": own.prometheus,
-        "apprise": own.alert and own.delivery.urls_file,
-    }
-    lacking = [name for name, table in needed.items() if table and find_spec(name) is None]
-    if not (own.page or own.ping or any(needed[name] for name in needed if name not in lacking)):
+    if not own.has_outputs():
+        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
+        wrong_use(
+            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
+            "tell others"
+        )
+    modules = needed_modules(own)
+    if not (own.page or own.ping or any(modules.values())):
+        lacking = [name for name, is_there in modules.items() if not is_there]
         require(*lacking)  # what else there is goes on without them
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -59,13 +60,7 @@ def bridge(
     for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
         say(line)
     microphones = [] if logs else configured_microphones(settings)
-    for line in filter(None, (unknown_microphone(rule, microphones) for rule in own.alert)):
+    for line in rule_doubts(own.alert, settings, microphones):
         say(f"alerts: {line}")
     outputs, since = open_outputs(own, home, state, say)
-    if not outputs:
-        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
-        wrong_use(
-            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
-            "tell others"
-        )
     Bridge(home, since, outputs, say).run(stop)

@@ -45,9 +45,11 @@ def check(
     """Check a configuration before a recorder or a bridge is started with it.
 
     Exit status 2: it is wrong; 1: a model, a folder or a file that it names cannot be used; 3:
-    others may read its secrets, a file may be a credential of the service, or an alert is of a
-    microphone that is not recorded.
+    others may read its secrets, a file may be a credential of the service, nobody would read a
+    text file, or an alert cannot ring.
     """
+    from hearthlog.analyzer.bridge.alerts.rule_doubts import rule_doubts
+    from hearthlog.analyzer.bridge.alerts.unheard_classes import unheard_classes
     from hearthlog.analyzer.bridge.outputs import exposed_files, output_problems
     from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
     from hearthlog.recorder.config import exposed_passwords
@@ -55,8 +57,11 @@ def check(
     from hearthlog.tools.cli.record import with_model
 
     settings, bridge = load_bridge_settings(file)
-    errors = recording_problems(with_model(settings))
-    problems, warnings = output_problems(bridge, configured_microphones(settings))
+    settings, microphones = with_model(settings), configured_microphones(settings)
+    errors = recording_problems(settings)
+    problems, warnings = output_problems(bridge)
+    warnings += rule_doubts(bridge.alert, settings, microphones)
+    warnings += unheard_classes(bridge.alert, settings, microphones)
     warnings += [*exposed_passwords(settings, file), *exposed_files(bridge, file, bridge.state)]
     for line in [*map(str, errors), *problems, *warnings]:
         tell(line)

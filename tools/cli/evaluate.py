@@ -71,7 +71,7 @@ evaluate = typer.Typer(
     cls=_Group, no_args_is_help=True, help="Score the labels of a log, a model, or a method."
 )
 
-_Method = Annotated[str, typer.Argument(help=METHODS)]
+_Method = Annotated[str | None, typer.Argument(help=METHODS, show_default=METHOD)]
 _Scenario = Annotated[str, typer.Option(help=SCENARIO)]
 _Folds = Annotated[
     Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
@@ -203,7 +203,7 @@ evaluate.command()(robustness)
 
 @evaluate.command("method")
 def evaluate_method(
-    method: _Method = METHOD,
+    method: _Method = None,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -221,11 +221,11 @@ def evaluate_method(
     check_output("--plot", plot, ".png", "a picture")
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
         result = cross_validate(segments, chosen, folds, progress)
-    title = f"{method} on {data} ({scenario}), by {folds}"
+    title = f"{chosen.name} on {data} ({scenario}), by {folds}"
     _save_plot(plot, title, result.scores, result.reliability)
     if as_json:
         print_json(
-            {"scenario": scenario, "method": method, "by": folds, "folds": result.folds}
+            {"scenario": scenario, "method": chosen.name, "by": folds, "folds": result.folds}
             | asdict(result.scores)
             | _calibration(result)
             | {"skipped": dict(segments.skipped)}
@@ -233,7 +233,7 @@ def evaluate_method(
         _end_with(segments.left_out)
         return
     print(
-        f"method {method}, scenario {scenario}: {result.scores.segments} segments of "
+        f"method {chosen.name}, scenario {scenario}: {result.scores.segments} segments of "
         f"{chosen.features.window_seconds:g} s from {result.scores.groups} sources, "
         f"{result.folds} folds by {folds}\n"
     )
@@ -244,7 +244,7 @@ def evaluate_method(
 
 @evaluate.command()
 def search(
-    method: _Method = METHOD,
+    method: _Method = None,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -262,23 +262,23 @@ def search(
         tried = grid_search.search(segments, chosen.variations(), folds, progress)
     if as_json:
         rows = [one.method.parameters | asdict(one.scores) for one in tried]
-        print_json({"scenario": scenario, "method": method, "by": folds, "tried": rows})
+        print_json({"scenario": scenario, "method": chosen.name, "by": folds, "tried": rows})
         _end_with(segments.left_out)
         return
     print(
-        f"method {method}, scenario {scenario}: {len(segments)} segments of "
+        f"method {chosen.name}, scenario {scenario}: {len(segments)} segments of "
         f"{chosen.features.window_seconds:g} s, folds by {folds}\n"
     )
     print_search(tried)
     best = tried[0].method.parameters
     options = "".join(f" --{name} {value:g}" for name, value in best.items())
-    print(f"\nhearthlog train --method {method}{options} …")
+    print(f"\nhearthlog train --method {chosen.name}{options} …")
     _end_with(segments.left_out)
 
 
 @evaluate.command()
 def adaptation(
-    method: _Method = METHOD,
+    method: _Method = None,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -297,7 +297,7 @@ def adaptation(
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
         curve = adaptation_curve(segments, chosen, progress)
     if as_json:
-        print_json({"scenario": scenario, "method": method} | curve._asdict())
+        print_json({"scenario": scenario, "method": chosen.name} | curve._asdict())
         _end_with(segments.left_out)
         return
     window = f"{chosen.features.window_seconds:g} s"
@@ -319,10 +319,11 @@ evaluate.command()(paper)
 
 @contextmanager
 def _learning(
-    name: str, data: Path, scenario: str, scheduler: str | None
+    name: str | None, data: Path, scenario: str, scheduler: str | None
 ) -> "Iterator[tuple[Method, Dataset, Progress]]":
     """Cut the clips into segments; what learns from them in the block runs on the cluster."""
     from hearthlog.analyzer.training.dataset import build_dataset
+    from hearthlog.analyzer.training.installed import clip_embedder
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.workers.parallel import fits_on
 
@@ -334,7 +335,12 @@ def _learning(
         classes = classes.with_unknown((clip.label, clip.source_group) for clip in clips)
         with share_done(f"listening to {len(clips)} clips", announce=True) as progress:
             segments = build_dataset(
-                clips, classes, progress, features=method.features, rooms=method.rooms
+                clips,
+                classes,
+                progress,
+                features=method.features,
+                rooms=method.rooms,
+                embedder=clip_embedder(method),
             )
         segments = replace(segments, left_out=[*left_out, *segments.left_out])
         with share_done(f"learning from {len(segments)} segments", announce=True) as progress:

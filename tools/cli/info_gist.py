@@ -27,7 +27,7 @@ def gist(summary: Summary) -> Iterator[str]:
             f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
             for label in known
         )
-        yield f"{microphone} heard (how often): {', '.join(amounts)}"
+        yield f"{microphone} heard, as labelled (segments): {', '.join(amounts)}"
         other = seconds.keys() - set(known)
         yield (
             f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "

@@ -119,6 +119,8 @@ def _options(
 
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
+    if sys.stdin is None:  # who started it has closed it
+        sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
     verbs = _wanted_verbs()
     if "install_service" not in verbs:  # units are for everybody to read
         os.umask(0o077)  # what comes from a home is private

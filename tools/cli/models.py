@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
+from hearthlog.tools.cli.fetch import fetch
 from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, labelled_clips, models_folder
 from hearthlog.tools.cli.scores import share
 from hearthlog.tools.cli.table import print_table
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 models = typer.Typer(
     no_args_is_help=True, help="Keep models in a folder: compare them, and choose which one labels."
 )
-
+models.command()(fetch)
 
 _HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "size")
 

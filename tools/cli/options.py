@@ -16,10 +16,11 @@ if TYPE_CHECKING:
 
 _LAST = (1 << 63) - 1  # log time
 
-METHOD = "room"  # the default one; what has it takes long to import
+METHOD = "embedding where its network is, else room"
 METHODS = (
-    "How to learn: room, room21 (the 21 features of auros21), bands, or paper; or the inputs of "
-    "room with logistic, perceptron, neighbours, forest, extra-trees, boosting, or one-class."
+    "How to learn: embedding (as room, and by what a network hears), room, room21 (the 21 features "
+    "of auros21), bands, or paper; or the inputs of room with logistic, perceptron, neighbours, "
+    "forest, extra-trees, boosting, or one-class."
 )
 
 
@@ -235,17 +236,18 @@ def scenario_files(given: list[str] | None) -> dict[str, Path]:
     return files
 
 
-def chosen_method(name: str, **parameters: float | None) -> "Method":
-    """Return a way to learn, with other parameters where they are given."""
+def chosen_method(name: str | None, **parameters: float | None) -> "Method":
+    """Return a way to learn, with other parameters where they are given; by default the best."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.training.installed import method_named
+    from hearthlog.analyzer.training.installed import default_method, method_named
 
     chosen = {key: value for key, value in parameters.items() if value is not None}
     for key, value in chosen.items():
         if not 0 < value < float("inf"):
             wrong_use(f"--{key} {value:g}: it must be more than 0")
     try:
-        return method_named(name).with_parameters(chosen)
+        method = default_method() if name is None else method_named(name)
+        return method.with_parameters(chosen)
     except DataError as error:
         wrong_use(str(error))
 

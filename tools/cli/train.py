@@ -66,7 +66,7 @@ def train(
             show_default="the one that labelled the latest log",
         ),
     ] = None,
-    method: Annotated[str, typer.Option(help=METHODS)] = METHOD,
+    method: Annotated[str | None, typer.Option(help=METHODS, show_default=METHOD)] = None,
     cost: Annotated[
         float | None,
         typer.Option(help="Cost of a wrong segment; `evaluate search` finds a good one."),
@@ -112,8 +112,11 @@ def train(
         model, segments = _adapted(base, home, scenario or "")
     else:
         assert scenario is not None
+        from hearthlog.analyzer.training.installed import DEFAULT
         from hearthlog.analyzer.workers.parallel import fits_on
 
+        if speakers and method is None:
+            method = DEFAULT.name  # who speaks is told by the features
         chosen = chosen_method(method, cost=cost, gamma=gamma)
         with fits_on(scheduler):
             words = scenario, home or [], chosen, smoothing
@@ -231,6 +234,7 @@ def _learned(
     left_out: "list[LeftOut]",
 ) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import build_dataset
+    from hearthlog.analyzer.training.installed import clip_embedder
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.training.train import train_model
     from hearthlog.models.classes import UNKNOWN
@@ -249,7 +253,10 @@ def _learned(
         )
     recordings = list(_home_recordings(home, method.features, method.gate))
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
+        heard = clip_embedder(method)
+        segments = build_dataset(
+            clips, chosen, report, recordings, method.features, method.rooms, heard
+        )
     _tell_left_out(segments.left_out)
     left_out += segments.left_out
     _warn_of_few(segments)
@@ -364,7 +371,7 @@ def _print(model: "Model", segments: "Dataset") -> None:
     data, amounts = model.description.training_data, ("sources", "seconds", "segments")
     adapted = bool(data.base_sha256)
     if not adapted:  # else the figures are those of another model, which has said them
-        _print_figures(model)
+        print_figures(model)
     if data.home:
         home = "also learned from the home"
         print(home if adapted else f"\n{home} (the figures above are those without it)")
@@ -378,7 +385,9 @@ def _print(model: "Model", segments: "Dataset") -> None:
     print_skipped(segments.skipped)
 
 
-def _print_figures(model: "Model") -> None:
+def print_figures(model: "Model") -> None:
+    """Print what a model was learned from, and how good it is on sources it has not heard."""
+    from hearthlog.models.classes import UNKNOWN
     from hearthlog.models.classifiers.installed import classifier_kind
 
     description, metrics = model.description, model.description.metrics
@@ -392,15 +401,16 @@ def _print_figures(model: "Model") -> None:
         rows.append((name, *_amounts(amount), *figures))
     head = "class", "sources", "seconds", "segments", "precision", "recall", "F1"
     print_table(head, rows)
+    others = f" without {UNKNOWN}" * (UNKNOWN in description.classes)
     print(
-        f"\nmacro F1 {metrics.macro_f1:.3f}, expected calibration error "
+        f"\nmacro F1 {metrics.macro_f1:.3f}{others}, expected calibration error "
         f"{metrics.expected_calibration_error:.3f} (cross-validated, {metrics.folds} folds, "
         "sources never split)"
     )
     if (elsewhere := description.elsewhere) is not None:
         print(
             f"in collections that nothing was learned from: {elsewhere.right:.0%} of "
-            f"{elsewhere.segments} segments right, expected calibration error "
+            f"{elsewhere.segments} segments of its classes right, expected calibration error "
             f"{elsewhere.expected_calibration_error:.3f} ({elsewhere.collections} left out in turn)"
         )
     parameters = [f"{name} {value:.4g}" for name, value in description.parameters.items()]

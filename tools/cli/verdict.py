@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.gate.judge import Verdict
     from hearthlog.models.modelfile.judgement import Judgement
 
+_WHOLE_DAY = 0.95 * 24 * 60  # minutes
+
 
 def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
     """Print what would change, how to hear that, and on what it is seen.
@@ -62,6 +64,9 @@ def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
     changes = evidence.changes
     much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")
     whole = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
+    day = changes.minutes.sum()
+    mean = f" (a day: the {time_words(day)} that a mean day with logs has)"
+    end = (mean if changes.each and day < _WHOLE_DAY else "") + end
     print(
         f"\n{model} in place of {champion} would change{much}{whole}, judged by "
         f"{time_words(evidence.minutes)} of the last two weeks that it has not learned from{end}"

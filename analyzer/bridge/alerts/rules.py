@@ -269,46 +269,52 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
     ]
     if not own or any(rule.label in names for names in own):
         return ""
-    return f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard"
+    there = listed(sorted(set().union(*own) - {SILENCE}), "and")
+    return (
+        f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard; "
+        f"there are {there}"
+    )
 
 
-def unknown_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
+def unknown_microphone(
+    rule: AlertRule, microphones: Collection[str], *, recorded: bool = False
+) -> str:
     """Say that there is no microphone of the name that a rule has; empty if there is.
 
     Parameters
     ----------
     rule : AlertRule
     microphones : collection of str
-        Those that are configured; without any nothing is known.
+        Those that there are; without any nothing is known.
+    recorded : bool, optional
+        Whether these are the ones that logs have something of, not those that are configured.
     """
-    if not (name := _missing(rule, microphones)):
+    name = rule.microphone if isinstance(rule, _SoundRule) else ""
+    if not microphones or name in {"", *microphones}:
         return ""
-    return (
-        f"{rule.name}: there is no microphone {name!r}, so that it hears nothing; there is "
-        f"{listed(sorted(microphones))}"
+    lacks = (
+        f"nothing of the microphone {name!r} was recorded in this time"
+        if recorded
+        else f"there is no microphone {name!r}, so that it hears nothing"
     )
+    return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
 
 
-def unrecorded_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
-    """Say that logs have nothing of the microphone that a rule has; empty if they have.
+def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
+    """Say that nothing labels what the microphone of a rule hears; empty if something does.
 
     Parameters
     ----------
     rule : AlertRule
     microphones : collection of str
-        Those that the logs have something of; without any nothing is known.
+        Those without a model.
     """
-    if not (name := _missing(rule, microphones)):
+    if not isinstance(rule, _SoundRule) or rule.microphone not in microphones:
         return ""
     return (
-        f"{rule.name}: nothing of the microphone {name!r} was recorded in this time; there is "
-        f"{listed(sorted(microphones))}"
+        f"{rule.name}: the microphone {rule.microphone!r} has no model, so that no sound of it has "
+        "a class"
     )
-
-
-def _missing(rule: AlertRule, microphones: Collection[str]) -> str:
-    name = rule.microphone if isinstance(rule, _SoundRule) else ""
-    return name if microphones and name not in microphones else ""
 
 
 def live_history(rule: AlertRule) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.models.embedding.folders import network_folders
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.network.card import (
     INPUTS,
@@ -13,7 +14,6 @@ from hearthlog.models.features.network.card import (
     card_names,
     find_card,
     has_card,
-    network_folders,
     read_card,
 )
 from hearthlog.models.features.network.extractor import NetworkExtractor

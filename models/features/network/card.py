@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
+from hearthlog.models.embedding.folders import network_folders
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.storage.small_file import read_toml, read_whole
@@ -91,18 +92,6 @@ class NetworkCard:
         shaping = [self.sample_rate, self.window, self.hop, len(self.names)]
         text = json.dumps([*shaping, self.input, self.output])
         return 1 + zlib.crc32(text.encode()) % ((1 << 31) - 1)
-
-
-def network_folders() -> list[Path]:
-    """Return the folders of networks: `hearthlog/networks` of the folders of data.
-
-    Those are `$XDG_DATA_HOME` (`~/.local/share`) and `$XDG_DATA_DIRS` (`/usr/local/share` and
-    `/usr/share`), as in the XDG Base Directory Specification.
-    """
-    of_user = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")  # noqa: PTH111  that of Path raises where there is no home
-    of_all = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
-    folders = [Path(text) for text in [of_user, *of_all.split(":")]]
-    return [folder / "hearthlog" / "networks" for folder in folders if folder.is_absolute()]
 
 
 def card_names() -> list[str]:

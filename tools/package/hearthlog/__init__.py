@@ -6,6 +6,7 @@ are imported when they are used: `import hearthlog` costs a recorder nothing.
 
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from hearthlog._version import __version__
@@ -59,10 +60,19 @@ _MODULES = (
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        for module in map(import_module, _MODULES):
+        for module in map(_imported, _MODULES):
             if hasattr(module, name):
                 return getattr(module, name)
     raise AttributeError(f"module 'hearthlog' has no attribute {name!r}")
+
+
+def _imported(module: str) -> ModuleType:
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        from hearthlog.analyzer.extras import MissingModuleError, missing  # noqa: PLC0415
+
+        raise MissingModuleError(missing(error.name or module)) from error
 
 
 def __dir__() -> list[str]:

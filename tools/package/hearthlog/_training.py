@@ -5,7 +5,11 @@ from pathlib import Path
 
 from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
 from hearthlog.analyzer.training.dataset import UNREADABLE, build_dataset, clip_recordings
-from hearthlog.analyzer.training.installed import DEFAULT, method_named
+from hearthlog.analyzer.training.installed import (
+    clip_embedder,
+    default_method,
+    method_named,
+)
 from hearthlog.analyzer.training.manifest import LeftOut, left_out_lines, read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import train_model
@@ -17,7 +21,7 @@ __all__ = ["Comparison", "compare", "train"]
 
 
 def train(
-    manifest: Path | str, scenario: str, method: str = DEFAULT.name, smoothing: str = "hmm"
+    manifest: Path | str, scenario: str, method: str | None = None, smoothing: str = "hmm"
 ) -> Model:
     """Learn a model from labelled clips, and measure it on sources that it has not heard.
 
@@ -27,9 +31,10 @@ def train(
         CSV file with the columns `path`, `label` and `source_group`.
     scenario : str
         What to tell apart: `bathroom`, `general`, or a TOML file.
-    method : str
-        `room`, `room21` (the same of the 21 features of auros21), `bands`, `paper`, or one that
-        another distribution adds.
+    method : str, optional
+        `embedding`, `room`, `room21` (the same of the 21 features of auros21), `bands`, `paper`, or
+        one that another distribution adds. By default `embedding` where its network is, else
+        `room`.
     smoothing : str
         How labels become segments: `hmm` or `merge`.
 
@@ -56,11 +61,19 @@ def train(
     >>> model.description.metrics.macro_f1 > 0.5
     True
     """
-    chosen, way = load_scenario(scenario), method_named(method)
+    chosen = load_scenario(scenario)
+    way = default_method() if method is None else method_named(method)
     left_out: list[LeftOut] = []
     clips = read_manifest(Path(manifest), chosen.labels, left_out)
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
-    data = build_dataset(clips, chosen, ignore_progress, features=way.features, rooms=way.rooms)
+    data = build_dataset(
+        clips,
+        chosen,
+        ignore_progress,
+        features=way.features,
+        rooms=way.rooms,
+        embedder=clip_embedder(way),
+    )
     for line in left_out_lines([*left_out, *data.left_out]):
         warnings.warn(line, stacklevel=2)
     return train_model(data, chosen, ignore_progress, way, smoothing)

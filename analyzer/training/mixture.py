@@ -1,0 +1,354 @@
+"""A classifier and heads on what a network hears, learned, tried and calibrated together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from sklearn.metrics import f1_score
+
+from hearthlog.analyzer.training.calibration import inverse_temperature
+from hearthlog.analyzer.training.cross_validation import Fold
+from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.heads import LinearHeads, learn_heads
+from hearthlog.analyzer.training.scenario import BUILTIN
+from hearthlog.models.classes import OTHER, SILENCE, UNKNOWN
+from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
+from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed, sounds_of
+from hearthlog.models.embedding.networks import NETWORKS
+from hearthlog.models.embedding.projection import read_projection
+from hearthlog.schemas.arrays import Bool, Float64, Indices
+
+HEAD_WEIGHTS = (1.0, 1.0)  # of the head on components, and on groups of names
+MACHINE_WEIGHT = 0.75
+CLASS_EXPONENT = 0.2
+_NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
+_REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
+_OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
+
+
+@dataclass(frozen=True)
+class Hearing:
+    """What of a network heads take.
+
+    Attributes
+    ----------
+    network, projection_sha256 : str
+    names : tuple of str
+        Of the values of a window.
+    inputs : tuple of slice
+        Of the linear heads.
+    """
+
+    network: str
+    projection_sha256: str
+    names: tuple[str, ...]
+    inputs: tuple[slice, ...]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups, which the last of the heads takes."""
+        return self.names[self.inputs[-1]]
+
+
+def hearing_of(network: str) -> Hearing:
+    """Return what heads take of a network.
+
+    Parameters
+    ----------
+    network : str
+        Its name.
+
+    Raises
+    ------
+    ModelError
+        If it is not known, or its projection is damaged.
+    """
+    projection = read_projection(NETWORKS.get(network).projection)
+    components = projection.components.shape[1]
+    groups = projection.names.index("outside") + 1
+    return Hearing(
+        network,
+        projection.sha256,
+        projection.names,
+        (slice(0, components), slice(components, groups)),
+    )
+
+
+def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
+    """Tell which of the windows for heads must not be learned from, as segments are left out.
+
+    Parameters
+    ----------
+    data : Dataset
+    unseen : np.ndarray [shape=(k,)], intp
+        Segments that are left out: with them go the sources and collections of which all segments
+        are.
+    """
+    seen = np.setdiff1d(np.arange(len(data)), unseen)
+    lost = np.zeros(len(data.heard.target), bool)
+    for of_segments, of_windows in (
+        (data.group, data.heard.group),
+        (data.collection, data.heard.collection),
+    ):
+        lost |= np.isin(of_windows, np.setdiff1d(of_segments[unseen], of_segments[seen]))
+    return lost
+
+
+def said_unseen(
+    data: Dataset, mix: EmbeddingMix, hearing: Hearing, folds: Sequence[Fold]
+) -> Float64:
+    """Let heads hear segments that they have not learned from.
+
+    Parameters
+    ----------
+    data : Dataset
+    mix : EmbeddingMix
+    hearing : Hearing
+    folds : sequence of Fold
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+        As `EmbeddingHeads.log_probabilities`; NaN of segments without an embedding, or in no fold.
+    """
+    said = np.full((len(data), len(data.classes)), np.nan)
+    for _, unseen in folds:
+        seen = ~unseen_windows(data, unseen)
+        learned = learn_heads(data.heard, data.classes, hearing.inputs, seen)
+        heads = EmbeddingHeads(mix, *learned, data.classes)
+        heard = unseen[data.is_embedded[unseen]]
+        said[heard] = heads.log_probabilities(data.embedded[heard])
+    return said
+
+
+class Tried(NamedTuple):
+    """A way of leaving out, with what a classifier says of what was left out.
+
+    Attributes
+    ----------
+    folds : sequence of Fold
+    decisions : np.ndarray [shape=(n, C)], float64
+        Of the classifier, times its inverse temperature.
+    used : np.ndarray [shape=(n,)], bool
+        By which segments it is found how sure the mix may be.
+    """
+
+    folds: Sequence[Fold]
+    decisions: Float64
+    used: Bool
+
+
+class Mixture(NamedTuple):
+    """What was learned.
+
+    Attributes
+    ----------
+    mix : EmbeddingMix
+    heads : LinearHeads
+    of_sources, of_collections : np.ndarray [shape=(n, C)], float64
+        Logarithms of the probabilities of segments left out, with what the others say of how sure
+        the mix may be.
+    """
+
+    mix: EmbeddingMix
+    heads: LinearHeads
+    of_sources: Float64
+    of_collections: Float64 | None
+
+
+class BestMix(NamedTuple):
+    """The better one of the ways to mix.
+
+    Attributes
+    ----------
+    mix : EmbeddingMix
+    said : list of np.ndarray [shape=(n, C)], float64
+        What heads say of segments, for each way of leaving out.
+    left_out : list of np.ndarray [shape=(n, C)], float64
+        Logarithms of the probabilities of segments, as sure as the others allow.
+    """
+
+    mix: EmbeddingMix
+    said: list[Float64]
+    left_out: list[Float64]
+
+
+def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
+    """Try heads and a classifier together, with and without the names of the network as they are.
+
+    They say what is of no class of the scenario, and, where the recordings of a class are too few
+    to learn from, of which class it is; they are mixed in where segments left out are told better.
+
+    Parameters
+    ----------
+    data : Dataset
+        With windows for heads.
+    hearing : Hearing
+    ways : sequence of Tried
+        At least one.
+    """
+    plain = _plain(hearing)
+    said = [said_unseen(data, plain, hearing, way.folds) for way in ways]
+    best = BestMix(plain, said, _left_out(data, plain, ways, said))
+    for head in (rejecting_head(hearing, data.classes), names_head(hearing, data.classes)):
+        if head is None:
+            continue
+        mix = plain.model_copy(update={"names": [head]})
+        of_names = _said_by_names(data, mix)
+        with_names = [one + of_names for one in said]
+        other = BestMix(mix, with_names, _left_out(data, mix, ways, with_names))
+        best = max(best, other, key=lambda one: _right(data, one.left_out))
+    return best
+
+
+def learn_mixture(
+    data: Dataset, hearing: Hearing, sources: Tried, collections: Tried | None
+) -> Mixture:
+    """Learn heads, and how sure they and a classifier may be together.
+
+    Parameters
+    ----------
+    data : Dataset
+        With windows for heads.
+    hearing : Hearing
+    sources : Tried
+    collections : Tried or None
+        None if there are too few of them.
+    """
+    ways = [sources] if collections is None else [sources, collections]
+    best = best_mix(data, hearing, ways)
+    everything = np.ones(len(data), bool)
+    inverse = _inverse_temperature(data, best.mix, ways[-1], best.said[-1], everything)
+    mix = best.mix.model_copy(update={"inverse_temperature": inverse})
+    heads = learn_heads(data.heard, data.classes, hearing.inputs)
+    return Mixture(mix, heads, best.left_out[0], None if collections is None else best.left_out[1])
+
+
+def _left_out(
+    data: Dataset, mix: EmbeddingMix, ways: Sequence[Tried], said: Sequence[Float64]
+) -> list[Float64]:
+    return [_nested(data, mix, way, one) for way, one in zip(ways, said, strict=True)]
+
+
+def _plain(hearing: Hearing) -> EmbeddingMix:
+    return EmbeddingMix(
+        network=hearing.network,
+        projection_sha256=hearing.projection_sha256,
+        values=len(hearing.names),
+        head_weights=list(HEAD_WEIGHTS),
+        machine_weight=MACHINE_WEIGHT,
+        inverse_temperature=1.0,
+    )
+
+
+def rejecting_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
+    """Return what the names of a network say of whether a sound is of any known class.
+
+    Parameters
+    ----------
+    hearing : Hearing
+    classes : sequence of str
+
+    Returns
+    -------
+    NamesHead or None
+        None where there is no class `unknown`, or no known one has a name.
+    """
+    first, groups = hearing.inputs[-1].start, hearing.groups
+    known = [name for name in classes if name not in {SILENCE, UNKNOWN}]
+    named = {group for name in known for group in _groups_of(name)} & set(groups)
+    others = set(groups) - named - {SILENCE}
+    if UNKNOWN not in classes or not named or not others:
+        return None
+    inside = [first + number for number, group in enumerate(groups) if group in named]
+    outside = [first + number for number, group in enumerate(groups) if group in others]
+    return NamesHead(
+        weight=_REJECTING_WEIGHT,
+        slope=_NAMES_SLOPE,
+        classes={**dict.fromkeys(known, inside), UNKNOWN: outside},
+        bias={UNKNOWN: _REJECTING_BIAS},
+    )
+
+
+def names_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
+    """Return what the names of a network say of some classes; None if one of them has no name.
+
+    Parameters
+    ----------
+    hearing : Hearing
+    classes : sequence of str
+    """
+    first, groups = hearing.inputs[-1].start, hearing.groups
+    named = {name: _groups_of(name) for name in classes if name != SILENCE}
+    if len(named) < 2 or not all(one in groups for same in named.values() for one in same):
+        return None
+    numbers = {name: [first + groups.index(one) for one in same] for name, same in named.items()}
+    return NamesHead(weight=_NAMES_WEIGHT, slope=_NAMES_SLOPE, classes=numbers)
+
+
+def _groups_of(name: str) -> list[str]:
+    """Return the groups of names that mean a class."""
+    return {UNKNOWN: ["outside"], OTHER: sorted(_OF_GENERAL)}.get(name, [name])
+
+
+def _said_by_names(data: Dataset, mix: EmbeddingMix) -> Float64:
+    """Return what names alone say of all segments; they have not learned from any."""
+    said = np.zeros((len(data), len(data.classes)))
+    nothing = np.zeros((0, mix.values, len(data.classes)), np.int32)
+    alone = mix.model_copy(update={"head_weights": []})
+    heads = EmbeddingHeads(alone, nothing, nothing[:, 0], data.classes)
+    if data.is_embedded.any():
+        said[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
+    return said
+
+
+def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, said: Float64) -> Float64:
+    """Mix what is said of segments left out, those of each fold as sure as the others allow."""
+    result = way.decisions - _log_sum(way.decisions)
+    for _, unseen in way.folds:
+        others = np.ones(len(data), bool)
+        others[unseen] = False
+        inverse = _inverse_temperature(data, mix, way, said, others)
+        heard = unseen[~np.isnan(said[unseen]).any(axis=1)]
+        surer = mix.model_copy(update={"inverse_temperature": inverse})
+        result[heard] = mixed(way.decisions[heard], said[heard], surer, data.classes)
+    return result
+
+
+def _inverse_temperature(
+    data: Dataset, mix: EmbeddingMix, way: Tried, said: Float64, chosen: Bool
+) -> float:
+    """Find how sure the mix may be of which sound it is, by some of the segments."""
+    sounds = sounds_of(data.classes)
+    used = chosen & way.used & np.isin(data.target, sounds) & ~np.isnan(said).any(axis=1)
+    if not used.any():
+        return 1.0
+    plain = mix.model_copy(update={"inverse_temperature": 1.0})
+    decisions = mixed(way.decisions[used], said[used], plain, data.classes)[:, sounds]
+    return inverse_temperature(decisions, np.searchsorted(sounds, data.target[used]))
+
+
+def _right(data: Dataset, results: Sequence[Float64]) -> float:
+    """Return the mean macro F1 of ways of leaving out."""
+    numbers = np.unique(data.target)
+    return float(
+        np.mean(
+            [
+                f1_score(
+                    data.target,
+                    one.argmax(axis=1),
+                    labels=numbers,
+                    average="macro",
+                    zero_division=0,
+                )
+                for one in results
+            ]
+        )
+    )
+
+
+def _log_sum(values: Float64) -> Float64:
+    highest = values.max(axis=1, keepdims=True)
+    total: Float64 = np.log(np.exp(values - highest).sum(axis=1, keepdims=True)) + highest
+    return total

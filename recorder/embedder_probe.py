@@ -1,0 +1,278 @@
+"""The network of sounds at the start of a recorder: tried in a process of its own first.
+
+A runtime that crashes, hangs or takes too much memory must not take the recorder with it. The
+module is that process, too: ``embedder_probe NAME FILE`` answers in one line of JSON.
+"""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
+from hearthlog.models.embedding.networks import (
+    NETWORKS,
+    Embedder,
+    find_network,
+    load_embedder,
+)
+from hearthlog.models.embedding.runtimes import missing_modules
+from hearthlog.models.errors import ModelError
+from hearthlog.recorder.modules import module_command
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.text import printable
+
+NO_NETWORK = "none"  # in place of a name
+DEFAULT_NETWORK = "yamnet"
+_HOP_SECONDS = HOP_FRAMES * FRAME_SAMPLES / SAMPLE_RATE
+_MOST_SHARE = 0.5  # of the hop
+_MOST_MEGABYTES = 300  # of the 600 that the service may take
+_PATIENCE_SECONDS = 30.0
+_WINDOWS = 5
+_MODULE = "hearthlog.recorder.embedder_probe"
+_GOES_ON = "it is recorded without a network"
+_SIGNALS: dict[int, str] = {
+    signal.SIGILL: "this processor lacks instructions that its runtime needs",
+    signal.SIGKILL: "perhaps there is too little memory",
+}
+
+
+class Probe(NamedTuple):
+    """What came of trying a network.
+
+    Attributes
+    ----------
+    seconds : float
+        That a window takes here.
+    megabytes : float
+        Most memory of a process that does nothing else; 0 where that is not known.
+    different_answers : list of str
+        As of `Embedder`.
+    """
+
+    seconds: float
+    megabytes: float
+    different_answers: list[str]
+
+    @property
+    def hop_seconds(self) -> float:
+        """Hop that this machine could hold."""
+        return self.seconds / _MOST_SHARE
+
+
+def probe_network(name: str, path: Path) -> Probe:
+    """Load a network in a process of its own, and try it.
+
+    Parameters
+    ----------
+    name : str
+    path : Path
+        Its file.
+
+    Raises
+    ------
+    ModelError
+        If it cannot be used, crashes, hangs, or takes too much memory.
+    """
+    network = NETWORKS.get(name)
+    if missing_modules(network.suffix):
+        extra = "embedding" if network.suffix == ".tflite" else "onnx"
+        raise ModelError(
+            f"{path}: its runtime is not installed; try: pip install '.[{extra}]' in a clone of "
+            "hearthlog"
+        )
+    try:
+        result = subprocess.run(  # noqa: S603  our own module
+            [*module_command(_MODULE), name, str(path)],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            cwd="/",
+            timeout=_PATIENCE_SECONDS,
+            start_new_session=True,  # Ctrl-C is for the recorder
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise ModelError(
+            f"{path}: the network hangs: no answer in {_PATIENCE_SECONDS:g} s; fetch it again: "
+            f"hearthlog models fetch {name}"
+        ) from error
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be tried ({error.strerror or error})") from error
+    if result.returncode < 0:
+        raise ModelError(f"{path}: {_crash(-result.returncode)}")
+    try:
+        answer = json.loads(result.stdout.splitlines()[-1])
+    except (ValueError, IndexError) as error:
+        last = (result.stderr.decode(errors="replace").splitlines() or ["it says nothing"])[-1]
+        raise ModelError(f"{path}: cannot be tried ({last[:200]})") from error
+    if "error" in answer:
+        raise ModelError(answer["error"])
+    if answer["megabytes"] > _MOST_MEGABYTES:
+        raise ModelError(
+            f"{path}: the network takes {answer['megabytes']:.0f} MB of memory, and "
+            f"{_MOST_MEGABYTES} are the most"
+        )
+    return Probe(**answer)
+
+
+def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | None, str]:
+    """Load the network that a recorder listens with, if there is one that this machine can run.
+
+    Parameters
+    ----------
+    wanted : str, optional
+        Name of a network, or none; empty for yamnet if it is there.
+    microphones : int, optional
+        How many are listened to.
+
+    Returns
+    -------
+    embedder : Embedder or None
+        None: it is recorded without a network.
+    line : str
+        Why; empty if there is nothing to say.
+    """
+    if wanted == NO_NETWORK:
+        return None, ""
+    name = wanted or DEFAULT_NETWORK
+    try:
+        path = network_path(name)
+    except ModelError as error:
+        return None, f"{error}; {_GOES_ON}" if wanted else ""
+    try:
+        check_pace(path, _probed(name, path, path.stat().st_mtime_ns), microphones)
+        return load_embedder(name, path), ""
+    except ModelError as error:
+        return None, f"{error}; {_GOES_ON}"
+    except Exception as error:  # noqa: BLE001  no runtime may keep a recorder from its start
+        return None, f"{path}: cannot be used ({printable(repr(error))[:200]}); {_GOES_ON}"
+
+
+@lru_cache(maxsize=4)
+def _probed(name: str, path: Path, _changed: int) -> Probe:
+    """Try a file once in the life of a process."""
+    return probe_network(name, path)
+
+
+def check_network(wanted: str, microphones: int = 1) -> None:
+    """Check the network that is configured by its name, if one is.
+
+    Parameters
+    ----------
+    wanted : str
+        As of `open_embedder`.
+    microphones : int, optional
+
+    Raises
+    ------
+    ModelError
+        If it is not there, or cannot be used.
+    """
+    if wanted not in {"", NO_NETWORK}:
+        path = network_path(wanted)
+        check_pace(path, probe_network(wanted, path), microphones)
+
+
+def network_path(name: str) -> Path:
+    """Return the file of a network.
+
+    Parameters
+    ----------
+    name : str
+
+    Raises
+    ------
+    ModelError
+        If there is no such network, or its file was not fetched.
+    """
+    path = find_network(name)
+    if path is None:
+        raise ModelError(
+            f"the network {name} is not there; hearthlog models fetch {name} brings it"
+        )
+    return path
+
+
+def check_pace(path: Path, probe: Probe, microphones: int = 1) -> None:
+    """Check whether this machine is quick enough for a network.
+
+    Parameters
+    ----------
+    path : Path
+        Its file.
+    probe : Probe
+    microphones : int, optional
+        How many are listened to.
+
+    Raises
+    ------
+    ModelError
+        If a window would take more than half of the time to the next.
+    """
+    if microphones * probe.seconds > _MOST_SHARE * _HOP_SECONDS:
+        of = f" of each of {microphones} microphones" if microphones > 1 else ""
+        raise ModelError(
+            f"{path}: too slow here: {probe.seconds:.2g} s for a window, every {_HOP_SECONDS:g} s"
+            f"{of}; this machine holds one every {microphones * probe.hop_seconds:.2g} s"
+        )
+
+
+def _crash(number: int) -> str:
+    try:
+        name = signal.Signals(number).name
+    except ValueError:
+        name = f"signal {number}"
+    why = _SIGNALS.get(number, "another version of its runtime may not: pip install --upgrade …")
+    return f"the network crashes ({name}): {why}"
+
+
+def main() -> None:
+    """Try a network, and answer in JSON."""
+    name, path = sys.argv[1], Path(sys.argv[2])
+    try:
+        embedder = load_embedder(name, path)
+        answer = {
+            "seconds": _window_seconds(embedder),
+            "different_answers": embedder.different_answers(),
+            "megabytes": _most_megabytes(),
+        }
+    except ModelError as error:
+        answer = {"error": str(error)}
+    sys.stdout.write(json.dumps(answer) + "\n")
+
+
+def _most_megabytes() -> float:
+    """Return the most memory that this process had; 0 where the system does not say.
+
+    That of `getrusage` counts what the process had that started it.
+    """
+    try:
+        status = Path("/proc/self/status").read_text("ascii", "replace")
+    except OSError:
+        return 0.0
+    found = re.search(r"^VmHWM:\s+(\d+) kB$", status, re.MULTILINE)
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def _window_seconds(embedder: Embedder) -> float:
+    """Return the least time of some windows: others may be busy for a while, as after a boot."""
+    window = np.zeros((WINDOW_FRAMES, FRAME_SAMPLES), np.float32)
+    times = []
+    for _ in range(_WINDOWS):
+        begin = time.perf_counter()
+        embedder(window)
+        times.append(time.perf_counter() - begin)
+        if times[-1] > _HOP_SECONDS:
+            break
+    return min(times)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""What a network gives is logged where there is sound, and labels come from what is logged."""
+
+import itertools
+import json
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
+from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
+from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding.networks import YAMNET, load_embedder
+from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.recorder.stream.private_frames import PrivateFrames
+from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.messages.topics import EmbeddingSource
+
+START = 1_772_000_000_000_000_000
+SOURCE = EmbeddingSource("yamnet", "a" * 64, "b" * 64, ("one", "two"), (0.25, 0.5))
+
+
+class Doubling:
+    """An embedder that needs no network: the least and the greatest sample, in hundredths."""
+
+    source = SOURCE
+
+    def __call__(self, window):
+        return np.rint(100 * np.array([window.min(), window.max()])).astype(np.int8)
+
+
+class AsTheyAre:
+    """Heads that say what the integers are."""
+
+    def log_probabilities(self, values):
+        return values.astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def embedder():
+    pytest.importorskip("ai_edge_litert")
+    path = Path(__file__).parents[2] / "shared" / "data" / "networks" / "yamnet.tflite"
+    if not path.exists():
+        pytest.skip("needs the network, in ../shared/data/networks")
+    return load_embedder(YAMNET.name, path)
+
+
+def stamps_of(first, count):
+    return START + np.arange(first, first + count) * FRAME_NANOSECONDS
+
+
+def pushed(stream, frames, sound, first, sizes):
+    """Push frames in pieces and join what comes."""
+    parts, begin, sizes = [NO_EMBEDDINGS], 0, itertools.cycle(sizes)
+    while begin < len(frames):
+        rows = slice(begin, begin + next(sizes))
+        stamps = stamps_of(first + begin, len(frames[rows]))
+        parts.append(stream.push(frames[rows], sound[rows], first + begin, stamps))
+        begin = rows.stop
+    return reduce(lambda one, other: one.followed_by(other), parts)
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def embeddings_at(*frames):
+    numbers = np.array(frames, np.int64)
+    values = np.stack([numbers % 100, -(numbers % 100)], axis=1).astype(np.int8)
+    return Embeddings(numbers, START + numbers * FRAME_NANOSECONDS, values)
+
+
+@pytest.mark.parametrize("first", [0, 3, 10, 1237])
+@pytest.mark.parametrize("sizes", [(1,), (7, 20, 3), (1000,)])
+def test_windows_begin_at_tens_of_frames_and_are_the_same_in_pieces_of_any_size(first, sizes):
+    frames = np.random.default_rng(first).uniform(-1, 1, (120, FRAME_SAMPLES)).astype(np.float32)
+    sound = np.ones(120, bool)
+    whole = pushed(EmbeddingStream(Doubling()), frames, sound, first, (len(frames),))
+    assert same(whole, pushed(EmbeddingStream(Doubling()), frames, sound, first, sizes))
+    begins = [n for n in range(first, first + 120 - WINDOW_FRAMES + 1) if n % 10 == 0]
+    assert whole.frames.tolist() == begins
+    assert whole.stamps.tolist() == [START + n * FRAME_NANOSECONDS for n in begins]
+
+
+def test_only_windows_with_sound_within_half_a_second_of_their_middle_are_embedded():
+    sound = np.zeros(200, bool)
+    sound[100:108] = True
+    frames = np.zeros((200, FRAME_SAMPLES), np.float32)
+    windows = pushed(EmbeddingStream(Doubling()), frames, sound, 0, (200,))
+    assert windows.frames.tolist() == [90, 100]  # 80 ends before it, 110 is half a second later
+    assert not len(pushed(EmbeddingStream(Doubling()), frames, sound & False, 0, (200,)).frames)
+
+
+def test_a_restart_embeds_no_window_from_both_sides():
+    stream, frames = EmbeddingStream(Doubling()), np.zeros((25, FRAME_SAMPLES), np.float32)
+    pushed(stream, frames, np.ones(25, bool), 0, (25,))
+    stream.restart()
+    assert pushed(stream, frames, np.ones(25, bool), 25, (25,)).frames.tolist() == [30]
+
+
+def test_frames_between_two_windows_have_both_in_proportion_and_others_the_only_one():
+    evidence = EmbeddingEvidence(AsTheyAre(), 2)
+    evidence.push(embeddings_at(0, 10, 40), 0)
+    said = evidence.at(0, 70)
+    np.testing.assert_allclose(said[10:20, 0], np.arange(10) + 0.5)  # from 0 at 10 to 10 at 20
+    np.testing.assert_allclose(said[0:10, 0], 0.0)  # before the middle of the first window
+    np.testing.assert_allclose(said[20:30, 0], 10.0)
+    assert np.isnan(said[30:40]).all()
+    np.testing.assert_allclose(said[40:60, 0], 40.0)
+    assert np.isnan(said[60:]).all()
+
+
+@pytest.mark.parametrize("step", [1, 7, 30])
+def test_what_is_said_of_frames_is_the_same_in_pieces_of_any_size(step):
+    embeddings = embeddings_at(*range(0, 300, 10))
+    whole = EmbeddingEvidence(AsTheyAre(), 2)
+    whole.push(embeddings, 0)
+    expected = whole.at(0, 300)
+    parts, pieces = EmbeddingEvidence(AsTheyAre(), 2), []
+    for first in range(0, 300, step):
+        parts.push(embeddings.known_at(first, step), first)
+        begin, end = max(first - 19, 0), max(first + step - 19, 0)
+        pieces.append(parts.at(begin, end - begin))
+    joined = np.concatenate(pieces)
+    np.testing.assert_array_equal(joined, expected[: len(joined)])
+
+
+def test_private_frames_are_those_of_labels_that_wait_for_embeddings_too():
+    """The same frames are private, whether a label is known at once or sixteen frames later."""
+    from test_veil import labels_of  # noqa: PLC0415  its labels of speech
+
+    said = np.zeros(200, np.float32)
+    said[80:85] = 0.9
+    at_once = PrivateFrames(["speech"], 20)
+    early = np.concatenate([at_once.push(200, labels_of(said)), at_once.close()])
+    waiting, late = PrivateFrames(["speech"], 20, 19), []
+    for frame in range(200):
+        known = labels_of(said[frame - 16 : frame - 15]) if frame >= 16 else None
+        late.append(waiting.push(1, None if known is None else known._replace(ahead=16)))
+    late = np.concatenate([*late, waiting.close()])
+    count = 200 - 16 - 39  # beside the end: unlabelled
+    np.testing.assert_array_equal(early[:count], late[:count])
+    assert early[60:90].any()
+    assert not early[20:50].any()
+
+
+def test_embeddings_are_dropped_whose_windows_reach_into_what_is_private():
+    veil = EmbeddingVeil()
+    veil.push(embeddings_at(*range(0, 100, 10)))
+    private = np.zeros(100, bool)
+    private[47] = True
+    parts = [
+        veil.release(
+            LoggedFrames(np.zeros((10, 1), np.float32), n, stamps_of(n, 10), private[n : n + 10])
+        )
+        for n in range(0, 100, 10)
+    ]
+    frames = [number for part in parts for number in part.frames.tolist()]
+    assert frames == [0, 10, 20, 50, 60, 70, 80]
+
+
+def test_a_pipeline_logs_the_embeddings_of_sound_with_the_stamps_of_their_last_frames(real_frames):
+    frames = np.concatenate([np.zeros((100, FRAME_SAMPLES), np.float32), real_frames[:400]])
+    pipeline = Pipeline("mic", DEFAULT, embedder=Doubling())
+    messages = pipeline.push(Frames(0, frames, stamps_of(0, 500)))
+    embedded = [message for message in messages if message.topic == "/mic/embedding"]
+    assert embedded
+    lasts = [(message.log_time - START) // FRAME_NANOSECONDS for message in embedded]
+    assert all(last % 10 == 9 for last in lasts)
+    assert min(lasts) > 90
+    assert [m.log_time for m in messages] == sorted(m.log_time for m in messages)
+
+
+def test_a_gap_separates_windows(real_frames):
+    pipeline = Pipeline("mic", DEFAULT, embedder=Doubling())
+    pipeline.push(Frames(0, real_frames[:105], stamps_of(0, 105)))
+    pipeline.push(Gap(START, START + FRAME_NANOSECONDS, "lost", 1))
+    messages = pipeline.push(Frames(106, real_frames[106:206], stamps_of(106, 100)))
+    embedded = [message for message in messages if message.topic == "/mic/embedding"]
+    first = (embedded[0].log_time - START) // FRAME_NANOSECONDS
+    assert first >= 110 + WINDOW_FRAMES - 1
+
+
+def test_of_nothing_nothing_is_known():
+    assert not len(NO_AUXILIARY.known_at(0, 100).embeddings.frames)
+    joined = Auxiliary(embeddings=embeddings_at(10)).followed_by(NO_AUXILIARY)
+    assert joined.embeddings.frames.tolist() == [10]
+
+
+def test_the_integers_of_the_network_are_the_same_for_the_same_window(embedder, real_frames):
+    windows = [real_frames[n : n + WINDOW_FRAMES] for n in range(0, 400, 40)]
+    first = [embedder(window) for window in windows]
+    again = [embedder(window) for window in reversed(windows)][::-1]
+    np.testing.assert_array_equal(first, again)
+    assert len(first[0]) == len(embedder.source.names) == len(embedder.source.steps)
+
+
+def test_what_a_channel_says_of_its_embeddings_is_read_back_and_damage_is_nothing(embedder):
+    source = embedder.source
+    metadata = {**source.metadata(), "values_names": json.dumps(list(source.names))}
+    assert EmbeddingSource.from_metadata(metadata) == source
+    for key in metadata:
+        damaged = {**metadata, key: "[1"}
+        if key.startswith("values"):
+            assert EmbeddingSource.from_metadata(damaged) is None
+    assert EmbeddingSource.from_metadata({}) is None

@@ -1,0 +1,1 @@
+"""Downloads that a user asks for, of files whose digest is known."""
