@@ -11,6 +11,7 @@ names'.
 
 import csv
 import math
+from bisect import bisect
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -155,7 +156,7 @@ _FLOOR = -70.0  # dBFS
 _FAINTEST = -12.0  # dB, by which a clip is laid fainter
 _THRESHOLDS = np.arange(-3.5, 12.1, 0.5)
 _PRECISION, _FALSE_AN_HOUR = 0.8, 1.0  # of an event
-_MARGIN = 1  # thresholds that the chosen one is above the lowest that would do
+_MARGINS = 1, 2, 3  # thresholds that the chosen one is above the lowest that would do
 _LEAST_RECALL = 0.2
 _FEWEST = 4  # sources
 _SPLITS = 20
@@ -327,7 +328,7 @@ def count(
     owners = [sources[each.source] for each in scene.laid]
     is_right = [_inside(sound, right) for sound in sounds]
     for good, sound in zip(is_right, sounds, strict=True):
-        owner = owners[max(0, np.searchsorted(begins, (sound.first + sound.end) // 2) - 1)]
+        owner = owners[max(0, bisect(begins, (sound.first + sound.end) // 2) - 1)]
         if good:
             counts[owner, _RIGHT] += 1
         elif not _inside(sound, [*right, *like]):
@@ -407,23 +408,25 @@ def _measured(name: SoundName, counts: Float64, times: int) -> SoundName:
     )
     if name.sources < _FEWEST:
         return name
-    tried = _tried(counts, positive)
-    place = _chosen(counts.sum(axis=1))
-    is_event = place is not None and tried.good
-    if place is None or not is_event:
-        both = [Counts(*row) for row in counts.sum(axis=1).tolist()]
-        place = max(range(len(both)), key=lambda place: _f1(both[place]))
-        tried = both[place]
+    for margin in _MARGINS:
+        tried, place = _tried(counts, positive, margin), _chosen(counts.sum(axis=1), margin)
+        if place is not None and tried.good:
+            return _with_figures(name, place, tried)._replace(is_event=True)
+    both = [Counts(*row) for row in counts.sum(axis=1).tolist()]
+    place = max(range(len(both)), key=lambda place: _f1(both[place]))
+    return _with_figures(name, place, both[place])
+
+
+def _with_figures(name: SoundName, place: int, tried: Counts) -> SoundName:
     return name._replace(
         threshold=float(_THRESHOLDS[place]),
-        is_event=is_event,
         precision=round(tried.precision, 2),
         recall=round(tried.recall, 2),
         false_an_hour=round(tried.false_an_hour, 1),
     )
 
 
-def _tried(counts: Float64, positive: Bool) -> Counts:
+def _tried(counts: Float64, positive: Bool, margin: int) -> Counts:
     """Choose on half of the sources and try on the other, for many halves, and both ways."""
     rng, total = np.random.default_rng(_SEED), np.zeros(len(Counts._fields))
     for _ in range(_SPLITS):
@@ -431,7 +434,8 @@ def _tried(counts: Float64, positive: Bool) -> Counts:
         for kind in (positive, ~positive):  # as many of each in both
             half[rng.permutation(np.flatnonzero(kind))[::2]] = True
         for chosen, other in ((half, ~half), (~half, half)):
-            place, rows = _chosen(counts[:, chosen].sum(axis=1)), counts[:, other].sum(axis=1)
+            place = _chosen(counts[:, chosen].sum(axis=1), margin)
+            rows = counts[:, other].sum(axis=1)
             if place is not None:
                 total += rows[place]
             else:  # it would be no event, and is never said
@@ -439,13 +443,13 @@ def _tried(counts: Float64, positive: Bool) -> Counts:
     return Counts(*total.tolist())
 
 
-def _chosen(counts: Float64) -> int | None:
-    """Return the threshold a step above the one that hears most of those that would do."""
+def _chosen(counts: Float64, margin: int) -> int | None:
+    """Return the threshold some steps above the one that hears most of those that would do."""
     each = [Counts(*row) for row in counts.tolist()]
     good = [place for place, one in enumerate(each) if one.good]
     if not good:
         return None
-    return min(max(good, key=lambda place: each[place].recall) + _MARGIN, len(each) - 1)
+    return min(max(good, key=lambda place: each[place].recall) + margin, len(each) - 1)
 
 
 def _f1(counts: Counts) -> float:
