@@ -129,6 +129,10 @@ class RecordingSession:
             name: MicrophoneStream(settings, name, source, models[name], embedder)
             for name, source in sources.items()
         }
+        for name, stream in self._streams.items():
+            model, classifier = models[name].model, models[name].classifier
+            if classifier and model and (why := stream.pipeline.lacking_embeddings(classifier)):
+                say(f"{name}: model {model.name}: {why}")
         is_live = not any(isinstance(source, FileSource) for source in sources.values())
         is_read_ahead = any(
             isinstance(source, FileSource) and not source.realtime for source in sources.values()

@@ -93,7 +93,10 @@ def test_a_table_that_contradicts_itself_closes_its_own_output_alone(home, tmp_p
     ("name", "problem"),
     [
         ("", "bridge.prometheus: text_file: {} is a folder; name a file in it, as hearthlog.prom"),
-        ("x" * 300, "bridge.prometheus: text_file: {} cannot be written (File name too long)"),
+        (
+            f"{'x' * 300}.prom",
+            "bridge.prometheus: text_file: {} cannot be written (File name too long)",
+        ),
         (f"{'x' * 300}/home.prom", "text_file: {} cannot be written (File name too long)"),
         ("loop/home.prom", "text_file: {} cannot be written (Too many levels of symbolic links)"),
         ("file/home.prom", "/file: cannot be written ("),

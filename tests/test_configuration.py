@@ -166,6 +166,7 @@ def slips(path, text):
 )
 def test_every_slip_is_told_in_words_that_say_what_to_write(tmp_path, monkeypatch, value):
     monkeypatch.delenv("HEARTHLOG_MODEL", raising=False)
+    monkeypatch.delenv("HEARTHLOG_EMBEDDING", raising=False)
     lines = slips(tmp_path / "c.toml", everywhere(value))
     for line in lines:
         assert not OF_A_LIBRARY.search(line.removeprefix(str(tmp_path))), line

@@ -61,6 +61,7 @@ def with_heads(seed=1, **changed):
         description=model.description.model_copy(update=update),
         embedding_weights=rng.integers(-(2**20), 2**20, shape, np.int32),
         embedding_bias=rng.integers(-(2**22), 2**22, shape[::2], np.int32),
+        embedding_scaler=np.ones((2, WIDTH)),
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from networks import model
 from onnx import helper
 
@@ -52,7 +53,8 @@ def yamnet_file():
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """The folder of networks of one test."""
+    """The folder of networks of one test, whose verbs are not told to listen without one."""
+    monkeypatch.delenv("HEARTHLOG_EMBEDDING", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setenv("XDG_DATA_DIRS", str(tmp_path / "all"))
     folder = tmp_path / "data" / "hearthlog" / "networks"
@@ -369,3 +371,23 @@ def test_a_file_that_hears_otherwise_is_told_when_it_is_fetched(yamnet, monkeypa
     monkeypatch.setattr(embedder_probe, "probe_network", lambda *_: probe)
     (line,) = verb._tried(YAMNET, yamnet)
     assert "hears otherwise than models were made with (beep of tone: -3.00" in line
+
+
+@pytest.mark.parametrize("signal", [4, 11])
+def test_a_recorder_records_where_the_runtime_crashes(yamnet, hearthlog, tmp_path, signal):
+    crashing = tmp_path / "site" / "ai_edge_litert"
+    crashing.mkdir(parents=True)
+    (crashing / "__init__.py").touch()
+    (crashing / "interpreter.py").write_text(f"import os\nos.kill(os.getpid(), {signal})\n")
+    path = f"{crashing.parent}:{os.environ.get('PYTHONPATH', '')}"
+    sound = np.random.default_rng(1).normal(0, 0.1, 48_000)
+    soundfile.write(tmp_path / "a.wav", sound, 16_000)
+    done = hearthlog(
+        *("record", tmp_path / "a.wav", "--model", "none", "-o", tmp_path / "logs"),
+        *("--start", "2026-03-01T07:00:00"),
+        env={"PYTHONPATH": path},
+    )
+    assert done.returncode == 0
+    assert f"{yamnet}: the network crashes (SIG" in done.stderr
+    assert done.stderr.count("it is recorded without a network") == 1
+    assert Path(done.stdout.strip()).exists()

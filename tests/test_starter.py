@@ -118,7 +118,9 @@ def test_a_starter_says_how_good_it_is_in_collections_that_were_left_out(name):
 def test_who_made_the_recordings_is_told_beside_the_starters():
     page = starter_file("general").with_name("README.md").read_text()
     for name in STARTERS:
-        for one in load_model(Path(name)).description.training_data.collections:
+        model = load_model(Path(name))
+        assert model_card(model) in page
+        for one in model.description.training_data.collections:
             assert one.name in page
 
 

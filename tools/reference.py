@@ -21,10 +21,11 @@ the command line goes before the environment, that before the file, and that bef
 `hearthlog config` prints all values in force, and where each comes from: the line of the file, a
 variable, or the default. Passwords of addresses are left out. `hearthlog config check` starts
 nothing, and says all that is wrong, each in a line with what to write: exit status 2 if a value
-makes no sense, 1 if a model, the folder or a file that is named cannot be used, 3 if everybody on
-this machine may read a file with secrets, or a file is not here that may be a credential of the
-service. `hearthlog config schema > home.schema.json` writes a JSON schema,
-by which editors check and complete the file if its first line is `#:schema ./home.schema.json`.
+makes no sense, 1 if a model, the folder, a file or a package that is named cannot be used, 3 if
+everybody on this machine may read a file with secrets, a file is not here that may be a credential
+of the service, an [alert](alerts.md) cannot ring, or nobody reads a `text_file`.
+`hearthlog config schema > home.schema.json` writes a JSON schema, by which editors check and
+complete the file if its first line is `#:schema ./home.schema.json`.
 
 At SIGHUP the recorder reads the file again. If the configuration has changed it completes its log
 and starts again, with a gap of a second or two that says so; if it is wrong, a line on standard

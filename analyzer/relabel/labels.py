@@ -103,6 +103,7 @@ class UnfinishedLayer(NamedTuple):
     sounds: Sequence[LabelledSound]
     left_out: Mapping[str, str]  # feature sets of microphones that the model is not for
     loss: str  # what could not be read of the log
+    lacks_embeddings: bool  # those that the model takes
 
     @property
     def lacks_starts(self) -> bool:
@@ -317,6 +318,7 @@ def _label(
         sounds=sounds,
         left_out=left_out,
         loss="" if infos[0].complete else "it is cut off",
+        lacks_embeddings=any(classifier.lacking_embeddings(info.embedding) for info in infos),
     )
     return layer, {each.info.microphone: each.labeller for each in begun}
 

@@ -42,6 +42,8 @@ class Relabelled:
     # feature sets of microphones that the model is not for, by name
     left_out: dict[str, str] = field(default_factory=dict)
 
+    by_features: list[Path] = field(default_factory=list)  # logs without the model's embeddings
+
     @property
     def logs(self) -> int:
         """Number of logs that are done."""
@@ -305,5 +307,7 @@ class _Relabelling:
         self.result.layers.append(task.job.layer)
         self.result.frames += task.labelled.frames
         self.result.left_out |= task.labelled.left_out
+        if task.labelled.lacks_embeddings:
+            self.result.by_features.append(task.job.log)
         if task.labelled.loss:
             self.result.lost[task.job.log] = task.labelled.loss

@@ -8,7 +8,8 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import home_temperature
 from hearthlog.analyzer.training.cross_validation import cross_validate
-from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset
+from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, HeardWindows
+from hearthlog.analyzer.training.home_heads import Heads, base_heads, learn_home
 from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.learned_segments import learned_digests, segment_digests
@@ -18,13 +19,15 @@ from hearthlog.analyzer.training.sightings import with_directions
 from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.description import (
     FORMAT,
+    FORMAT_OF_EMBEDDINGS,
     MOST_WEIGHT,
     Amount,
     ClassMetrics,
     Description,
 )
+from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed, sounds_of
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.arrays import Bool, Indices
+from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.progress import ignore_progress
 
 _FEWEST_SEGMENTS = 10
@@ -97,7 +100,8 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         arrays |= method.memory(remembered, learned)
     before = description.base_inverse_temperature or description.inverse_temperature
     description = _of_classes(description, home.classes)
-    inverse = _temperature_here(method, examples, here, ~_is_confirmed(home), description)
+    left_out = _left_out(method, examples, here, ~_is_confirmed(home), description)
+    inverse = _temperature_here(left_out, examples, here, description)
     smoothing = description.smoothing
     weight = min(smoothing.weight * description.inverse_temperature / inverse, MOST_WEIGHT)
     training = description.training_data.model_copy(
@@ -119,8 +123,9 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     was_learned = base.description.training_data.home_frames > 0  # by an earlier version
     if len(transitions) and (was_learned or home.classes != base.classes):
         transitions = default_transitions(home.classes)
+    plain = {"format": FORMAT, "direction_microphones": []}
     adapted = Model(
-        description.model_copy(update=update | {"format": FORMAT, "direction_microphones": []}),
+        description.model_copy(update=update | plain),
         arrays,
         transitions=transitions,
         training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
@@ -129,7 +134,71 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         training_target=base.training_target,
         training_group=base.training_group,
     )
+    if description.embedding is not None:
+        adapted = _with_heads(adapted, base, home, inverse * left_out[here])
     return with_directions(adapted, home.target, home.sightings)
+
+
+def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) -> Model:
+    """Let the heads of a model learn from a home, too; the classifier's decisions are left out."""
+    heads = base_heads(base, home.classes)
+    marked = home.heard.collection != _confirmed_number(home)
+    learned = learn_home(heads, home.heard, marked, home.classes)
+    inverse = _inverse_here(heads, home, decisions)
+    mix = learned.mix.model_copy(
+        update={
+            "inverse_temperature": inverse,
+            "base_inverse_temperature": heads.mix.inverse_temperature,
+        }
+    )
+    smoothing = adapted.description.smoothing.model_copy(
+        update={"weight": base.description.smoothing.weight}  # of probabilities as they are
+    )
+    update = {"format": FORMAT_OF_EMBEDDINGS, "embedding": mix, "smoothing": smoothing}
+    return replace(
+        adapted,
+        description=adapted.description.model_copy(update=update),
+        embedding_weights=learned.weights,
+        embedding_bias=learned.bias,
+        embedding_scaler=learned.scaler,
+    )
+
+
+def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
+    """Return how sure the mix may be of sounds of a home, by parts of it left out."""
+    base, sounds = heads.mix.inverse_temperature, sounds_of(home.classes)
+    marked = ~_is_confirmed(home)
+    tried = np.isfinite(decisions).all(axis=1) & home.is_embedded & np.isin(home.target, sounds)
+    if marked.sum() < _FEWEST_SEGMENTS or not tried.any():
+        return base
+    said = np.full(decisions.shape, np.nan)
+    for part in _parts(marked):
+        own = part[tried[part]]
+        seen = np.setdiff1d(np.arange(len(home)), part)
+        learned = _learned_without(heads, home, seen)
+        of_home = EmbeddingHeads(learned.mix, learned.weights, learned.bias, home.classes)
+        said[own] = of_home.log_probabilities(home.embedded[own])
+    plain = heads.mix.model_copy(update={"inverse_temperature": 1.0})
+    logarithms = mixed(decisions[tried], said[tried], plain, home.classes)[:, sounds]
+    return home_temperature(logarithms, np.searchsorted(sounds, home.target[tried]), base)
+
+
+def _learned_without(heads: Heads, home: Dataset, seen: Indices) -> Heads:
+    """Let heads learn from some segments of a home instead of all windows."""
+    own = seen[home.is_embedded[seen]]
+    heard = HeardWindows(
+        home.embedded[own],
+        home.target[own],
+        home.group[own],
+        home.collection[own],
+        np.ones(len(own), bool),
+    )
+    return learn_home(heads, heard, heard.collection != _confirmed_number(home), home.classes)
+
+
+def _confirmed_number(home: Dataset) -> int:
+    names = home.collection_names
+    return names.index(CONFIRMED) if CONFIRMED in names else -1
 
 
 def _check_every_class(base: Model, examples: Examples, classes: Sequence[str]) -> None:
@@ -170,25 +239,39 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
     return description.model_copy(update=update)
 
 
-def _temperature_here(
+def _left_out(
     method: Method, examples: Examples, home: Indices, marked: Bool, description: Description
+) -> Float64:
+    """Return what a classifier says of parts of a home that it was not adapted to.
+
+    NaN for all but the home, and for all if too little of it is marked.
+    """
+    everything, count = np.arange(len(examples.target)), len(description.classes)
+    if marked.sum() < _FEWEST_SEGMENTS:
+        return np.full((len(everything), count), np.nan)
+    parts = [home[part] for part in _parts(marked)]
+    folds = [(np.setdiff1d(everything, part), part) for part in parts]
+    [decisions] = cross_validate([method], examples, count, folds, ignore_progress)
+    bias = np.array([description.decision_bias.get(name, 0.0) for name in description.classes])
+    return decisions + bias
+
+
+def _parts(marked: Bool) -> list[Indices]:
+    """Divide the segments of a home into parts, each with its share of the marked ones."""
+    of_marks, others = (np.array_split(np.flatnonzero(same), _FOLDS) for same in (marked, ~marked))
+    return [np.concatenate(pair) for pair in zip(of_marks, others, strict=True)]
+
+
+def _temperature_here(
+    left_out: Float64, examples: Examples, home: Indices, description: Description
 ) -> float:
     """Return the inverse temperature of a model adapted to a home, by parts of it left out.
 
     Marks alone, of what was hard, would make it unsure of all the rest.
     """
     before = description.base_inverse_temperature or description.inverse_temperature
-    if marked.sum() < _FEWEST_SEGMENTS:
-        return before
-    everything = np.arange(len(examples.target))
-    of_marks, others = (np.array_split(home[same], _FOLDS) for same in (marked, ~marked))
-    parts = map(np.concatenate, zip(of_marks, others, strict=True))
-    folds = [(np.setdiff1d(everything, part), part) for part in parts]
-    classes = description.classes
-    [decisions] = cross_validate([method], examples, len(classes), folds, ignore_progress)
-    bias = np.array([description.decision_bias.get(name, 0.0) for name in classes])
-    tried = home[np.isfinite(decisions[home]).all(axis=1)]
-    return home_temperature(decisions[tried] + bias, examples.target[tried], before)
+    tried = home[np.isfinite(left_out[home]).all(axis=1)]
+    return home_temperature(left_out[tried], examples.target[tried], before)
 
 
 def _is_confirmed(home: Dataset) -> Bool:

@@ -30,6 +30,7 @@ SHORT_PARTS = len(_SHORT_SECONDS)  # of a clip
 _SHORT_NOISE_DBFS = (-80.0, -60.0)
 _SHORT_PLACE = (0.1, 0.9)  # of the window, in which a short part lies
 _FAINTER_DB = (-20.0, 0.0)  # every other short part
+_NEAR, _FAR = 5, 1 << 60  # frames
 _SEED = 20_261_126
 
 
@@ -59,6 +60,22 @@ class ClipEmbeddings(NamedTuple):
     version: Indices
     taught: Bool
     starts: Indices
+
+    def at(self, start: int) -> Int8:
+        """Return the window nearest to one that begins at a frame, at most five frames from it.
+
+        Parameters
+        ----------
+        start : int
+
+        Returns
+        -------
+        np.ndarray [shape=(1 or 0, W)], int8
+            None if there is none so near.
+        """
+        away = np.where(self.version == AS_IT_IS, np.abs(self.starts - start), _FAR)
+        nearest = int(away.argmin()) if len(away) else 0
+        return self.values[nearest : nearest + int(len(away) > 0 and away[nearest] <= _NEAR)]
 
     def part(self, rows: slice) -> "ClipEmbeddings":
         """Return some of the windows."""

@@ -243,8 +243,10 @@ def _probabilities(
     of_each = of_segments(inputs, segments, floors)
     by_window = np.zeros((*quiet.shape, len(model.classes)))
     evidence = evidence_of(classifier, [recording.sighting for recording in recordings])
-    of_windows = None if evidence is None else evidence[np.nonzero(~quiet)[0]]
-    by_window[~quiet] = classifier.classify(of_each[~quiet], of_windows)[0]
+    loud_rows = np.nonzero(~quiet)[0]
+    of_windows = None if evidence is None else evidence[loud_rows]
+    said = _said(recordings, classifier)[loud_rows]
+    by_window[~quiet] = classifier.classify(of_each[~quiet], of_windows, said)[0]
     if quiet.any():
         by_window[quiet, model.classes.index(SILENCE)] = 1.0
     loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)
@@ -252,6 +254,18 @@ def _probabilities(
     share = (loud / loud.sum(axis=1, keepdims=True))[:, :, np.newaxis]
     probabilities: Float64 = (by_window * share).sum(axis=1)
     return probabilities, quiet.min(axis=1)
+
+
+def _said(recordings: Sequence[Recording], classifier: Classifier) -> Float64:
+    """Return what the heads of a classifier say of segments; NaN where nothing is embedded."""
+    said = np.full((len(recordings), len(classifier.classes)), np.nan)
+    if classifier.embedding_heads is None:
+        return said
+    for row, recording in enumerate(recordings):
+        heard = None if recording.embedded is None else recording.embedded.at(0)
+        if heard is not None and len(heard):
+            said[row] = classifier.embedding_heads.log_probabilities(heard)[0]
+    return said
 
 
 def _quiet_windows(recording: Recording, floor: Float64, classifier: Classifier) -> Bool:

@@ -121,7 +121,7 @@ class HeardWindows(NamedTuple):
 
 
 _NO_NUMBERS = np.empty(0, np.intp)
-_NOTHING_HEARD = HeardWindows(
+NOTHING_HEARD = HeardWindows(
     np.empty((0, 0), np.int8), _NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, np.empty(0, bool)
 )
 
@@ -186,7 +186,7 @@ class Dataset:
     left_out: Sequence[LeftOut] = ()
     embedded: Int8 = field(default_factory=lambda: np.empty((0, 0), np.int8))
     is_embedded: Bool = field(default_factory=lambda: np.empty(0, bool))
-    heard: HeardWindows = _NOTHING_HEARD
+    heard: HeardWindows = NOTHING_HEARD
 
     def __len__(self) -> int:
         return len(self.target)
@@ -347,7 +347,7 @@ def cut_recordings(
     seconds: dict[str, float] = {}
     left_out: list[LeftOut] = []
     chosen: list[_Chosen] = []
-    heard: list[tuple[ClipEmbeddings, Indices]] = []
+    heard: list[tuple[Recording, Indices]] = []
     spans: list[tuple[int, int]] = []
     rows = [np.empty((0, 3), np.intp)]
     weights = [np.empty(0)]
@@ -369,7 +369,7 @@ def cut_recordings(
         key = np.array([classes.index(name), group, collection])
         used[item.collection, item.licence] += 1
         if item.embedded is not None:
-            heard.append((item.embedded, key))
+            heard.append((item, key))
         if reason:
             continue
         spans += [item.span] if item.span else []
@@ -433,25 +433,28 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
     return windows, floors
 
 
-def _joined(heard: Sequence[tuple[ClipEmbeddings, Indices]]) -> HeardWindows:
+def _joined(heard: Sequence[tuple[Recording, Indices]]) -> HeardWindows:
     """Join the windows that teach heads, evenly spaced ones where a source has many.
 
     Each recording is of a class, a group and a collection.
     """
-    parts = [(one.values[one.taught], one.version[one.taught], key) for one, key in heard]
-    parts = [part for part in parts if len(part[1])]
+    parts = [
+        (one.values[one.taught], one.version[one.taught], key, recording.weight)
+        for recording, key in heard
+        if (one := recording.embedded) is not None and one.taught.any()
+    ]
     if not parts:
-        return _NOTHING_HEARD
+        return NOTHING_HEARD
+    counts = [len(part[1]) for part in parts]
     values = np.concatenate([part[0] for part in parts])
     version = np.concatenate([part[1] for part in parts])
-    keys = np.repeat([part[2] for part in parts], [len(part[1]) for part in parts], axis=0)
-    target, group, collection = keys.T
+    keys = np.repeat([part[2] for part in parts], counts, axis=0)
+    most = np.repeat([part[3] for part in parts], counts) * (_HEARD_PER_GROUP / SEGMENTS_PER_GROUP)
     columns = np.column_stack([keys, version])
     key = np.unique(columns, axis=0, return_inverse=True)[1].ravel()
-    most = np.where(version == SHORT, SHORT_PARTS, 1.0) * (_HEARD_PER_GROUP / SEGMENTS_PER_GROUP)
-    kept = _thinned(key, most)
-    heard_windows = HeardWindows(values, target, group, collection, version == AS_IT_IS)
-    return heard_windows.rows(kept)
+    kept = _thinned(key, np.where(version == SHORT, SHORT_PARTS, 1.0) * most)
+    target, group, collection = keys.T
+    return HeardWindows(values, target, group, collection, version == AS_IT_IS).rows(kept)
 
 
 def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:
@@ -459,9 +462,7 @@ def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:
     rows: list[tuple[int, Int8]] = []
     for number, (recording, start) in enumerate(segments):
         if recording.embedded is not None:
-            same = recording.embedded.version == AS_IT_IS
-            place = np.flatnonzero(same & (recording.embedded.starts == start))
-            rows += [(number, recording.embedded.values[one]) for one in place[:1]]
+            rows += [(number, one) for one in recording.embedded.at(start)]
     embedded = np.zeros((len(segments), len(rows[0][1]) if rows else 0), np.int8)
     is_embedded = np.zeros(len(segments), bool)
     for number, values in rows:

@@ -64,6 +64,13 @@ def learn_heads(
     return LinearHeads(in_units(weights), in_units(bias))
 
 
+def scaler_of(heard: HeardWindows, classes: Sequence[str]) -> Float64:
+    """Return mean and standard deviation of the values of windows with sound, shape (2, W)."""
+    sound = np.array([name != SILENCE for name in classes])[heard.target]
+    values = heard.values[sound].astype(np.float64)
+    return np.stack([values.mean(axis=0), np.maximum(values.std(axis=0), 1.0)])
+
+
 def in_units(values: Float64) -> Int32:
     """Round weights or biases to those of a model."""
     steps = np.clip(np.rint(values / UNIT), -_LARGEST, _LARGEST)

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan
-from hearthlog.analyzer.training.dataset import Recording
+from hearthlog.analyzer.training.clip_embeddings import AS_IT_IS, ClipEmbeddings
+from hearthlog.analyzer.training.dataset import Recording, spread
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.sightings import sighting_of
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
 from hearthlog.models.features.installed import DEFAULT
@@ -226,7 +228,23 @@ def recording_of(
         most=MOST_OF_MARK,
         span=span,
         sighting=sighting_of(sound.microphone, sound.directions.begun_in(*span)),
+        embedded=_embedded(sound, frames),
     )
+
+
+def _embedded(sound: HomeSound, frames: Indices) -> ClipEmbeddings | None:
+    """Return the windows of successive frames as a network heard them, filled by half or more."""
+    first, count = int(sound.frames[frames[0]]), len(frames)
+    windows = sound.embeddings
+    starts = windows.frames - first
+    inside = (starts >= -HOP_FRAMES) & (starts + WINDOW_FRAMES <= count + HOP_FRAMES)
+    rows = np.flatnonzero(inside)
+    if not len(rows):
+        return None
+    taught = np.zeros(len(rows), bool)
+    taught[spread(np.arange(len(rows)), MOST_OF_MARK)] = True
+    version = np.full(len(rows), AS_IT_IS)
+    return ClipEmbeddings(windows.values[rows], version, taught, starts[rows])
 
 
 def _group(sound: HomeSound, start: int) -> str:

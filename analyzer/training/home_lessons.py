@@ -96,7 +96,7 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> L
     candidates: list[Candidates] = []
     counts, window = _Counts(), features.window_frames
     for folder in folders:
-        read = read_reviewed_sound(folder, features, scenario)
+        read = read_reviewed_sound(folder, features, scenario, model.description.embedding)
         sounds = list(_counted(read, counts, features))
         marked += marked_recordings(sounds, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]

@@ -10,10 +10,13 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, directions_of
+from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
+from hearthlog.models.classifiers.description import EmbeddingMix
 from hearthlog.models.classifiers.directions import NOWHERE, Directions
+from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, Embeddings
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
@@ -22,7 +25,12 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import ENROLLED, find_logs
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import LIVE, scenario_labelling, topic
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    EmbeddingSource,
+    scenario_labelling,
+    topic,
+)
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = ("header.stamp", "frame", "values")
@@ -51,6 +59,8 @@ class HomeSound:
         The recorder's that it was said of: `live`, or `scenario/<name>`.
     directions : Directions
         Of an array; none where only features were wanted.
+    embeddings : Embeddings
+        Of the network that was asked for; none of another one.
     """
 
     log: Path
@@ -63,6 +73,7 @@ class HomeSound:
     floors: Float64 | None
     labelling: str = LIVE
     directions: Directions = NOWHERE
+    embeddings: Embeddings = NO_EMBEDDINGS
 
     @property
     def enrolled(self) -> bool:
@@ -95,7 +106,7 @@ class HomeSound:
 
 
 def read_reviewed_sound(
-    folder: Path, features: FeatureSet, scenario: str = ""
+    folder: Path, features: FeatureSet, scenario: str = "", mix: EmbeddingMix | None = None
 ) -> Iterator[HomeSound]:
     """Read what was marked or looked at in the logs of a folder, log by log.
 
@@ -106,6 +117,8 @@ def read_reviewed_sound(
     features : FeatureSet
     scenario : str, optional
         What is said of this scenario, by its name, instead of the sounds of the home.
+    mix : EmbeddingMix, optional
+        Of a model whose heads take embeddings: only those of its network and projection.
 
     Raises
     ------
@@ -128,7 +141,9 @@ def read_reviewed_sound(
                 usable = True
             elif sound.marks:
                 other = log, sound.microphone
-            yield replace(sound, directions=_directions(log, sound.microphone, limits))
+            yield with_embeddings(
+                replace(sound, directions=_directions(log, sound.microphone, limits)), limits, mix
+            )
     if other is not None and not usable:
         name = _set_of(*other)
         raise DataError(
@@ -202,6 +217,44 @@ def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directio
         return directions_of(columns)
     except LogError as error:
         raise LogError(f"{log}: {error}") from error
+
+
+def with_embeddings(
+    sound: HomeSound, limits: tuple[int, int], mix: EmbeddingMix | None
+) -> HomeSound:
+    """Read what a network heard in a part of a log, if it is the network of a model.
+
+    Parameters
+    ----------
+    sound : HomeSound
+    limits : (int, int)
+        Start and end of the part, in nanoseconds of UTC.
+    mix : EmbeddingMix or None
+        Of the model; None if it has no heads.
+
+    Raises
+    ------
+    LogError
+        If the log has embeddings that no recorder writes.
+    """
+    if mix is None:
+        return sound
+    name = topic(sound.microphone, "embedding")
+    start, end = limits[0] - _AROUND, limits[1] + _AROUND
+    columns = read_columns([sound.log], {name}, start, end, EMBEDDING_FIELDS).get(name)
+    if columns is None or columns.type != message_types.EMBEDDING or not len(columns):
+        return sound
+    source = EmbeddingSource.from_metadata(columns.metadata)
+    if source is None or (source.network, source.projection_sha256, len(source.names)) != (
+        mix.network,
+        mix.projection_sha256,
+        mix.values,
+    ):
+        return sound
+    try:
+        return replace(sound, embeddings=embeddings_of(columns))
+    except LogError as error:
+        raise LogError(f"{sound.log}: {error}") from error
 
 
 def _coarse(values: Float32, features: FeatureSet) -> Bool:

@@ -19,8 +19,9 @@ from hearthlog.models.embedding.networks import NETWORKS
 from hearthlog.models.embedding.projection import read_projection
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 
-HEAD_WEIGHTS = (1.0, 1.0)  # of the head on components, and on groups of names
+HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
+_SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tried
 CLASS_EXPONENT = 0.2
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
 _REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
@@ -96,7 +97,7 @@ def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
 
 
 def said_unseen(
-    data: Dataset, mix: EmbeddingMix, hearing: Hearing, folds: Sequence[Fold]
+    data: Dataset, mix: EmbeddingMix, inputs: Sequence[slice], folds: Sequence[Fold]
 ) -> Float64:
     """Let heads hear segments that they have not learned from.
 
@@ -104,7 +105,8 @@ def said_unseen(
     ----------
     data : Dataset
     mix : EmbeddingMix
-    hearing : Hearing
+    inputs : sequence of slice
+        Of its linear heads.
     folds : sequence of Fold
 
     Returns
@@ -115,7 +117,7 @@ def said_unseen(
     said = np.full((len(data), len(data.classes)), np.nan)
     for _, unseen in folds:
         seen = ~unseen_windows(data, unseen)
-        learned = learn_heads(data.heard, data.classes, hearing.inputs, seen)
+        learned = learn_heads(data.heard, data.classes, inputs, seen)
         heads = EmbeddingHeads(mix, *learned, data.classes)
         heard = unseen[data.is_embedded[unseen]]
         said[heard] = heads.log_probabilities(data.embedded[heard])
@@ -158,11 +160,13 @@ class Mixture(NamedTuple):
 
 
 class BestMix(NamedTuple):
-    """The better one of the ways to mix.
+    """The best one of the ways to mix.
 
     Attributes
     ----------
     mix : EmbeddingMix
+    inputs : tuple of slice
+        Of its linear heads.
     said : list of np.ndarray [shape=(n, C)], float64
         What heads say of segments, for each way of leaving out.
     left_out : list of np.ndarray [shape=(n, C)], float64
@@ -170,6 +174,7 @@ class BestMix(NamedTuple):
     """
 
     mix: EmbeddingMix
+    inputs: tuple[slice, ...]
     said: list[Float64]
     left_out: list[Float64]
 
@@ -177,8 +182,9 @@ class BestMix(NamedTuple):
 def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
     """Try heads and a classifier together, with and without the names of the network as they are.
 
-    They say what is of no class of the scenario, and, where the recordings of a class are too few
-    to learn from, of which class it is; they are mixed in where segments left out are told better.
+    Names say what is of no class of the scenario. Where the recordings of a class are too few to
+    learn from, such as those of water, names say of which class it is, instead of the head that is
+    learned from them. They are mixed in where segments left out are told better.
 
     Parameters
     ----------
@@ -188,18 +194,31 @@ def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
     ways : sequence of Tried
         At least one.
     """
-    plain = _plain(hearing)
-    said = [said_unseen(data, plain, hearing, way.folds) for way in ways]
-    best = BestMix(plain, said, _left_out(data, plain, ways, said))
-    for head in (rejecting_head(hearing, data.classes), names_head(hearing, data.classes)):
-        if head is None:
+    single = _plain(hearing, hearing.inputs[:1])
+    by_head = [
+        [said_unseen(data, single, [columns], way.folds) for way in ways]
+        for columns in hearing.inputs
+    ]
+    every = hearing.inputs
+    candidates: list[tuple[tuple[slice, ...], NamesHead | None]] = [
+        (every, None),
+        (every, rejecting_head(hearing, data.classes)),
+        (every[:1], names_head(hearing, data.classes)),
+    ]
+    tried = []
+    for number, (inputs, names) in enumerate(candidates):
+        if names is None and number:
             continue
-        mix = plain.model_copy(update={"names": [head]})
-        of_names = _said_by_names(data, mix)
-        with_names = [one + of_names for one in said]
-        other = BestMix(mix, with_names, _left_out(data, mix, ways, with_names))
-        best = max(best, other, key=lambda one: _right(data, one.left_out))
-    return best
+        mix, said = (
+            _plain(hearing, inputs),
+            [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)],
+        )
+        if names is not None:
+            mix = mix.model_copy(update={"names": [names]})
+            of_names = _said_by_names(data, mix)
+            said = [one + of_names for one in said]
+        tried.append(BestMix(mix, inputs, said, _left_out(data, mix, ways, said)))
+    return max(tried, key=lambda one: _right(data, one.left_out))
 
 
 def learn_mixture(
@@ -221,7 +240,7 @@ def learn_mixture(
     everything = np.ones(len(data), bool)
     inverse = _inverse_temperature(data, best.mix, ways[-1], best.said[-1], everything)
     mix = best.mix.model_copy(update={"inverse_temperature": inverse})
-    heads = learn_heads(data.heard, data.classes, hearing.inputs)
+    heads = learn_heads(data.heard, data.classes, best.inputs)
     return Mixture(mix, heads, best.left_out[0], None if collections is None else best.left_out[1])
 
 
@@ -231,12 +250,12 @@ def _left_out(
     return [_nested(data, mix, way, one) for way, one in zip(ways, said, strict=True)]
 
 
-def _plain(hearing: Hearing) -> EmbeddingMix:
+def _plain(hearing: Hearing, inputs: Sequence[slice]) -> EmbeddingMix:
     return EmbeddingMix(
         network=hearing.network,
         projection_sha256=hearing.projection_sha256,
         values=len(hearing.names),
-        head_weights=list(HEAD_WEIGHTS),
+        head_weights=[HEAD_WEIGHT] * len(inputs),
         machine_weight=MACHINE_WEIGHT,
         inverse_temperature=1.0,
     )
@@ -326,7 +345,8 @@ def _inverse_temperature(
         return 1.0
     plain = mix.model_copy(update={"inverse_temperature": 1.0})
     decisions = mixed(way.decisions[used], said[used], plain, data.classes)[:, sounds]
-    return inverse_temperature(decisions, np.searchsorted(sounds, data.target[used]))
+    found = inverse_temperature(decisions, np.searchsorted(sounds, data.target[used]))
+    return min(found, _SUREST)
 
 
 def _right(data: Dataset, results: Sequence[Float64]) -> float:

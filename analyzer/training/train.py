@@ -21,6 +21,7 @@ from hearthlog.analyzer.training.calibration import (
 )
 from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
 from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.heads import scaler_of
 from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import DEFAULT
 from hearthlog.analyzer.training.learned_segments import segment_digests
@@ -145,7 +146,12 @@ def train_model(  # noqa: PLR0913, PLR0917
     )
     if mixture is not None:
         heads = mixture.heads
-        model = replace(model, embedding_weights=heads[0], embedding_bias=heads[1])
+        model = replace(
+            model,
+            embedding_weights=heads[0],
+            embedding_bias=heads[1],
+            embedding_scaler=scaler_of(data.heard, data.classes),
+        )
     model = with_directions(model, data.target, data.sightings)
     if method.remembered(model) is not None:
         return model

@@ -11,7 +11,7 @@ from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, labelling_of
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
 from hearthlog.analyzer.training.confirmed import Candidates, chosen, labelled_segments
 from hearthlog.analyzer.training.dataset import Recording
-from hearthlog.analyzer.training.marked_sound import read_sound_of
+from hearthlog.analyzer.training.marked_sound import read_sound_of, with_embeddings
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
@@ -107,7 +107,8 @@ def _labelled(
             if info.first_frame is not None:
                 begin = info.first_frame[1]
                 part = begin, begin + length
-                for sound in read_sound_of(log, features, {info.microphone}, part, scenario):
+                for one in read_sound_of(log, features, {info.microphone}, part, scenario):
+                    sound = with_embeddings(one, part, model.description.embedding)
                     yield labelled_segments(sound, model.classes, names, features.window_frames)
 
 

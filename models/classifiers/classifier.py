@@ -97,6 +97,23 @@ class Classifier:
         theirs = source.network, source.projection_sha256, len(source.names)
         return theirs == (mix.network, mix.projection_sha256, mix.values)
 
+    def lacking_embeddings(self, source: EmbeddingSource | None) -> str:
+        """Say which embeddings the model was learned on and does not get; empty if it gets them.
+
+        Parameters
+        ----------
+        source : EmbeddingSource or None
+            Of the embeddings that there are.
+        """
+        if self._mix is None or self.takes_embeddings(source):
+            return ""
+        theirs = "there are none"
+        if source is not None:
+            theirs = f"these are of {source.network} with another projection"
+            if source.network != self._mix.network:
+                theirs = f"these are of {source.network}"
+        return f"it takes embeddings of {self._mix.network}, and {theirs}: labels by features alone"
+
     def mix(
         self, probabilities: Float32, embedded: Float64, evidence: Float64 | None = None
     ) -> tuple[Float32, Float32]:

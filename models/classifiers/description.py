@@ -226,8 +226,13 @@ class EmbeddingMix(_Record):
         Of the classifier.
     inverse_temperature : float
         Of the mix, the weighted mean of the logarithms of probabilities.
+    base_inverse_temperature : float or None
+        That of the model before it was adapted to a home; None if it never was.
     bias : dict of str to float
         What is added to the mean, by class.
+    of_home : bool
+        Whether there is one linear head more, of a home: its decision values are no logarithms of
+        probabilities, but added to the sum of those of the other heads.
     """
 
     network: _Text
@@ -239,8 +244,10 @@ class EmbeddingMix(_Record):
     ]
     names: Annotated[list[NamesHead], Field(max_length=MOST_HEADS)] = []
     machine_weight: Annotated[float, Field(ge=0.0, le=MOST_WEIGHT)]
-    inverse_temperature: Annotated[float, Field(gt=0.0, le=100.0)]
+    inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)]
+    base_inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)] | None = None
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
+    of_home: bool = False
 
 
 class Description(_Record):

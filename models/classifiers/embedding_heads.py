@@ -51,7 +51,7 @@ class EmbeddingHeads:
         self._sounds = sounds_of(classes)
         self._weights = weights[..., self._sounds].astype(np.float64)
         self._bias = bias[:, self._sounds].astype(np.float64)
-        self._of_heads = mix.head_weights
+        self._of_heads, self._of_home = mix.head_weights, mix.of_home
         names = [classes[number] for number in self._sounds]
         self._names = [_Names(head, names) for head in mix.names]
 
@@ -66,8 +66,8 @@ class EmbeddingHeads:
         Returns
         -------
         np.ndarray [shape=(m, C)], float64
-            Sums of the logarithms of the heads' probabilities, times their weights in the mix; 0
-            for silence, of which the heads say nothing.
+            Sums of the logarithms of the heads' probabilities, times their weights in the mix, and
+            of what a home adds; 0 for silence, of which the heads say nothing.
         """
         result = np.zeros((len(values), self._classes))
         for start in range(0, len(values), _ROWS_AT_ONCE):
@@ -77,8 +77,10 @@ class EmbeddingHeads:
 
     def _of_sounds(self, values: Int8) -> Float64:
         steps, total = values.astype(np.float64), np.zeros((len(values), len(self._sounds)))
-        for weight, slopes, bias in zip(self._of_heads, self._weights, self._bias, strict=True):
+        for weight, slopes, bias in zip(self._of_heads, self._weights, self._bias, strict=False):
             total += weight * floored(UNIT * (steps @ slopes + bias))
+        if self._of_home:
+            total += UNIT * (steps @ self._weights[-1] + self._bias[-1])
         for head in self._names:
             total += head.weight * floored(head.decide(values))
         return np.rint(total / _STEP) * _STEP

@@ -41,6 +41,8 @@ class Model:
         `hearthlog.models.classifiers.embedding_heads.UNIT`; empty without heads.
     embedding_bias : np.ndarray [shape=(H, C)], int32
         In the same units.
+    embedding_scaler : np.ndarray [shape=(2, W)], float64
+        Mean and standard deviation of these values, of what the heads were learned from.
     name : str
         Stem of the model file.
     sha256 : str
@@ -58,6 +60,7 @@ class Model:
     direction_weights: Float64 = field(default_factory=lambda: np.empty((0, 0, 0)))
     embedding_weights: Int32 = field(default_factory=lambda: np.empty((0, 0, 0), np.int32))
     embedding_bias: Int32 = field(default_factory=lambda: np.empty((0, 0), np.int32))
+    embedding_scaler: Float64 = field(default_factory=lambda: np.empty((0, 0)))
     name: str = ""
     sha256: str = ""
 

@@ -50,6 +50,7 @@ _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are op
     "direction_weights": np.dtype(np.float64),
     "embedding_weights": np.dtype(np.int32),
     "embedding_bias": np.dtype(np.int32),
+    "embedding_scaler": np.dtype(np.float64),
 }
 
 
@@ -355,6 +356,8 @@ def _problem_of_values(classes: int, arrays: Mapping[str, Array]) -> str | None:
         return "training_target has classes that the model has not"
     if (np.abs(arrays.get("direction_weights", np.empty(0))) > MOST_EVIDENCE).any():
         return f"direction_weights has values beyond {MOST_EVIDENCE:g}"
+    if (arrays.get("embedding_scaler", np.ones((2, 1)))[1] <= 0).any():
+        return "embedding_scaler has standard deviations that are not positive"
     transitions = arrays.get("transitions", np.ones((1, 1)))
     if (transitions < 0).any() or (np.abs(transitions.sum(axis=1) - 1.0) > _ROUNDING).any():
         return "the rows of transitions are no probabilities"
@@ -386,9 +389,10 @@ def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, 
         count = len(description.direction_microphones)
         shapes["direction_weights"] = (count, classes, SECTORS)
     if (mix := description.embedding) is not None:
-        heads = len(mix.head_weights)
+        heads = len(mix.head_weights) + mix.of_home
         shapes["embedding_weights"] = (heads, mix.values, classes)
         shapes["embedding_bias"] = (heads, classes)
+        shapes["embedding_scaler"] = (2, mix.values)
     digests = arrays.get("training_digests", np.empty(0))
     if digests.ndim and len(digests):
         shapes["training_digests"] = (len(digests),)

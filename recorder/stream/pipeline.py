@@ -333,6 +333,8 @@ class Pipeline:
             self._streams[labelling] = stream
             self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
         opening = self.report("model", stamp, _from_frame(labelling, model, frame))
+        if classifier is not None and (lacking := self.lacking_embeddings(classifier)):
+            opening += self.report("model", stamp, Notice(WARNING, lacking))
         if unknown := self.unknown_private():
             names = ", ".join(map(repr, unknown))
             text = (
@@ -340,6 +342,10 @@ class Pipeline:
             )
             opening += self.report("model", stamp, Notice(WARNING, text))
         return [*held, *closing], opening
+
+    def lacking_embeddings(self, classifier: Classifier) -> str:
+        """Say which embeddings a model does not get here; empty if it gets what it takes."""
+        return classifier.lacking_embeddings(self._source)
 
     def unknown_private(self) -> list[str]:
         """Return the private classes that the model in use does not know."""

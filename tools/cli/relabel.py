@@ -73,6 +73,9 @@ def _print(result: "Relabelled", model: str) -> None:
     if result.left_out:
         named = [f"{name} (features of {kind})" for name, kind in sorted(result.left_out.items())]
         tell(f"left out, as {model} is for other features: {listed(named, 'and')}")
+    if result.by_features:
+        logs_there = number(len(result.by_features), "log")
+        tell(f"{logs_there} without the embeddings that {model} takes: labelled by features alone")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
         for line in first_of(what, sorted(named)):
@@ -93,4 +96,5 @@ def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]
         "lost": {str(log): why for log, why in result.lost.items()},
         "failed": {str(log): why for log, why in result.failed.items()},
         "left_out": result.left_out,
+        "by_features": [str(log) for log in result.by_features],
     }

@@ -1,0 +1,156 @@
+"""What a home's marks add to the heads of a model.
+
+The heads stay as they are; what a home teaches is a linear head of its own that is added to them,
+so that nothing of the base's recordings is needed. It is learned by logistic regression, and pulled
+to zero: where nothing is marked the base decides.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from hearthlog.analyzer.training.dataset import HeardWindows
+from hearthlog.analyzer.training.heads import in_units
+from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
+from hearthlog.models.classifiers.embedding_heads import UNIT, EmbeddingHeads, sounds_of
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
+
+_PULL = 10.0  # to zero, of weights of inputs of one standard deviation
+_PULL_OF_NEW = 1.0  # of those of a class that the base has not: all of it is to be learned
+_CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a marked one has 1
+_BELOW = 2.0  # the others on average, is a new class before anything is learned
+_STEPS = 150
+
+
+class Heads(NamedTuple):
+    """The mix of a model, the arrays of its heads, and how many of the last classes are new."""
+
+    mix: EmbeddingMix
+    weights: Int32
+    bias: Int32
+    scaler: Float64
+    new: int
+
+
+def base_heads(model: Model, classes: Sequence[str]) -> Heads:
+    """Return the heads of a model as before it was ever adapted, with room for new classes.
+
+    Parameters
+    ----------
+    model : Model
+        With heads.
+    classes : sequence of str
+        The first of which are the first of the model.
+    """
+    mix = model.description.embedding
+    assert mix is not None
+    count = len(mix.head_weights)
+    same = sum(name in model.classes for name in classes)
+    inverse = mix.base_inverse_temperature or mix.inverse_temperature
+    weights = model.embedding_weights[:count, :, :same]
+    bias = model.embedding_bias[:count, :same]
+    new = len(classes) - same
+    if new:
+        sounds = sounds_of(classes[:same])
+        middle = bias[:, sounds] + np.einsum(
+            "w,hws->hs", model.embedding_scaler[0], weights[..., sounds].astype(np.float64)
+        )
+        constant = np.rint(middle.mean(axis=1) - _BELOW / inverse / UNIT).astype(np.int32)
+        weights = np.pad(weights, ((0, 0), (0, 0), (0, new)))
+        bias = np.concatenate([bias, np.tile(constant[:, np.newaxis], (1, new))], axis=1)
+    update = {
+        "names": [_with_classes(head, classes) for head in mix.names],
+        "bias": {name: value for name, value in mix.bias.items() if name in classes},
+        "inverse_temperature": inverse,
+        "base_inverse_temperature": None,
+        "of_home": False,
+    }
+    return Heads(mix.model_copy(update=update), weights, bias, model.embedding_scaler, new)
+
+
+def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
+    """Return a head with the classes of a home, of which the names say what of unknown ones."""
+    kept = {name: values for name, values in head.classes.items() if name in classes}
+    bias = {name: value for name, value in head.bias.items() if name in classes}
+    if UNKNOWN in head.classes:
+        for name in classes:
+            if name not in kept and name != SILENCE:
+                kept[name] = head.classes[UNKNOWN]
+                bias |= {name: head.bias[UNKNOWN]} if UNKNOWN in head.bias else {}
+    return head.model_copy(update={"classes": kept, "bias": bias})
+
+
+def learn_home(heads: Heads, heard: HeardWindows, marked: Bool, classes: Sequence[str]) -> Heads:
+    """Add what a home teaches.
+
+    Parameters
+    ----------
+    heads : Heads
+        As `base_heads` gives them.
+    heard : HeardWindows
+        Of the home.
+    marked : np.ndarray [shape=(m,)], bool
+        Whether somebody has said what it is; the others are as they were labelled.
+    classes : sequence of str
+
+    Returns
+    -------
+    Heads
+        The same where no sound was heard.
+    """
+    sounds = sounds_of(classes)
+    own = np.isin(heard.target, sounds)
+    if not own.any():
+        return heads
+    mix, values = heads.mix, heard.values[own]
+    said = EmbeddingHeads(mix, heads.weights, heads.bias, classes).log_probabilities(values)
+    shares = sum(mix.head_weights) + sum(head.weight for head in mix.names)
+    before = mix.inverse_temperature / shares * said[:, sounds]
+    used = np.flatnonzero(heads.weights.any(axis=(0, 2)))
+    mean, scale = heads.scaler[:, used]
+    inputs = (values[:, used] - mean) / scale
+    weight = np.where(marked[own], 1.0, _CONFIRMED_WEIGHT)
+    target = np.searchsorted(sounds, heard.target[own])
+    pull = np.full(len(sounds), _PULL)
+    pull[len(sounds) - heads.new :] = _PULL_OF_NEW
+    slopes, constants = _regressed(inputs, target, weight, before, pull)
+    weights = np.zeros((1, *heads.weights.shape[1:]))
+    bias = np.zeros((1, heads.bias.shape[1]))
+    factor = shares / mix.inverse_temperature
+    weights[0][np.ix_(used, sounds)] = factor * slopes / scale[:, np.newaxis]
+    bias[0, sounds] = factor * (constants - (mean / scale) @ slopes)
+    return heads._replace(
+        mix=mix.model_copy(update={"of_home": True}),
+        weights=np.concatenate([heads.weights, in_units(weights)]),
+        bias=np.concatenate([heads.bias, in_units(bias)]),
+    )
+
+
+def _regressed(
+    inputs: Float64, target: Indices, weight: Float64, before: Float64, pull: Float64
+) -> tuple[Float64, Float64]:
+    """Return the weights and biases that, added to decision values, tell windows best."""
+    width, count = inputs.shape[1], before.shape[1]
+    truth = np.eye(count)[target]
+    rows = np.arange(len(target))
+
+    def loss(flat: Float64) -> tuple[float, Float64]:
+        both = flat.reshape(width + 1, count)
+        decisions = before + inputs @ both[:-1] + both[-1]
+        decisions -= decisions.max(axis=1, keepdims=True)
+        grown = np.exp(decisions)
+        total = grown.sum(axis=1, keepdims=True)
+        lost = -(weight * (decisions[rows, target] - np.log(total[:, 0]))).sum()
+        wrong = weight[:, np.newaxis] * (grown / total - truth)
+        slope = np.concatenate([inputs.T @ wrong, wrong.sum(axis=0, keepdims=True)])
+        value = lost + (pull * np.square(both)).sum() / 2
+        return float(value), (slope + pull * both).ravel()
+
+    start = np.zeros((width + 1) * count)
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": _STEPS})
+    both = found.x.reshape(width + 1, count)
+    return both[:-1], both[-1]
