@@ -73,7 +73,7 @@ def test_the_examples_run_and_show_what_they_say(name, folder, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     for test in examples_of(name):
         report = []
-        doctest.DocTestRunner().run(test, out=report.append)
+        doctest.DocTestRunner(verbose=False).run(test, out=report.append)
         assert not report, "".join(report)
 
 

@@ -15,7 +15,11 @@ from hearthlog.models.classifiers.description import (
     EmbeddingMix,
     NamesHead,
 )
-from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mix_weight
+from hearthlog.models.classifiers.embedding_heads import (
+    UNTAUGHT,
+    EmbeddingHeads,
+    mix_weight,
+)
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -248,6 +252,15 @@ def test_arrays_of_heads_that_do_not_fit_are_refused(heads_file, tmp_path, name,
     path = tmp_path / "hostile.safetensors"
     path.write_bytes(_content(heads_file, (), {name: other}))
     with pytest.raises(ModelError, match=name):
+        load_model(path)
+
+
+def test_a_head_that_leaves_all_classes_to_others_is_refused(heads_file, tmp_path):
+    bias = load(heads_file.read_bytes())["embedding_bias"].copy()
+    bias[1] = UNTAUGHT
+    path = tmp_path / "hostile.safetensors"
+    path.write_bytes(_content(heads_file, (), {"embedding_bias": bias}))
+    with pytest.raises(ModelError, match="embedding_bias has a head without a class"):
         load_model(path)
 
 

@@ -19,6 +19,7 @@ from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.analyzer.training.home_data import home_recordings
 from hearthlog.analyzer.training.installed import DEFAULT as DEFAULT_METHOD
 from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.svm_method import EMBEDDING
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.installed import DEFAULT, FEATURE_SETS
 from hearthlog.recorder.config import Settings
@@ -127,7 +128,7 @@ def test_what_says_which_method_is_for_a_set_names_one_that_is():
             method = advice.partition("--method ")[2].partition("`")[0]
             assert method_named(method).features.name == name
     assert recorder_info.models_for("octaves") == "take a model for octaves"
-    assert DEFAULT_METHOD.name == METHOD
+    assert f"{EMBEDDING.name} where its network is, else {DEFAULT_METHOD.name}" == METHOD
     assert DEFAULT_METHOD.features == DEFAULT
 
 

@@ -1,5 +1,9 @@
 """Learn the starter models: `python -m hearthlog.tools.starter MANIFEST … -o models/starter`.
 
+With `--method embedding` those for a home with a network, `general-embedding` and
+`bathroom-embedding`: smaller, and with classes that the features alone mislead about. Of what the
+manifests have hardly any recordings, they keep what the other starters have learned.
+
 Only recordings whose licence allows that a model is passed on are learned from, and none of those
 that the simulated home plays, so that its days try the models on what they have not heard.
 """
@@ -17,10 +21,11 @@ import numpy as np
 import soundfile
 
 from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.dataset import build_dataset
+from hearthlog.analyzer.training.dataset import Dataset, clip_recordings, cut_recordings
+from hearthlog.analyzer.training.installed import clip_embedder
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
-from hearthlog.analyzer.training.svm_method import ROOM
+from hearthlog.analyzer.training.svm_method import EMBEDDING, ROOM, SvmMethod
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING
 from hearthlog.models.classifiers.description import SIMULATED
@@ -28,8 +33,8 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.licences import may_be_shipped
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.starter import STARTERS
-from hearthlog.schemas.arrays import Float32
+from hearthlog.models.starter import STARTERS, starter_file
+from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
@@ -40,7 +45,10 @@ _FEWEST_SOURCES = 3  # a class of fewer would only mislead
 # babies, and speech is taken for it.
 _MISLEADING = {"general": (LAUGHING, CRYING)}
 _RING_TONES, _RING_SECONDS = 40, 4.0
-_METHOD = replace(ROOM, most_windows=7_000)  # both models take less than 6 MB
+_METHODS: dict[str, SvmMethod] = {
+    ROOM.name: replace(ROOM, most_windows=7_000),  # both models take less than 6 MB
+    EMBEDDING.name: replace(EMBEDDING, most_windows=3_000),  # and these less than 1 MB each
+}
 _COLUMNS = ("path", "label", "source_group", "source", "licence", "seconds", "credit", "url")
 _ABOUT = """# The starter models
 
@@ -51,7 +59,9 @@ The collections are repositories at https://github.com, or packages of Debian wh
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
 
 
-def learn_starters(manifests: Sequence[Path], folder: Path) -> None:
+def learn_starters(
+    manifests: Sequence[Path], folder: Path, method: SvmMethod = _METHODS[ROOM.name]
+) -> None:
     """Learn the starter models, and write them and a page about them.
 
     Parameters
@@ -60,18 +70,27 @@ def learn_starters(manifests: Sequence[Path], folder: Path) -> None:
         Of the collections, with licences.
     folder : Path
         Is written over.
+    method : SvmMethod, optional
 
     Raises
     ------
     DataError
         If a manifest cannot be read, or too little of it may be used.
+    ModelError
+        If the network of the method is not there.
     """
     clips = list(_usable(manifests))
     with TemporaryDirectory() as temporary:
         sounds = [*_joined(clips, Path(temporary)), *_ring_tones(Path(temporary))]
-        models = [_learn(name, sounds, folder) for name in STARTERS]
-    _write_sources(folder / "sources.csv", manifests, clips)
-    (folder / "README.md").write_text(_page(models), "utf-8")
+        models = [_learn(name, sounds, folder, method) for name in STARTERS]
+    suffix = _suffix(method)
+    _write_sources(folder / f"sources{suffix}.csv", manifests, clips)
+    (folder / f"README{suffix}.md").write_text(_page(models), "utf-8")
+
+
+def _suffix(method: SvmMethod) -> str:
+    """Return what the names of files end in, of starters that are for a network."""
+    return f"-{method.name}" if method.network else ""
 
 
 def _usable(manifests: Sequence[Path]) -> Iterator[LabelledClip]:
@@ -96,7 +115,7 @@ def _joined(clips: Sequence[LabelledClip], folder: Path) -> list[LabelledClip]:
     long = []
     for clip in clips:
         frames = clip_frames(clip)
-        if len(frames) < _METHOD.features.window_frames:
+        if len(frames) < ROOM.features.window_frames:
             source = clip.label, clip.source_group, clip.source, clip.licence
             short.setdefault(source, []).append(frames)
         else:
@@ -118,24 +137,36 @@ def _ring_tones(folder: Path) -> list[LabelledClip]:
     return clips
 
 
-def _learn(name: str, clips: Sequence[LabelledClip], folder: Path) -> Model:
+def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMethod) -> Model:
     """Learn one model of the classes that have enough sources."""
-    scenario, path = BUILTIN[name], folder / f"{name}.safetensors"
+    scenario, path = BUILTIN[name], folder / f"{name}{_suffix(method)}.safetensors"
     sources: dict[str, set[tuple[str, str]]] = {}
     for clip in clips:
         if (class_ := scenario.find(clip.label)) is not None:
             sources.setdefault(class_, set()).add((clip.source, clip.source_group))
+    few = {one for one in scenario.classes if len(sources.get(one, ())) < _FEWEST_SOURCES}
+    before = load_model(starter_file(name)) if method.network else None
+    kept = few & set(before.classes) if before is not None else set()
+    misleading = () if method.network else _MISLEADING.get(name, ())
     classes = dict(scenario.classes)
     for one in scenario.classes:
-        if len(sources.get(one, ())) < _FEWEST_SOURCES or one in _MISLEADING.get(name, ()):
+        if one in few - kept or one in misleading:
             print(f"{name}: no class {one}, of which there are {len(sources.get(one, ()))} sources")
             del classes[one]
     chosen = Scenario(scenario.name, classes).with_unknown(
         (clip.label, clip.source_group) for clip in clips
     )
-    features = _METHOD.features
-    data = build_dataset(clips, chosen, ignore_progress, features=features, rooms=_METHOD.rooms)
-    model = train_model(data, chosen, ignore_progress, _METHOD)
+    data = cut_recordings(
+        clip_recordings(
+            clips, chosen, ignore_progress, method.features, method.rooms, clip_embedder(method)
+        ),
+        chosen,
+        method.features,
+    )
+    others = None if before is None or not kept else _remembered(before, method, data, kept)
+    model = train_model(data, chosen, ignore_progress, method, others=others)
+    if before is not None and others is not None:
+        model = _crediting(model, before)
     path.unlink(missing_ok=True)
     save_model(model, path)
     path.chmod(0o644)  # it learned from published recordings, and is passed on
@@ -147,10 +178,38 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path) -> Model:
     return model
 
 
+def _remembered(
+    before: Model, method: SvmMethod, data: Dataset, kept: set[str]
+) -> tuple[Float32, Indices]:
+    """Return the windows of some classes that a model without a network has learned from."""
+    remembered = method.as_of(before.description).remembered(before)
+    assert remembered is not None
+    inputs, target = remembered
+    own = np.isin(target, [before.classes.index(one) for one in kept])
+    numbers = [data.classes.index(before.classes[one]) for one in target[own].tolist()]
+    return inputs[own], np.array(numbers, np.intp)
+
+
+def _crediting(model: Model, before: Model) -> Model:
+    """Name the collections, too, of which only another model has learned."""
+    training = model.description.training_data
+    named = {(one.name, one.licence) for one in training.collections}
+    more = [
+        one
+        for one in before.description.training_data.collections
+        if (one.name, one.licence) not in named
+    ]
+    update = {"collections": sorted([*training.collections, *more], key=lambda one: one.name)}
+    described = model.description.model_copy(
+        update={"training_data": training.model_copy(update=update)}
+    )
+    return replace(model, description=described)
+
+
 def _page(models: Sequence[Model]) -> str:
     """Describe the models, and name the classes that they lack."""
     lacking = [
-        f"- `{name}` has no class `{one}`: its recordings are too few, or too alike."
+        f"- `{model.name}` has no class `{one}`: its recordings are too few, or too alike."
         for name, model in zip(STARTERS, models, strict=True)
         for one in BUILTIN[name].classes
         if one not in model.classes
@@ -178,9 +237,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m hearthlog.tools.starter", description=__doc__)
     parser.add_argument("manifests", nargs="+", type=Path, metavar="MANIFEST")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the models")
+    parser.add_argument("--method", choices=_METHODS, default=ROOM.name)
     options = parser.parse_args(arguments)
     try:
-        learn_starters(options.manifests, options.output)
+        learn_starters(options.manifests, options.output, _METHODS[options.method])
     except HearthlogError as error:
         print(f"hearthlog: {error}", file=sys.stderr)
         return 1

@@ -12,7 +12,7 @@ from hearthlog.analyzer.training.calibration import inverse_temperature, nested_
 from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import Method, prepare
-from hearthlog.analyzer.training.mixture import Tried, best_mix, hearing_of
+from hearthlog.analyzer.training.mixture import Tried, best_mix, has_lessons, hearing_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
 from hearthlog.models.classes import UNKNOWN
@@ -60,7 +60,7 @@ def evaluate_method(
     examples = prepare(method, data)
     [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
     probabilities = nested_probabilities(decisions, data.target, folds)
-    if method.network and len(data.heard.target):
+    if method.network and has_lessons(data):
         probabilities = _mixed(data, method, folds, decisions)
     return CrossValidation(
         len(folds),

@@ -129,7 +129,7 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
 
 
 def _heard(days: Sequence[Day]) -> str:
-    """Say how many days were heard, and how many of them not for the most part: `2 heard`."""
+    """Say how many days were heard, and how many of them in part: `2 of them heard`."""
     partly = sum(day.share < MOST for day in days)
     return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
 

@@ -12,14 +12,14 @@ import numpy as np
 from hearthlog.analyzer.training.calibration import inverse_temperature
 from hearthlog.analyzer.training.dataset import HeardWindows
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.embedding_heads import UNIT
+from hearthlog.models.classifiers.embedding_heads import UNIT, UNTAUGHT
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
 _ALPHA = 30.0  # of inputs of one standard deviation, whatever their number
 _ROOT = 0.5  # a collection weighs as its number of windows to this power
 _FEWEST_COLLECTIONS = 3
 _PARTS = 5  # of the sources, where there are fewer collections
-_IMPOSSIBLE = -100.0  # decision value of a class that was not learned
+FEWEST_SOURCES = 3  # of a class; one of fewer is left to the other heads, and to names
 _LARGEST = 2**31 - 1
 
 
@@ -54,14 +54,18 @@ def learn_heads(
     """
     sound = np.array([name != SILENCE for name in classes])[heard.target]
     chosen = sound if seen is None else sound & seen
-    rows = heard.rows(chosen)
+    pairs = np.unique(np.stack([heard.target[chosen], heard.group[chosen]]), axis=1)
+    sources = np.bincount(pairs[0], minlength=len(classes))
+    rows = heard.rows(chosen & (sources >= FEWEST_SOURCES)[heard.target])
     width, count = heard.values.shape[1], len(classes)
-    weights, bias = np.zeros((len(inputs), width, count)), np.zeros((len(inputs), count))
+    weights = np.zeros((len(inputs), width, count))
+    bias = np.full((len(inputs), count), UNTAUGHT, np.int32)
     for number, columns in enumerate(inputs):
         values = rows.values[:, columns].astype(np.float64)
-        slopes, constants = _calibrated(values, rows, count)
-        weights[number, columns], bias[number] = slopes, constants
-    return LinearHeads(in_units(weights), in_units(bias))
+        if len(values):
+            slopes, constants, learned = _calibrated(values, rows, count)
+            weights[number, columns], bias[number, learned] = slopes, in_units(constants)
+    return LinearHeads(in_units(weights), bias)
 
 
 def scaler_of(heard: HeardWindows, classes: Sequence[str]) -> Float64:
@@ -77,8 +81,10 @@ def in_units(values: Float64) -> Int32:
     return steps.astype(np.int32)
 
 
-def _calibrated(values: Float64, rows: HeardWindows, count: int) -> tuple[Float64, Float64]:
-    """Learn one head; returns its weights and biases, times its inverse temperature."""
+def _calibrated(
+    values: Float64, rows: HeardWindows, count: int
+) -> tuple[Float64, Float64, Indices]:
+    """Learn one head; returns weights and biases, times its inverse temperature, and which."""
     unit = rows.collection
     if len(np.unique(unit)) < _FEWEST_COLLECTIONS:
         unit = rows.group % _PARTS
@@ -91,9 +97,9 @@ def _calibrated(values: Float64, rows: HeardWindows, count: int) -> tuple[Float6
     told = rows.tried & np.isfinite(left_out[np.arange(len(values)), rows.target])
     inverse = inverse_temperature(left_out[told], rows.target[told]) if told.any() else 1.0
     weights, bias, learned = sums.ridge(np.ones(len(sums.unit), bool))
-    slopes, constants = np.zeros((values.shape[1], count)), np.full(count, _IMPOSSIBLE)
-    slopes[:, learned], constants[learned] = inverse * weights, inverse * bias
-    return slopes, constants
+    slopes = np.zeros((values.shape[1], count))
+    slopes[:, learned] = inverse * weights
+    return slopes, inverse * bias, learned
 
 
 class _Sums:

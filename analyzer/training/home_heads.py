@@ -15,7 +15,12 @@ from hearthlog.analyzer.training.dataset import HeardWindows
 from hearthlog.analyzer.training.heads import in_units
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
-from hearthlog.models.classifiers.embedding_heads import UNIT, EmbeddingHeads, sounds_of
+from hearthlog.models.classifiers.embedding_heads import (
+    UNIT,
+    UNTAUGHT,
+    EmbeddingHeads,
+    sounds_of,
+)
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
@@ -59,7 +64,9 @@ def base_heads(model: Model, classes: Sequence[str]) -> Heads:
         middle = bias[:, sounds] + np.einsum(
             "w,hws->hs", model.embedding_scaler[0], weights[..., sounds].astype(np.float64)
         )
-        constant = np.rint(middle.mean(axis=1) - _BELOW / inverse / UNIT).astype(np.int32)
+        middle = np.ma.masked_array(middle, bias[:, sounds] == UNTAUGHT)
+        constant = np.rint(middle.mean(axis=1).filled(0.0) - _BELOW / inverse / UNIT)
+        constant = constant.astype(np.int32)
         weights = np.pad(weights, ((0, 0), (0, 0), (0, new)))
         bias = np.concatenate([bias, np.tile(constant[:, np.newaxis], (1, new))], axis=1)
     update = {

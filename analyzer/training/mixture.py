@@ -10,7 +10,7 @@ from sklearn.metrics import f1_score
 from hearthlog.analyzer.training.calibration import inverse_temperature
 from hearthlog.analyzer.training.cross_validation import Fold
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.heads import LinearHeads, learn_heads
+from hearthlog.analyzer.training.heads import FEWEST_SOURCES, LinearHeads, learn_heads
 from hearthlog.analyzer.training.scenario import BUILTIN
 from hearthlog.models.classes import OTHER, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
@@ -122,6 +122,18 @@ def said_unseen(
         heard = unseen[data.is_embedded[unseen]]
         said[heard] = heads.log_probabilities(data.embedded[heard])
     return said
+
+
+def has_lessons(data: Dataset) -> bool:
+    """Tell whether heads can be learned: from two classes of sound, of some sources each.
+
+    Parameters
+    ----------
+    data : Dataset
+    """
+    pairs = np.unique(np.stack([data.heard.target, data.heard.group]), axis=1)
+    sources = np.bincount(pairs[0], minlength=len(data.classes))
+    return int((sources[sounds_of(data.classes)] >= FEWEST_SOURCES).sum()) > 1
 
 
 class Tried(NamedTuple):

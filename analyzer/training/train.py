@@ -26,7 +26,13 @@ from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import DEFAULT
 from hearthlog.analyzer.training.learned_segments import segment_digests
 from hearthlog.analyzer.training.method import Learned, Method, prepare
-from hearthlog.analyzer.training.mixture import Mixture, Tried, hearing_of, learn_mixture
+from hearthlog.analyzer.training.mixture import (
+    Mixture,
+    Tried,
+    has_lessons,
+    hearing_of,
+    learn_mixture,
+)
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import calibration_error
 from hearthlog.analyzer.training.sightings import with_directions
@@ -117,7 +123,7 @@ def train_model(  # noqa: PLR0913, PLR0917
         left_out = decide(collections, len(sources)) + bias
         inverse, elsewhere = calibrate_elsewhere(left_out, data, collections)
     mixture, measured, sure = None, decisions, inverse
-    if method.network and len(data.heard.target):
+    if method.network and has_lessons(data):
         mixture = _mixture(data, method, inverse, (sources, decisions), (collections, left_out))
         measured, sure = mixture.of_sources, 1.0
         if mixture.of_collections is not None:
@@ -145,11 +151,10 @@ def train_model(  # noqa: PLR0913, PLR0917
         training_digests=segment_digests(data.windows),
     )
     if mixture is not None:
-        heads = mixture.heads
         model = replace(
             model,
-            embedding_weights=heads[0],
-            embedding_bias=heads[1],
+            embedding_weights=mixture.heads.weights,
+            embedding_bias=mixture.heads.bias,
             embedding_scaler=scaler_of(data.heard, data.classes),
         )
     model = with_directions(model, data.target, data.sightings)

@@ -18,6 +18,8 @@ from hearthlog.schemas.arrays import Float64, Indices, Int32
 # exact in a float64: the same in any order, and from any BLAS.
 UNIT = 2.0**-22
 LEAST = 1e-4  # probability of a head or a classifier for a class: none has a veto
+UNTAUGHT = -(2**31)  # bias of a class of which a head has learned nothing
+_OF_UNTAUGHT = -0.9  # what it says of such a class: as much as of the right one on average, a log
 _STEP = 2.0**-20  # of logarithms: what is finer depends on the processor
 _ROWS_AT_ONCE = 4096
 
@@ -33,7 +35,7 @@ class EmbeddingHeads:
     weights : np.ndarray [shape=(H, W, C)], int32
         Of the linear heads, in units of `UNIT`.
     bias : np.ndarray [shape=(H, C)], int32
-        In the same units.
+        In the same units; `UNTAUGHT` for a class that is left to the other heads.
     classes : sequence of str
         Of the model.
 
@@ -50,7 +52,8 @@ class EmbeddingHeads:
         self._classes = len(classes)
         self._sounds = sounds_of(classes)
         self._weights = weights[..., self._sounds].astype(np.float64)
-        self._bias = bias[:, self._sounds].astype(np.float64)
+        self._untaught = bias[:, self._sounds] == UNTAUGHT
+        self._bias = UNIT * bias[:, self._sounds].astype(np.float64)
         self._of_heads, self._of_home = mix.head_weights, mix.of_home
         names = [classes[number] for number in self._sounds]
         self._names = [_Names(head, names) for head in mix.names]
@@ -77,10 +80,15 @@ class EmbeddingHeads:
 
     def _of_sounds(self, values: Int8) -> Float64:
         steps, total = values.astype(np.float64), np.zeros((len(values), len(self._sounds)))
-        for weight, slopes, bias in zip(self._of_heads, self._weights, self._bias, strict=False):
-            total += weight * floored(UNIT * (steps @ slopes + bias))
+        for number, weight in enumerate(self._of_heads):
+            taught = ~self._untaught[number]
+            said = np.full(total.shape, _OF_UNTAUGHT)
+            if taught.any():
+                slopes, bias = self._weights[number][:, taught], self._bias[number, taught]
+                said[:, taught] = floored(UNIT * (steps @ slopes) + bias)
+            total += weight * said
         if self._of_home:
-            total += UNIT * (steps @ self._weights[-1] + self._bias[-1])
+            total += UNIT * (steps @ self._weights[-1]) + self._bias[-1]
         for head in self._names:
             total += head.weight * floored(head.decide(values))
         return np.rint(total / _STEP) * _STEP

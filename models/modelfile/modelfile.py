@@ -23,6 +23,7 @@ from hearthlog.models.classifiers.description import (
     read_description,
 )
 from hearthlog.models.classifiers.directions import MOST_EVIDENCE, SECTORS
+from hearthlog.models.classifiers.embedding_heads import UNTAUGHT, sounds_of
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
@@ -346,7 +347,25 @@ def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | 
     for name, shape in shapes.items():
         if problem := _problem_of_array(arrays[name], dtypes[name], shape):
             return f"{name} {problem}"
-    return _problem_of_values(classes, arrays) or kind.problem(classes, arrays)
+    return (
+        _problem_of_values(classes, arrays)
+        or _problem_of_untaught(description, arrays)
+        or kind.problem(classes, arrays)
+    )
+
+
+def _problem_of_untaught(description: Description, arrays: Mapping[str, Array]) -> str | None:
+    """Return what is wrong with the classes that heads leave to others."""
+    mix = description.embedding
+    if mix is None:
+        return None
+    sounds = sounds_of(description.classes)
+    untaught = arrays["embedding_bias"][:, sounds] == UNTAUGHT
+    if untaught.all(axis=1).any():
+        return "embedding_bias has a head without a class"
+    if mix.of_home and untaught[-1].any():
+        return "embedding_bias leaves a class out in what a home adds"
+    return None
 
 
 def _problem_of_values(classes: int, arrays: Mapping[str, Array]) -> str | None:
