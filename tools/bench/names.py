@@ -242,7 +242,7 @@ def names(
     network: Annotated[Path, typer.Argument(help="File of YAMNet.")],
     manifests: Annotated[list[Path], typer.Argument(help="Clips, with their kinds.")],
     output: Annotated[Path | None, typer.Option("-o", help="Table to write.")] = None,
-    seeds: Annotated[int, typer.Option(help="Scenes.")] = 2,
+    seeds: Annotated[int, typer.Option(help="Scenes.")] = 4,
 ) -> None:
     """Measure each name, and print the table."""
     clips = [kind for manifest in manifests for kind in read_kinds(manifest)]
