@@ -7,10 +7,10 @@ too often to be counted. `audioset_names.csv` has names, words and durations, an
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,8 @@ class SoundName(NamedTuple):
     clips, sources : int
         Recordings of it that it was measured with.
     precision, recall, false_an_hour : float
-        On sources that the threshold was not chosen on; NaN where there are too few recordings.
+        Of an event on sources that its threshold was not chosen on, of a hint on all; NaN where
+        there are too few.
     """
 
     name: str
@@ -259,4 +260,4 @@ def _text(value: object) -> str:
     return str(value)
 
 
-_VALUES = {str: str, float: float, int: int, bool: _yes}
+_VALUES: Mapping[object, Callable[[str], Any]] = {str: str, float: float, int: int, bool: _yes}

@@ -1,21 +1,20 @@
 """`python -m hearthlog.tools.bench.names YAMNET MANIFEST`: which names may be events.
 
-The clips of each half of the sources are laid, each once and at a level of its own, into hours of
-noise, and the network names what it hears. A threshold is chosen on one half, so that a name is
-right often enough and said falsely seldom enough, and tried on the other. With `-o` the
-table of names takes the thresholds and figures; what is printed is the table of docs/audioset.md.
+Clips are laid, each once and at a level of its own, into hours of noise, and the network names what
+it hears. A threshold is chosen on half of the sources, so that a name is right often enough and
+said falsely seldom enough, and tried on the other half, for many halves. With `-o` the table of
+names takes the thresholds and figures; what is printed is the table of docs/audioset.md.
 
 The manifest needs a column `detail`, the kind of the sound; `KINDS` says which kinds are which
 names'.
 """
 
 import csv
-import hashlib
 import math
+from bisect import bisect
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -36,6 +35,7 @@ from hearthlog.models.embedding.sound_names import (
     write_names,
 )
 from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.schemas.arrays import Bool, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 
 # Kinds as `label/detail`, or a label alone, and the names that are right for them.
@@ -156,18 +156,20 @@ _FLOOR = -70.0  # dBFS
 _FAINTEST = -12.0  # dB, by which a clip is laid fainter
 _THRESHOLDS = np.arange(-3.5, 12.1, 0.5)
 _PRECISION, _FALSE_AN_HOUR = 0.8, 1.0  # of an event
-_CHOSEN = ((0.9, 0.5), (_PRECISION, _FALSE_AN_HOUR))  # with a margin, if it can be had
-_FEWEST = 2  # clips of a name in each half
-_LEAST_RECALL = 0.1
+_MARGINS = 1, 2, 3  # thresholds that the chosen one is above the lowest that would do
+_LEAST_RECALL = 0.2
+_FEWEST = 4  # sources
+_SPLITS = 20
 _EDGE = 10  # frames
+_SEED = 1
+_CLIPS, _HEARD, _RIGHT, _WRONG, _HOURS = range(5)  # places in `Counts`
 
 
 class Kind(NamedTuple):
-    """A clip, the kind of its sound, and the half that its source is in."""
+    """A clip, and the kind of its sound."""
 
     clip: LabelledClip
     kind: str
-    half: int
 
 
 class Laid(NamedTuple):
@@ -200,19 +202,19 @@ class Counts(NamedTuple):
 
     Attributes
     ----------
-    clips, heard : int
+    clips, heard : float
         Of its kinds, and those in which it was said.
-    right, wrong : int
+    right, wrong : float
         Times that it was said in them, and where there was nothing of the kind.
     hours : float
         Without it.
     """
 
-    clips: int = 0
-    heard: int = 0
-    right: int = 0
-    wrong: int = 0
-    hours: float = 0.0
+    clips: float
+    heard: float
+    right: float
+    wrong: float
+    hours: float
 
     @property
     def precision(self) -> float:
@@ -229,43 +231,45 @@ class Counts(NamedTuple):
         """Wrong ones in an hour without it."""
         return self.wrong / self.hours if self.hours else math.nan
 
-    def good(self, precision: float, false_an_hour: float) -> bool:
-        """Tell whether it is right often enough."""
-        return self.precision >= precision and self.false_an_hour <= false_an_hour
-
-    def __add__(self, other: tuple[object, ...]) -> "Counts":
-        """Count both."""
-        return Counts(*(a + b for a, b in zip(self, other, strict=True)))  # type: ignore[operator]
+    @property
+    def good(self) -> bool:
+        """Whether it is heard, and right often enough, to be an event."""
+        right = self.precision >= _PRECISION and self.false_an_hour <= _FALSE_AN_HOUR
+        return right and self.recall >= _LEAST_RECALL
 
 
 def names(
     network: Annotated[Path, typer.Argument(help="File of YAMNet.")],
     manifests: Annotated[list[Path], typer.Argument(help="Clips, with their kinds.")],
     output: Annotated[Path | None, typer.Option("-o", help="Table to write.")] = None,
-    seeds: Annotated[int, typer.Option(help="Scenes of each half.")] = 2,
+    seeds: Annotated[int, typer.Option(help="Scenes.")] = 4,
 ) -> None:
     """Measure each name, and print the table."""
-    clips = [kind for manifest in manifests for kind in _kinds(manifest)]
+    clips = [kind for manifest in manifests for kind in read_kinds(manifest)]
     embedder = Embedder(YAMNET, network)
-    halves = [[one for one in clips if one.half == half] for half in (0, 1)]
-    scenes = [[compose(half, embedder, seed) for seed in range(seeds)] for half in halves]
-    hours = [sum(scene.hours for scene in half) for half in scenes]
-    print(f"{len(clips):,} clips; {hours[0]:.1f} and {hours[1]:.1f} hours of scenes")
+    scenes = [compose(clips, embedder, seed) for seed in range(seeds)]
+    hours = sum(scene.hours for scene in scenes)
+    sources = len({each.clip.source_group for each in clips})
+    print(f"{len(clips):,} clips of {sources:,} sources; {hours:.1f} hours of scenes")
     measured = measure(scenes, embedder.projection)
     print(table(measured))
     if output is not None:
         write_names(measured, output)
 
 
-def _kinds(manifest: Path) -> list[Kind]:
-    """Read the clips of a manifest; its labels are free."""
+def read_kinds(manifest: Path) -> list[Kind]:
+    """Read the clips of a manifest; its labels are free.
+
+    Parameters
+    ----------
+    manifest : Path
+    """
     with manifest.open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     return [
         Kind(
             LabelledClip(manifest.parent / row["path"], row["label"], row["source_group"], "", ""),
             f"{row['label']}/{row['detail']}",
-            hashlib.sha256(row["source_group"].encode()).digest()[0] % 2,
         )
         for row in rows
     ]
@@ -285,7 +289,7 @@ def compose(clips: Sequence[Kind], embedder: Embedder, seed: int) -> Scene:
     parts: list[tuple[int, np.ndarray]] = []
     place = 40
     for number in rng.permutation(len(clips)):
-        clip, kind, _ = clips[number]
+        clip, kind = clips[number]
         frames = clip_frames(clip)[:_LONGEST] * 10 ** (rng.uniform(_FAINTEST, 0.0) / 20)
         laid.append(Laid(kind, clip.source_group, place, place + len(frames)))
         parts.append((place, frames))
@@ -299,7 +303,9 @@ def compose(clips: Sequence[Kind], embedder: Embedder, seed: int) -> Scene:
     return Scene(embeddings, laid, len(sound) * FRAME_SECONDS / 3600)
 
 
-def count(name: SoundName, sounds: Sequence[NamedSound], scene: Scene) -> Counts:
+def count(
+    name: SoundName, sounds: Sequence[NamedSound], scene: Scene, sources: Mapping[str, int]
+) -> Float64:
     """Count how often a name was right and wrong in a scene.
 
     Parameters
@@ -308,20 +314,35 @@ def count(name: SoundName, sounds: Sequence[NamedSound], scene: Scene) -> Counts
     sounds : sequence of NamedSound
         That were given the name.
     scene : Scene
+    sources : mapping of str to int
+        Numbers of the sources.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 5)], float64
+        `Counts` of each source; the pause behind a clip is its source's, too.
     """
     right, like = _right_for(name, scene)
+    counts = np.zeros((len(sources), len(Counts._fields)))
+    begins = [each.first for each in scene.laid]
+    owners = [sources[each.source] for each in scene.laid]
     is_right = [_inside(sound, right) for sound in sounds]
-    wrong = sum(
-        not good and not _inside(sound, [*right, *like])
-        for good, sound in zip(is_right, sounds, strict=True)
-    )
-    heard = sum(
-        any(good and _overlap(sound, each) for good, sound in zip(is_right, sounds, strict=True))
-        for each in right
-    )
-    frames = sum(each.end - each.first for each in {*right, *like})
-    hours = scene.hours - frames * FRAME_SECONDS / 3600
-    return Counts(len(right), heard, sum(is_right), wrong, hours)
+    for good, sound in zip(is_right, sounds, strict=True):
+        owner = owners[max(0, bisect(begins, (sound.first + sound.end) // 2) - 1)]
+        if good:
+            counts[owner, _RIGHT] += 1
+        elif not _inside(sound, [*right, *like]):
+            counts[owner, _WRONG] += 1
+    told = [sound for good, sound in zip(is_right, sounds, strict=True) if good]
+    for each in right:
+        counts[sources[each.source], _CLIPS] += 1
+        counts[sources[each.source], _HEARD] += any(_overlap(sound, each) for sound in told)
+    held = {each.first for each in (*right, *like)}
+    lengths = np.diff([*begins, scene.laid[-1].end]) * FRAME_SECONDS / 3600
+    for begin, owner, hours in zip(begins, owners, lengths, strict=True):
+        if begin not in held:
+            counts[owner, _HOURS] += hours
+    return counts
 
 
 def _is_of(kind: str, kinds: Sequence[str]) -> bool:
@@ -347,70 +368,88 @@ def _overlap(sound: NamedSound, laid: Laid, edge: int = 0) -> int:
     return max(0, min(sound.end, laid.end + edge) - max(sound.first, laid.first - edge))
 
 
-def measure(scenes: Sequence[Sequence[Scene]], projection: Projection) -> list[SoundName]:
-    """Choose the threshold of each name on each half, and try it on the other.
+def measure(scenes: Sequence[Scene], projection: Projection) -> list[SoundName]:
+    """Choose the threshold of each name, and try it on halves of the sources.
 
     Parameters
     ----------
-    scenes : sequence of sequence of Scene
-        Of the two halves of the sources.
+    scenes : sequence of Scene
     projection : Projection
     """
     names = audioset_names()
     tried = [name._replace(threshold=float(each)) for name in names for each in _THRESHOLDS]
     sounds: dict[tuple[str, float, Scene], list[NamedSound]] = defaultdict(list)
-    for scene in chain(*scenes):
+    for scene in scenes:
         for sound in named_sounds(scene.embeddings, projection, tried):
             sounds[sound.name.name, sound.name.threshold, scene].append(sound)
+    groups = sorted({each.source for scene in scenes for each in scene.laid})
+    sources = {source: number for number, source in enumerate(groups)}
+    measured = []
+    for name in names:
+        counts = np.zeros((len(_THRESHOLDS), len(sources), len(Counts._fields)))
+        for row, each in enumerate(_THRESHOLDS.tolist()):
+            for scene in scenes:
+                counts[row] += count(name, sounds[name.name, each, scene], scene, sources)
+        measured.append(_measured(name, counts, len(scenes)))
+    return measured
 
-    def counts(name: SoundName, half: Sequence[Scene]) -> list[Counts]:
-        totals = []
-        for each in _THRESHOLDS:
-            said = [(sounds[name.name, float(each), scene], scene) for scene in half]
-            totals.append(sum((count(name, *one) for one in said), Counts()))
-        return totals
 
-    return [_measured(name, [counts(name, half) for half in scenes], scenes) for name in names]
-
-
-def _measured(
-    name: SoundName, counts: Sequence[Sequence[Counts]], scenes: Sequence[Sequence[Scene]]
-) -> SoundName:
-    laid = [_right_for(name, half[0])[0] for half in scenes]
-    name = SoundName(*name[: SoundName._fields.index("threshold")])._replace(
-        clips=sum(map(len, laid)), sources=len({each.source for each in chain(*laid)})
+def _measured(name: SoundName, counts: Float64, times: int) -> SoundName:
+    """Fill in the figures of a name, from counts of shape (thresholds, sources, 5)."""
+    positive = counts[0, :, _CLIPS] > 0
+    name = SoundName(
+        name.name,
+        name.words,
+        name.group,
+        name.seconds,
+        name.windows,
+        clips=round(counts[0, :, _CLIPS].sum() / times),
+        sources=int(positive.sum()),
     )
-    if min(map(len, laid)) < _FEWEST:
+    if name.sources < _FEWEST:
         return name
-    first, second = map(_chosen, counts)
-    if first is None or second is None:
-        both = [a + b for a, b in zip(*counts, strict=True)]
-        place = max(range(len(both)), key=lambda place: _f1(both[place]))
-        tried, is_event = both[place], False
-    else:
-        place = max(first, second)
-        tried = counts[0][second] + counts[1][first]
-        is_event = tried.good(_PRECISION, _FALSE_AN_HOUR)
+    for margin in _MARGINS:
+        tried, place = _tried(counts, positive, margin), _chosen(counts.sum(axis=1), margin)
+        if place is not None and tried.good:
+            return _with_figures(name, place, tried)._replace(is_event=True)
+    both = [Counts(*row) for row in counts.sum(axis=1).tolist()]
+    place = max(range(len(both)), key=lambda place: _f1(both[place]))
+    return _with_figures(name, place, both[place])
+
+
+def _with_figures(name: SoundName, place: int, tried: Counts) -> SoundName:
     return name._replace(
         threshold=float(_THRESHOLDS[place]),
-        is_event=is_event,
         precision=round(tried.precision, 2),
         recall=round(tried.recall, 2),
         false_an_hour=round(tried.false_an_hour, 1),
     )
 
 
-def _chosen(counts: Sequence[Counts]) -> int | None:
-    """Return the threshold that hears most of those that are right often enough."""
-    for precision, false_an_hour in _CHOSEN:
-        good = [
-            place
-            for place, each in enumerate(counts)
-            if each.good(precision, false_an_hour) and each.recall >= _LEAST_RECALL
-        ]
-        if good:
-            return max(good, key=lambda place: counts[place].recall)
-    return None
+def _tried(counts: Float64, positive: Bool, margin: int) -> Counts:
+    """Choose on half of the sources and try on the other, for many halves, and both ways."""
+    rng, total = np.random.default_rng(_SEED), np.zeros(len(Counts._fields))
+    for _ in range(_SPLITS):
+        half = np.zeros(len(positive), bool)
+        for kind in (positive, ~positive):  # as many of each in both
+            half[rng.permutation(np.flatnonzero(kind))[::2]] = True
+        for chosen, other in ((half, ~half), (~half, half)):
+            place = _chosen(counts[:, chosen].sum(axis=1), margin)
+            rows = counts[:, other].sum(axis=1)
+            if place is not None:
+                total += rows[place]
+            else:  # it would be no event, and is never said
+                total[[_CLIPS, _HOURS]] += rows[0, [_CLIPS, _HOURS]]
+    return Counts(*total.tolist())
+
+
+def _chosen(counts: Float64, margin: int) -> int | None:
+    """Return the threshold some steps above the one that hears most of those that would do."""
+    each = [Counts(*row) for row in counts.tolist()]
+    good = [place for place, one in enumerate(each) if one.good]
+    if not good:
+        return None
+    return min(max(good, key=lambda place: each[place].recall) + margin, len(each) - 1)
 
 
 def _f1(counts: Counts) -> float:
