@@ -550,7 +550,7 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     state = HomeState()
     columns = read_columns([log], [*OF_WATER, "/mic/gap", "/mic/label", "/mic/segment"])
     news = News(state, [], [], today(START + 60 * NANOSECONDS, UTC), UTC)
-    figures, home = tmp_path / "figures", Home(tmp_path, "home", UTC)
+    figures, home = tmp_path / "figures.prom", Home(tmp_path, "home", UTC)
     output = PrometheusOutput(
         PrometheusSettings(text_file=figures, readable_by="all"), home, tmp_path, 0, pytest.fail
     )
