@@ -157,7 +157,7 @@ class NamedSounds:
         self._projection = projection
         self._names = audioset_names() if names is None else tuple(names)
         self._thresholds = np.array([name.threshold for name in self._names])
-        columns = _columns(projection, self._names)
+        self._columns = columns = _columns(projection, self._names)
         above_low = (projection.lows + projection.steps)[columns]  # the low itself is nothing heard
         self._release = np.maximum(self._thresholds - _RELEASE, above_low)
         self._least = np.array([name.windows for name in self._names])
@@ -182,7 +182,7 @@ class NamedSounds:
         """
         ended: list[NamedSound] = []
         if len(embeddings.frames):
-            logits = name_logits(embeddings.values, self._projection, self._names)
+            logits = self._projection.values(embeddings.values)[:, self._columns]
             for frame, row in zip(embeddings.frames.tolist(), logits, strict=True):
                 ended += self._ended(frame)
                 self._add(frame, row)
