@@ -27,10 +27,17 @@ from hearthlog.analyzer.training.dataset import (
 )
 from hearthlog.analyzer.training.heads import learn_heads
 from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.mixture import Hearing, hearing_of, names_head, rejecting_head
+from hearthlog.analyzer.training.mixture import (
+    Hearing,
+    Tried,
+    best_mix,
+    hearing_of,
+    names_head,
+    rejecting_head,
+)
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.training.svm_method import EMBEDDING, ROOM
-from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.train import group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import FORMAT, FORMAT_OF_EMBEDDINGS
 from hearthlog.models.classifiers.embedding_heads import UNTAUGHT, EmbeddingHeads
@@ -161,6 +168,16 @@ def test_a_class_of_hardly_any_source_is_left_to_others():
     said = EmbeddingHeads(mix, *heads, data.classes).log_probabilities(data.embedded)
     assert np.ptp(said[:, 3]) < 1e-6
     assert np.log(1e-4) < said[0, 3] < 0
+
+
+def test_names_are_mixed_in_where_a_class_has_hardly_any_source():
+    data, few = made_up(), np.unique(made_up().heard.group[made_up().heard.target == 3])[:2]
+    kept = (data.heard.target != 3) | np.isin(data.heard.group, few)
+    data = replace(data, heard=data.heard.rows(kept))
+    known = np.ones(len(data), bool)
+    way = Tried(group_folds(data), np.zeros((len(data), len(data.classes))), known)
+    mix = best_mix(data, HEARING, [way]).mix
+    assert [HEARING.names[one] for one in mix.names[-1].classes["coughing"]] == ["coughing"]
 
 
 def test_names_are_those_of_the_scenario_and_what_is_outside_it():

@@ -23,6 +23,7 @@ HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
 _SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tried
 CLASS_EXPONENT = 0.2
+_NAMES_BESIDE = 0.5  # weight of names beside both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
 _REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
 _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
@@ -131,9 +132,8 @@ def has_lessons(data: Dataset) -> bool:
     ----------
     data : Dataset
     """
-    pairs = np.unique(np.stack([data.heard.target, data.heard.group]), axis=1)
-    sources = np.bincount(pairs[0], minlength=len(data.classes))
-    return int((sources[sounds_of(data.classes)] >= FEWEST_SOURCES).sum()) > 1
+    sources = _sources(data)[sounds_of(data.classes)]
+    return int((sources >= FEWEST_SOURCES).sum()) > 1
 
 
 class Tried(NamedTuple):
@@ -211,26 +211,43 @@ def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
         [said_unseen(data, single, [columns], way.folds) for way in ways]
         for columns in hearing.inputs
     ]
-    every = hearing.inputs
-    candidates: list[tuple[tuple[slice, ...], NamesHead | None]] = [
-        (every, None),
-        (every, rejecting_head(hearing, data.classes)),
-        (every[:1], names_head(hearing, data.classes)),
-    ]
     tried = []
-    for number, (inputs, names) in enumerate(candidates):
-        if names is None and number:
-            continue
-        mix, said = (
-            _plain(hearing, inputs),
-            [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)],
-        )
-        if names is not None:
-            mix = mix.model_copy(update={"names": [names]})
+    for inputs, names in _candidates(data, hearing):
+        mix = _plain(hearing, inputs)
+        said = [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)]
+        if names:
+            mix = mix.model_copy(update={"names": names})
             of_names = _said_by_names(data, mix)
             said = [one + of_names for one in said]
         tried.append(BestMix(mix, inputs, said, _left_out(data, mix, ways, said)))
     return max(tried, key=lambda one: _right(data, one.left_out))
+
+
+def _candidates(data: Dataset, hearing: Hearing) -> list[tuple[tuple[slice, ...], list[NamesHead]]]:
+    """Return linear heads and names that may be mixed; names where a class has hardly any source.
+
+    That of such a class cannot be measured.
+    """
+    every = hearing.inputs
+    rejecting, names = (
+        rejecting_head(hearing, data.classes),
+        names_head(hearing, data.classes),
+    )
+    by_rejecting = [] if rejecting is None else [rejecting]
+    if names is None:
+        return [(every, []), (every, by_rejecting)] if by_rejecting else [(every, [])]
+    known = [number for number, name in enumerate(data.classes) if name != UNKNOWN]
+    known = [number for number in known if data.classes[number] != SILENCE]
+    if (_sources(data)[known] < FEWEST_SOURCES).any():
+        beside = names.model_copy(update={"weight": _NAMES_BESIDE})
+        return [(every, [*by_rejecting, beside]), (every[:1], [names])]
+    return [(every, []), *([(every, by_rejecting)] if by_rejecting else []), (every[:1], [names])]
+
+
+def _sources(data: Dataset) -> Indices:
+    """Return the number of sources of the windows for heads, by class."""
+    pairs = np.unique(np.stack([data.heard.target, data.heard.group]), axis=1)
+    return np.bincount(pairs[0], minlength=len(data.classes))
 
 
 def learn_mixture(
