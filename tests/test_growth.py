@@ -78,7 +78,8 @@ def test_what_was_appended_since_the_first_release_has_a_default_and_raised_the_
             for schema in file.schemas.values():
                 kind = message_type(schema.name, schema.encoding, schema.data)
                 first[schema.name] = {name for name, _ in kind.types[schema.name]}
-    later = {message_types.REVIEWED, message_types.DIRECTION}  # which that release did not have
+    # Which that release did not have.
+    later = {message_types.REVIEWED, message_types.DIRECTION, message_types.EMBEDDING}
     for name in set(OURS) - later:
         today = [field for field, _ in message_type(name).types[name]]
         appended = APPENDED.get(name, {})
@@ -346,7 +347,12 @@ def test_the_doctor_misses_what_the_version_of_a_log_had(golden, capfd, tmp_path
         patch.setattr("hearthlog.schemas.logs.provenance._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
         said = json.loads(run(capfd, "doctor", golden, "--json").stdout)
     wrong = [each["what"] for each in said["findings"] if each["level"] == "error"]
-    absent = {message_types.MARK, message_types.REVIEWED, message_types.DIRECTION}  # in this log
+    absent = {  # in this log
+        message_types.MARK,
+        message_types.REVIEWED,
+        message_types.DIRECTION,
+        message_types.EMBEDDING,
+    }
     assert said["errors"] == len({*OURS} - absent) + 1
     assert any("model.json" in what for what in wrong)  # which the first version had not
     assert any(

@@ -7,7 +7,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
-from hearthlog.analyzer.training.clip_embeddings import AS_IT_IS
+from hearthlog.analyzer.training.clip_embeddings import AS_IT_IS, model_embedder
 from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.dataset import (
     Dataset,
@@ -15,7 +15,6 @@ from hearthlog.analyzer.training.dataset import (
     clip_recordings,
     cut_recordings,
 )
-from hearthlog.analyzer.training.installed import model_embedder
 from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of
 from hearthlog.analyzer.training.rooms import captured, steady_noise

@@ -4,14 +4,20 @@ A home gives windows that a sound fills in part, short sounds, and other rooms; 
 """
 
 import hashlib
+import warnings
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from hearthlog.analyzer.training.rooms import other_room, steady_noise
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Int8
+from hearthlog.models.embedding.networks import find_network, load_embedder
+from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
@@ -220,3 +226,52 @@ def _short_parts(sound: Float64, rng: np.random.Generator) -> Iterator[Float32]:
         place = int(rng.uniform(first, last))
         window[place : place + length] += part
         yield _window(window)
+
+
+def model_embedder(model: Model) -> ClipEmbedder | None:
+    """Return what hears clips for the heads of a model; None if it has none.
+
+    Without its network, or with another projection, a `HearthlogWarning` says that the model is
+    tried without it.
+
+    Parameters
+    ----------
+    model : Model
+    """
+    mix = model.description.embedding
+    if mix is None:
+        return None
+    try:
+        embedder = network_embedder(mix.network)
+        source = embedder.source
+        if source is not None and source.projection_sha256 == mix.projection_sha256:
+            return embedder
+        why = f"it was learned with another projection of the network {mix.network}"
+    except ModelError as error:
+        why = str(error)
+    name = model.name or model.description.scenario_name
+    text = f"a model is tried by the features alone: {why}"
+    warnings.warn(HearthlogWarning(text, f"model {name}"), stacklevel=2)
+    return None
+
+
+@lru_cache(maxsize=2)
+def network_embedder(network: str) -> ClipEmbedder:
+    """Return what hears clips by a network.
+
+    Parameters
+    ----------
+    network : str
+        Its name.
+
+    Raises
+    ------
+    ModelError
+        If it is not known, not there, another file, or cannot be used.
+    """
+    path = find_network(network)
+    if path is None:
+        raise ModelError(
+            f"the network {network} is not here; fetch it: hearthlog models fetch {network}"
+        )
+    return ClipEmbedder(load_embedder(network, path))

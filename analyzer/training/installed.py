@@ -1,11 +1,9 @@
 """The methods that are installed."""
 
-import warnings
-from functools import lru_cache
 from importlib.util import find_spec
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_embeddings import ClipEmbedder
+from hearthlog.analyzer.training.clip_embeddings import ClipEmbedder, network_embedder
 from hearthlog.analyzer.training.layer_methods import LOGISTIC, PERCEPTRON
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.svm_method import (
@@ -18,12 +16,9 @@ from hearthlog.analyzer.training.svm_method import (
 )
 from hearthlog.analyzer.training.tree_methods import BOOSTING, EXTRA_TREES, FOREST
 from hearthlog.analyzer.training.vector_methods import NEIGHBOURS_VOTE, ONE_CLASS_MACHINES
-from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.networks import find_network, load_embedder
-from hearthlog.models.errors import ModelError
+from hearthlog.models.embedding.networks import find_network
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.installed import is_network
-from hearthlog.schemas.errors import HearthlogWarning
 
 DEFAULT: Method = ROOM
 OTHERS: tuple[Method, ...] = (
@@ -57,44 +52,7 @@ def clip_embedder(method: Method) -> ClipEmbedder | None:
     ModelError
         If its network is not known, not there, another file, or cannot be used.
     """
-    return _clip_embedder(method.network) if method.network else None
-
-
-def model_embedder(model: Model) -> ClipEmbedder | None:
-    """Return what hears clips for the heads of a model; None if it has none.
-
-    Without its network, or with another projection, a `HearthlogWarning` says that the model is
-    tried without it.
-
-    Parameters
-    ----------
-    model : Model
-    """
-    mix = model.description.embedding
-    if mix is None:
-        return None
-    try:
-        embedder = _clip_embedder(mix.network)
-        source = embedder.source
-        if source is not None and source.projection_sha256 == mix.projection_sha256:
-            return embedder
-        why = f"it was learned with another projection of the network {mix.network}"
-    except ModelError as error:
-        why = str(error)
-    name = model.name or model.description.scenario_name
-    text = f"a model is tried by the features alone: {why}"
-    warnings.warn(HearthlogWarning(text, f"model {name}"), stacklevel=2)
-    return None
-
-
-@lru_cache(maxsize=2)
-def _clip_embedder(network: str) -> ClipEmbedder:
-    path = find_network(network)
-    if path is None:
-        raise ModelError(
-            f"the network {network} is not here; fetch it: hearthlog models fetch {network}"
-        )
-    return ClipEmbedder(load_embedder(network, path))
+    return network_embedder(method.network) if method.network else None
 
 
 def method_named(name: str) -> Method:

@@ -265,9 +265,9 @@ def _recordings(
     model: "Model",
     left_out: "list[LeftOut]",
 ) -> "list[Recording]":
+    from hearthlog.analyzer.training.clip_embeddings import model_embedder
     from hearthlog.analyzer.training.dataset import UNREADABLE, clip_recordings
     from hearthlog.analyzer.training.home_data import home_recordings
-    from hearthlog.analyzer.training.installed import model_embedder
     from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.models.features.installed import feature_set
     from hearthlog.tools.cli.progress import share_done

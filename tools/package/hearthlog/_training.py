@@ -4,13 +4,9 @@ import warnings
 from pathlib import Path
 
 from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
+from hearthlog.analyzer.training.clip_embeddings import model_embedder
 from hearthlog.analyzer.training.dataset import UNREADABLE, build_dataset, clip_recordings
-from hearthlog.analyzer.training.installed import (
-    clip_embedder,
-    default_method,
-    method_named,
-    model_embedder,
-)
+from hearthlog.analyzer.training.installed import clip_embedder, default_method, method_named
 from hearthlog.analyzer.training.manifest import LeftOut, left_out_lines, read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import train_model
