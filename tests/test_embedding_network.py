@@ -28,12 +28,10 @@ from hearthlog.models.embedding.projection import Projection, write_projection
 from hearthlog.models.embedding.sounds import NOISE, synthetic_sounds
 from hearthlog.models.errors import ModelError
 from hearthlog.recorder import embedder_probe
-from hearthlog.recorder.config import NO_MODEL, Settings
 from hearthlog.recorder.embedder_probe import Probe, open_embedder, probe_network
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.cli import fetch as verb
-from hearthlog.tools.cli.record import _tell_of_network
 
 _PLACES = (
     Path(__file__).parents[2] / "shared" / "data" / "networks" / "yamnet.tflite",
@@ -351,19 +349,6 @@ def test_a_configured_network_that_is_not_there_is_noticed(hearthlog, tmp_path, 
     assert "or not all of it: it has 4 bytes" in hearthlog("config", "check", file).stderr
     file.write_text(f'model = "none"\nembedding = "none"\noutput = "{tmp_path}/logs"\n')
     assert hearthlog("config", "check", file).returncode == 0
-
-
-def test_on_a_terminal_it_is_said_once_what_a_network_would_gain(folder, capsys, monkeypatch):
-    _tell_of_network(Settings(model=Path("general")))
-    assert "hearthlog models fetch yamnet (4 MB, once)\n" in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "ai_edge_litert", None)
-    _tell_of_network(Settings(model=Path("general")))
-    assert "it wants LiteRT, too; try: " in capsys.readouterr().err
-    _tell_of_network(Settings(model=NO_MODEL))
-    _tell_of_network(Settings(embedding="none"))
-    (folder / "yamnet.tflite").touch()
-    _tell_of_network(Settings())
-    assert capsys.readouterr().err == ""
 
 
 def test_a_file_that_hears_otherwise_is_told_when_it_is_fetched(yamnet, monkeypatch):

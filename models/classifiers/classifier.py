@@ -112,7 +112,10 @@ class Classifier:
             theirs = f"these are of {source.network} with another projection"
             if source.network != self._mix.network:
                 theirs = f"these are of {source.network}"
-        return f"it takes embeddings of {self._mix.network}, and {theirs}: labels by features alone"
+        return (
+            f"it takes embeddings of {self._mix.network}, and {theirs}: labels by features alone, "
+            f"which are less true (hearthlog models fetch {self._mix.network})"
+        )
 
     def mix(
         self, probabilities: Float32, embedded: Float64, evidence: Float64 | None = None

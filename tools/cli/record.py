@@ -153,8 +153,6 @@ def record(
     settings = with_model(configured)
     for line in exposed_passwords(settings, config):
         tell(line)
-    if sys.stderr.isatty():
-        _tell_of_network(settings)
     os.umask(_HIDDEN[settings.readable_by])
     losses: list[str] = []
     stop = Flag()
@@ -223,24 +221,6 @@ def with_model(settings: "Settings") -> "Settings":
     if starter in STARTERS and not Path(starter).exists() and starter_file(starter).exists():
         tell(f"the labels are by the starter model {starter}, which has never heard this home")
     return settings.model_copy(update={"model": model})
-
-
-def _tell_of_network(settings: "Settings") -> None:
-    """Say what a network would gain, and how to get it, where nobody has decided on one."""
-    from hearthlog.analyzer.extras import remedy
-    from hearthlog.models.embedding.networks import find_network
-    from hearthlog.models.embedding.runtimes import missing_modules
-    from hearthlog.recorder.config import NO_MODEL
-    from hearthlog.recorder.embedder_probe import DEFAULT_NETWORK
-
-    if settings.embedding or settings.model == NO_MODEL or find_network(DEFAULT_NETWORK):
-        return
-    absent = missing_modules(".tflite")
-    tell(
-        "labels are truer in a home that nobody has heard with a network that has heard two "
-        f"million clips: hearthlog models fetch {DEFAULT_NETWORK} (4 MB, once)"
-        + (f"; it wants LiteRT, too; {remedy(*absent)}" if absent else "")
-    )
 
 
 def _say(recording: "RecordingSummary", losses: list[str]) -> None:
