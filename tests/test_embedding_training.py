@@ -10,7 +10,8 @@ from blobs import blobs
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
-from hearthlog.analyzer.training import clip_embeddings, installed
+from hearthlog.analyzer.training import clip_embeddings as hearing
+from hearthlog.analyzer.training import installed
 from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.clip_embeddings import (
     AS_IT_IS,
@@ -357,9 +358,9 @@ def test_segments_take_the_window_that_is_nearest():
 
 
 def test_without_the_network_the_method_says_what_to_fetch(monkeypatch):
-    for module in (installed, clip_embeddings):
+    for module in (installed, hearing):
         monkeypatch.setattr(module, "find_network", lambda _: None)
-    clip_embeddings.network_embedder.cache_clear()
+    hearing.network_embedder.cache_clear()
     assert installed.default_method() is installed.DEFAULT
     assert installed.clip_embedder(ROOM) is None
     with pytest.raises(ModelError, match="hearthlog models fetch yamnet"):
