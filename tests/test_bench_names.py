@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+
 from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS
 from hearthlog.models.embedding.sound_names import NamedSound, SoundName, audioset_names
 from hearthlog.tools.bench import names as bench
