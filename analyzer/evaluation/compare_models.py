@@ -9,7 +9,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_model import (
     check_classes,
-    said_of_segments,
+    heads_of_segments,
     segment_probabilities,
 )
 from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
@@ -109,7 +109,7 @@ def compare_models(
     sightings = list(compress(data.sightings, kept))
     probabilities = [
         _probabilities(
-            one, i[kept], evidence_of(one, sightings), _said(one, data, kept), data.classes
+            one, i[kept], evidence_of(one, sightings), _by_heads(one, data, kept), data.classes
         )
         for one, i in zip((first, second), inputs, strict=True)
     ]
@@ -153,17 +153,17 @@ def check_features(a: Model, b: Model) -> None:
         )
 
 
-def _said(classifier: Classifier, data: Dataset, kept: Bool) -> Float64 | None:
-    said = said_of_segments(classifier, data)
-    return None if said is None else said[kept]
+def _by_heads(classifier: Classifier, data: Dataset, kept: Bool) -> Float64 | None:
+    by_heads = heads_of_segments(classifier, data)
+    return None if by_heads is None else by_heads[kept]
 
 
 def _probabilities(
     classifier: Classifier,
     inputs: Float32,
     evidence: Float64 | None,
-    said: Float64 | None,
+    by_heads: Float64 | None,
     classes: Sequence[str],
 ) -> Float64:
     order = [classifier.classes.index(name) for name in classes]
-    return segment_probabilities(classifier, inputs, evidence, said)[:, order]
+    return segment_probabilities(classifier, inputs, evidence, by_heads)[:, order]

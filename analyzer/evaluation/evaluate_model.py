@@ -92,7 +92,7 @@ def evaluate_model(
     probabilities = segment_probabilities(
         classifier,
         of_segments(classifier.inputs, data.windows, data.floor),
-        said=said_of_segments(classifier, data),
+        by_heads=heads_of_segments(classifier, data),
     )
     scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
     return ModelEvaluation(
@@ -154,7 +154,7 @@ def check_classes(model: Model, scenario: Scenario) -> None:
         )
 
 
-def said_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
+def heads_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
     """Return what the heads of a classifier say of segments, as `Classifier.classify` takes it.
 
     Parameters
@@ -171,16 +171,16 @@ def said_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
     heads = classifier.embedding_heads
     if heads is None or not data.is_embedded.any():
         return None
-    said = np.full((len(data), len(classifier.classes)), np.nan)
-    said[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
-    return said
+    by_heads = np.full((len(data), len(classifier.classes)), np.nan)
+    by_heads[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
+    return by_heads
 
 
 def segment_probabilities(
     classifier: Classifier,
     inputs: Float32,
     evidence: Float64 | None = None,
-    said: Float64 | None = None,
+    by_heads: Float64 | None = None,
 ) -> Float64:
     """Compute the probability of each class in each segment, by all windows in it.
 
@@ -189,7 +189,7 @@ def segment_probabilities(
     classifier : Classifier
     inputs : np.ndarray [shape=(n, places, width)], float32
         As of `of_segments`.
-    evidence, said : np.ndarray [shape=(n, C)], float64, optional
+    evidence, by_heads : np.ndarray [shape=(n, C)], float64, optional
         As of `Classifier.classify`: of directions, and of heads.
 
     Returns
@@ -199,9 +199,9 @@ def segment_probabilities(
     """
     if evidence is not None:
         evidence = evidence.repeat(inputs.shape[1], axis=0)
-    if said is not None:
-        said = said.repeat(inputs.shape[1], axis=0)
-    rows, _ = classifier.classify(inputs.reshape(-1, inputs.shape[-1]), evidence, said)
+    if by_heads is not None:
+        by_heads = by_heads.repeat(inputs.shape[1], axis=0)
+    rows, _ = classifier.classify(inputs.reshape(-1, inputs.shape[-1]), evidence, by_heads)
     logarithms = np.log(np.maximum(rows, _LEAST, dtype=np.float64))
     return softmax(logarithms.reshape(*inputs.shape[:2], -1).mean(axis=1))
 

@@ -171,15 +171,15 @@ def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
     tried = np.isfinite(decisions).all(axis=1) & home.is_embedded & np.isin(home.target, sounds)
     if marked.sum() < _FEWEST_SEGMENTS or not tried.any():
         return base
-    said = np.full(decisions.shape, np.nan)
+    by_heads = np.full(decisions.shape, np.nan)
     for part in _parts(marked):
         own = part[tried[part]]
         seen = np.setdiff1d(np.arange(len(home)), part)
         learned = _learned_without(heads, home, seen)
         of_home = EmbeddingHeads(learned.mix, learned.weights, learned.bias, home.classes)
-        said[own] = of_home.log_probabilities(home.embedded[own])
+        by_heads[own] = of_home.log_probabilities(home.embedded[own])
     plain = heads.mix.model_copy(update={"inverse_temperature": 1.0})
-    logarithms = mixed(decisions[tried], said[tried], plain, home.classes)[:, sounds]
+    logarithms = mixed(decisions[tried], by_heads[tried], plain, home.classes)[:, sounds]
     return home_temperature(logarithms, np.searchsorted(sounds, home.target[tried]), base)
 
 

@@ -42,7 +42,7 @@ _SEED = 20_261_126
 
 
 class Embeds(Protocol):
-    """What turns a window of 20 frames into integers, such as `Embedder`."""
+    """Embeds a window of 20 frames, as `Embedder` does: the integers that are logged."""
 
     def __call__(self, window: Float32) -> Int8:
         """Compute the integers of a window."""

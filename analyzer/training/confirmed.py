@@ -245,8 +245,8 @@ def _probabilities(
     evidence = evidence_of(classifier, [recording.sighting for recording in recordings])
     loud_rows = np.nonzero(~quiet)[0]
     of_windows = None if evidence is None else evidence[loud_rows]
-    said = _said(recordings, classifier)[loud_rows]
-    by_window[~quiet] = classifier.classify(of_each[~quiet], of_windows, said)[0]
+    by_heads = _by_heads(recordings, classifier)[loud_rows]
+    by_window[~quiet] = classifier.classify(of_each[~quiet], of_windows, by_heads)[0]
     if quiet.any():
         by_window[quiet, model.classes.index(SILENCE)] = 1.0
     loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)
@@ -256,16 +256,16 @@ def _probabilities(
     return probabilities, quiet.min(axis=1)
 
 
-def _said(recordings: Sequence[Recording], classifier: Classifier) -> Float64:
+def _by_heads(recordings: Sequence[Recording], classifier: Classifier) -> Float64:
     """Return what the heads of a classifier say of segments; NaN where nothing is embedded."""
-    said = np.full((len(recordings), len(classifier.classes)), np.nan)
+    by_heads = np.full((len(recordings), len(classifier.classes)), np.nan)
     if classifier.embedding_heads is None:
-        return said
+        return by_heads
     for row, recording in enumerate(recordings):
         heard = None if recording.embedded is None else recording.embedded.at(0)
         if heard is not None and len(heard):
-            said[row] = classifier.embedding_heads.log_probabilities(heard)[0]
-    return said
+            by_heads[row] = classifier.embedding_heads.log_probabilities(heard)[0]
+    return by_heads
 
 
 def _quiet_windows(recording: Recording, floor: Float64, classifier: Classifier) -> Bool:

@@ -94,8 +94,8 @@ def _calibrated(
         weights, bias, learned = sums.ridge(sums.unit != one)
         own = unit == one
         left_out[np.ix_(own, learned)] = values[own] @ weights + bias
-    told = rows.tried & np.isfinite(left_out[np.arange(len(values)), rows.target])
-    inverse = inverse_temperature(left_out[told], rows.target[told]) if told.any() else 1.0
+    usable = rows.tried & np.isfinite(left_out[np.arange(len(values)), rows.target])
+    inverse = inverse_temperature(left_out[usable], rows.target[usable]) if usable.any() else 1.0
     weights, bias, learned = sums.ridge(np.ones(len(sums.unit), bool))
     slopes = np.zeros((values.shape[1], count))
     slopes[:, learned] = inverse * weights

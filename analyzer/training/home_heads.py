@@ -114,9 +114,9 @@ def learn_home(heads: Heads, heard: HeardWindows, marked: Bool, classes: Sequenc
     if not own.any():
         return heads
     mix, values = heads.mix, heard.values[own]
-    said = EmbeddingHeads(mix, heads.weights, heads.bias, classes).log_probabilities(values)
+    by_heads = EmbeddingHeads(mix, heads.weights, heads.bias, classes).log_probabilities(values)
     shares = sum(mix.head_weights) + sum(head.weight for head in mix.names)
-    before = mix.inverse_temperature / shares * said[:, sounds]
+    before = mix.inverse_temperature / shares * by_heads[:, sounds]
     used = np.flatnonzero(heads.weights.any(axis=(0, 2)))
     mean, scale = heads.scaler[:, used]
     inputs = (values[:, used] - mean) / scale

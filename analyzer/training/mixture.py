@@ -115,14 +115,14 @@ def said_unseen(
     np.ndarray [shape=(n, C)], float64
         As `EmbeddingHeads.log_probabilities`; NaN of segments without an embedding, or in no fold.
     """
-    said = np.full((len(data), len(data.classes)), np.nan)
+    by_heads = np.full((len(data), len(data.classes)), np.nan)
     for _, unseen in folds:
         seen = ~unseen_windows(data, unseen)
         learned = learn_heads(data.heard, data.classes, inputs, seen)
         heads = EmbeddingHeads(mix, *learned, data.classes)
         heard = unseen[data.is_embedded[unseen]]
-        said[heard] = heads.log_probabilities(data.embedded[heard])
-    return said
+        by_heads[heard] = heads.log_probabilities(data.embedded[heard])
+    return by_heads
 
 
 def has_lessons(data: Dataset) -> bool:
@@ -179,7 +179,7 @@ class BestMix(NamedTuple):
     mix : EmbeddingMix
     inputs : tuple of slice
         Of its linear heads.
-    said : list of np.ndarray [shape=(n, C)], float64
+    by_heads : list of np.ndarray [shape=(n, C)], float64
         What heads say of segments, for each way of leaving out.
     left_out : list of np.ndarray [shape=(n, C)], float64
         Logarithms of the probabilities of segments, as sure as the others allow.
@@ -187,7 +187,7 @@ class BestMix(NamedTuple):
 
     mix: EmbeddingMix
     inputs: tuple[slice, ...]
-    said: list[Float64]
+    by_heads: list[Float64]
     left_out: list[Float64]
 
 
@@ -214,12 +214,12 @@ def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
     tried = []
     for inputs, names in _candidates(data, hearing):
         mix = _plain(hearing, inputs)
-        said = [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)]
+        by_heads = [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)]
         if names:
             mix = mix.model_copy(update={"names": names})
             of_names = _said_by_names(data, mix)
-            said = [one + of_names for one in said]
-        tried.append(BestMix(mix, inputs, said, _left_out(data, mix, ways, said)))
+            by_heads = [one + of_names for one in by_heads]
+        tried.append(BestMix(mix, inputs, by_heads, _left_out(data, mix, ways, by_heads)))
     return max(tried, key=lambda one: _right(data, one.left_out))
 
 
@@ -267,16 +267,16 @@ def learn_mixture(
     ways = [sources] if collections is None else [sources, collections]
     best = best_mix(data, hearing, ways)
     everything = np.ones(len(data), bool)
-    inverse = _inverse_temperature(data, best.mix, ways[-1], best.said[-1], everything)
+    inverse = _inverse_temperature(data, best.mix, ways[-1], best.by_heads[-1], everything)
     mix = best.mix.model_copy(update={"inverse_temperature": inverse})
     heads = learn_heads(data.heard, data.classes, best.inputs)
     return Mixture(mix, heads, best.left_out[0], None if collections is None else best.left_out[1])
 
 
 def _left_out(
-    data: Dataset, mix: EmbeddingMix, ways: Sequence[Tried], said: Sequence[Float64]
+    data: Dataset, mix: EmbeddingMix, ways: Sequence[Tried], by_heads: Sequence[Float64]
 ) -> list[Float64]:
-    return [_nested(data, mix, way, one) for way, one in zip(ways, said, strict=True)]
+    return [_nested(data, mix, way, one) for way, one in zip(ways, by_heads, strict=True)]
 
 
 def _plain(hearing: Hearing, inputs: Sequence[slice]) -> EmbeddingMix:
@@ -342,38 +342,38 @@ def _groups_of(name: str) -> list[str]:
 
 def _said_by_names(data: Dataset, mix: EmbeddingMix) -> Float64:
     """Return what names alone say of all segments; they have not learned from any."""
-    said = np.zeros((len(data), len(data.classes)))
+    by_heads = np.zeros((len(data), len(data.classes)))
     nothing = np.zeros((0, mix.values, len(data.classes)), np.int32)
     alone = mix.model_copy(update={"head_weights": []})
     heads = EmbeddingHeads(alone, nothing, nothing[:, 0], data.classes)
     if data.is_embedded.any():
-        said[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
-    return said
+        by_heads[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
+    return by_heads
 
 
-def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, said: Float64) -> Float64:
+def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64) -> Float64:
     """Mix what is said of segments left out, those of each fold as sure as the others allow."""
     result = way.decisions - _log_sum(way.decisions)
     for _, unseen in way.folds:
         others = np.ones(len(data), bool)
         others[unseen] = False
-        inverse = _inverse_temperature(data, mix, way, said, others)
-        heard = unseen[~np.isnan(said[unseen]).any(axis=1)]
+        inverse = _inverse_temperature(data, mix, way, by_heads, others)
+        heard = unseen[~np.isnan(by_heads[unseen]).any(axis=1)]
         surer = mix.model_copy(update={"inverse_temperature": inverse})
-        result[heard] = mixed(way.decisions[heard], said[heard], surer, data.classes)
+        result[heard] = mixed(way.decisions[heard], by_heads[heard], surer, data.classes)
     return result
 
 
 def _inverse_temperature(
-    data: Dataset, mix: EmbeddingMix, way: Tried, said: Float64, chosen: Bool
+    data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64, chosen: Bool
 ) -> float:
     """Find how sure the mix may be of which sound it is, by some of the segments."""
     sounds = sounds_of(data.classes)
-    used = chosen & way.used & np.isin(data.target, sounds) & ~np.isnan(said).any(axis=1)
+    used = chosen & way.used & np.isin(data.target, sounds) & ~np.isnan(by_heads).any(axis=1)
     if not used.any():
         return 1.0
     plain = mix.model_copy(update={"inverse_temperature": 1.0})
-    decisions = mixed(way.decisions[used], said[used], plain, data.classes)[:, sounds]
+    decisions = mixed(way.decisions[used], by_heads[used], plain, data.classes)[:, sounds]
     found = inverse_temperature(decisions, np.searchsorted(sounds, data.target[used]))
     return min(found, _SUREST)
 

@@ -212,8 +212,8 @@ class Classifier:
         probabilities /= _STEPS
         return probabilities, 1.0 - probabilities[:, self._known].max(axis=1, initial=0.0)
 
-    def _add_heads(self, decision: Float64, said: Float64) -> None:
+    def _add_heads(self, decision: Float64, by_heads: Float64) -> None:
         """Mix the decision values of windows with what heads say there."""
-        heard = ~np.isnan(said).any(axis=1)
+        heard = ~np.isnan(by_heads).any(axis=1)
         if self._mix is not None and heard.any():
-            decision[heard] = mixed(decision[heard], said[heard], self._mix, self.classes)
+            decision[heard] = mixed(decision[heard], by_heads[heard], self._mix, self.classes)

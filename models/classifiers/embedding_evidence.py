@@ -1,4 +1,4 @@
-"""What embeddings say of the frames of one stream, between the middles of their windows."""
+"""The probabilities of frames by embeddings, interpolated between the middles of windows."""
 
 from typing import Protocol
 
@@ -23,7 +23,7 @@ class Heads(Protocol):
 
 
 class EmbeddingEvidence:
-    """Interpolates what is said of windows to frames.
+    """Interpolates the log-probabilities of windows to frames.
 
     A frame between the middles of two windows has both of them in proportion, or the only one that
     there is.
@@ -75,7 +75,7 @@ class EmbeddingEvidence:
         return self._first is not None and begin >= self._first
 
     def at(self, first: int, count: int) -> Float64:
-        """Return what is said of successive frames; earlier ones are never asked for again.
+        """Return the log-probabilities of successive frames, and forget those of earlier ones.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class EmbeddingEvidence:
         Returns
         -------
         np.ndarray [shape=(count, C)], float64
-            NaN where nothing is said.
+            NaN where there is no window.
         """
         frames = np.arange(first, first + count)
         before = (frames - _MIDDLE) // HOP_FRAMES
@@ -95,11 +95,11 @@ class EmbeddingEvidence:
         self._windows, self._values = self._windows[keep:], self._values[keep:]
         earlier = np.where(np.isnan(earlier), later, earlier)
         later = np.where(np.isnan(later), earlier, later)
-        said: Float64 = (1.0 - share) * earlier + share * later
-        return said
+        by_heads: Float64 = (1.0 - share) * earlier + share * later
+        return by_heads
 
     def _of_windows(self, numbers: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64:
-        """Return what is said of windows; NaN of those that there are not."""
+        """Return the log-probabilities of windows; NaN where there is none."""
         values = np.full((len(numbers), self._classes), np.nan)
         if len(self._windows):
             places = np.minimum(np.searchsorted(self._windows, numbers), len(self._windows) - 1)

@@ -82,11 +82,11 @@ class EmbeddingHeads:
         steps, total = values.astype(np.float64), np.zeros((len(values), len(self._sounds)))
         for number, weight in enumerate(self._of_heads):
             taught = ~self._untaught[number]
-            said = np.full(total.shape, _OF_UNTAUGHT)
+            by_heads = np.full(total.shape, _OF_UNTAUGHT)
             if taught.any():
                 slopes, bias = self._weights[number][:, taught], self._bias[number, taught]
-                said[:, taught] = floored(UNIT * (steps @ slopes) + bias)
-            total += weight * said
+                by_heads[:, taught] = floored(UNIT * (steps @ slopes) + bias)
+            total += weight * by_heads
         if self._of_home:
             total += UNIT * (steps @ self._weights[-1]) + self._bias[-1]
         for head in self._names:
@@ -139,7 +139,9 @@ def floored(decisions: Float64) -> Float64:
     return logarithms
 
 
-def mixed(decisions: Float64, said: Float64, mix: EmbeddingMix, classes: Sequence[str]) -> Float64:
+def mixed(
+    decisions: Float64, by_heads: Float64, mix: EmbeddingMix, classes: Sequence[str]
+) -> Float64:
     """Mix what a classifier and heads say.
 
     Silence has the probability that the classifier gives it; the classes of sound share the rest.
@@ -148,7 +150,7 @@ def mixed(decisions: Float64, said: Float64, mix: EmbeddingMix, classes: Sequenc
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
         Logarithms of the probabilities of a classifier, plus any constant for each row.
-    said : np.ndarray [shape=(n, C)], float64
+    by_heads : np.ndarray [shape=(n, C)], float64
         As `EmbeddingHeads.log_probabilities` gives them.
     mix : EmbeddingMix
     classes : sequence of str
@@ -160,7 +162,7 @@ def mixed(decisions: Float64, said: Float64, mix: EmbeddingMix, classes: Sequenc
     """
     sounds = sounds_of(classes)
     of_sounds = decisions[:, sounds]
-    total = mix.machine_weight * floored(of_sounds) + said[:, sounds]
+    total = mix.machine_weight * floored(of_sounds) + by_heads[:, sounds]
     total /= mix_weight(mix)
     total += np.array([mix.bias.get(classes[number], 0.0) for number in sounds])
     total *= mix.inverse_temperature

@@ -51,16 +51,6 @@ class Embeddings(NamedTuple):
         begin, end = np.searchsorted(self.last_frames, [first, first + count])
         return self.rows(slice(begin, end))
 
-    def begun_in(self, start: int, end: int) -> "Embeddings":
-        """Return those whose windows begin in a span of time.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC: from `start` on, before `end`.
-        """
-        return self.rows(slice(*np.searchsorted(self.stamps, [start, end])))
-
     def followed_by(self, later: "Embeddings") -> "Embeddings":
         """Join these embeddings with those that follow; where one has none, its width is free."""
         if not len(self.frames):

@@ -292,10 +292,10 @@ class Labeller:
     ) -> tuple[LabelledFrames, Float32]:
         """Let embeddings say what the sound of frames is; return also its novelty."""
         count = len(frames.stamps)
-        said = np.full((count, len(self.classes)), np.nan)
+        by_heads = np.full((count, len(self.classes)), np.nan)
         if self._embedded is not None:
-            said = self._embedded.at(first, count)
-        probabilities, novelty = self._classifier.mix(frames.probabilities, said, evidence)
+            by_heads = self._embedded.at(first, count)
+        probabilities, novelty = self._classifier.mix(frames.probabilities, by_heads, evidence)
         return frames._replace(probabilities=probabilities), novelty
 
     def _advance(
