@@ -172,6 +172,9 @@ class Connection:
                 info.wait_for_publish(_CLOSE_SECONDS)
         self._client.disconnect()
         self._client.loop_stop()
+        # The pair that wakes its loop is else left to the garbage collector, which warns of it
+        # where it finalises the pair before the client.
+        self._client._reset_sockets()  # noqa: SLF001  no public call does only this
 
     def _make_client(self, settings: MqttSettings) -> mqtt.Client:
         settings.check_files()
