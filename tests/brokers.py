@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from microphones import DIES_WITH_PARENT
 
-_SECONDS = 15.0
+_SECONDS = 60.0
 _SETTINGS = "allow_anonymous true\npersistence false\n"
 _AS_WE = "user root\n"  # else it gives up the right to read its files, where root starts it
 
@@ -99,7 +99,7 @@ class Listener:
         assert self._is_ready.wait(_SECONDS)
         self._client.publish(topic, payload, 1, retain).wait_for_publish(_SECONDS)
 
-    def wait_for(self, topic: str, value: str | None = None, seconds: float = 30.0) -> str:
+    def wait_for(self, topic: str, value: str | None = None, seconds: float = 120.0) -> str:
         """Wait until a topic has a value, any or this one, and return it."""
         return (
             self.wait_until(
@@ -109,7 +109,7 @@ class Listener:
             and self.values[topic]
         )
 
-    def wait_until(self, holds, seconds: float = 30.0) -> bool:
+    def wait_until(self, holds, seconds: float = 120.0) -> bool:
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             if holds():

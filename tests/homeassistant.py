@@ -81,7 +81,7 @@ def wait_for(condition, seconds, *, pause=0.2):
     return value
 
 
-def end(process, number=signal.SIGTERM, seconds=30):
+def end(process, number=signal.SIGTERM, seconds=120):
     """End a process, and return its status."""
     process.send_signal(number)
     try:

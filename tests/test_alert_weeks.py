@@ -70,7 +70,7 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
     try:
         place = Home(home.folder, "home", zone)
         own = AlertsOutput([rule], DeliverySettings(), place, state, said.append, tell)
-        end = time.monotonic() + 30
+        end = time.monotonic() + 120
         with following(place, {"alerts": own}, said):
             while not told and time.monotonic() < end:
                 home.hears("silence")

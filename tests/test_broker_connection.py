@@ -30,7 +30,7 @@ def connected(broker, client_id="hearthlog-home", **settings):
         connection.close()
 
 
-def flush_until(connection, holds, seconds=20.0):
+def flush_until(connection, holds, seconds=80.0):
     """Flush as the bridge does, until something holds."""
     until = time.monotonic() + seconds
     while not holds():

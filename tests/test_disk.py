@@ -153,7 +153,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def wait_for(process, text, seconds=30):
+def wait_for(process, text, seconds=120):
     """Wait for a line on standard error."""
     deadline = time.monotonic() + seconds
     said = ""

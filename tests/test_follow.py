@@ -52,7 +52,7 @@ class Followed(Thread):
 
     def wait_for(self, frames):
         """Wait until all these frames were given, and give what was."""
-        until = monotonic() + 30
+        until = monotonic() + 120
         while len(self.frames) < len(frames) and monotonic() < until:
             sleep(0.02)
         return self.frames

@@ -312,7 +312,7 @@ def judged(folder, model, *, reasons=(), insisted=False):
 
 
 def refusals(watch, count=1):
-    found, deadline = [], time.monotonic() + 20
+    found, deadline = [], time.monotonic() + 120
     while len(found) < count:
         assert time.monotonic() < deadline
         found += watch.refusals()
@@ -339,7 +339,7 @@ def test_a_recorder_takes_over_only_what_was_judged(place, monkeypatch, capfd):
     time.sleep(0.3)
     assert (list(watch.refusals()), watch.ready) == ([], None)  # said once
     insist(folder, model.sha256)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while watch.ready is None:
         assert time.monotonic() < deadline
         assert not list(watch.refusals())

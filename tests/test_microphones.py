@@ -47,7 +47,7 @@ class Recording:
         self.wait_until(lambda: self.count() >= count)
         return self.blocks()
 
-    def wait_until(self, condition, seconds=20.0):
+    def wait_until(self, condition, seconds=120.0):
         deadline = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < deadline, f"not in time; {self.count()} blocks came"

@@ -72,7 +72,7 @@ def figures(text):
 
 
 def wait_for(text_of):
-    until = time.monotonic() + 30
+    until = time.monotonic() + 120
     while time.monotonic() < until:
         if found := figures(text_of()):
             return found

@@ -260,7 +260,7 @@ def start_realtime(file, logs):
 
 def wait_for_log(logs, seconds):
     """Wait until the log is open, and so many seconds more; return when it was opened."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while not list(logs.rglob("*.active")):
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -41,7 +41,7 @@ class Systemd:
                 lines += self._socket.recv(4096).decode().split("\n")
         return lines
 
-    def wait_for(self, *texts, seconds=30):
+    def wait_for(self, *texts, seconds=120):
         """Wait for a line that has these texts, and return all that came until then."""
         end = time.monotonic() + seconds
         lines = []

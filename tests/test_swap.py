@@ -66,7 +66,7 @@ def recording(folder, logs, *arguments, env=None):
             process.kill()
 
 
-def wait_for(condition, seconds=30):
+def wait_for(condition, seconds=120):
     deadline = time.monotonic() + seconds
     while True:
         with suppress(LogError):  # a log is completed, and gets its name, at any time
