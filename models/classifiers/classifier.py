@@ -92,10 +92,7 @@ class Classifier:
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
         """Return whether the model was learned on embeddings of the same network and projection."""
         mix = self._mix
-        if source is None or mix is None:
-            return False
-        theirs = source.network, source.projection_sha256, len(source.names)
-        return theirs == (mix.network, mix.projection_sha256, mix.values)
+        return source is not None and mix is not None and source.space == mix.space
 
     def lacking_embeddings(self, source: EmbeddingSource | None) -> str:
         """Say which embeddings the model was learned on and does not get; empty if it gets them.
