@@ -189,7 +189,7 @@ def test_after_a_gap_nothing_is_left_of_the_directions_before_it(recorded):
     model, (first, *_) = taking(strong()), [e for e in events(recorded) if isinstance(e, Features)]
     half = first.part(slice(0, 109))  # a burst ends with frame 107
     elsewhere = np.full(len(half.auxiliary.directions.azimuths), DOOR, np.float32)
-    directions = half.auxiliary.directions._replace(azimuths=elsewhere)
+    directions = replace(half.auxiliary.directions, azimuths=elsewhere)
     half = half._replace(auxiliary=half.auxiliary._replace(directions=directions))
     gap = Gap(int(first.stamps[109]), int(first.stamps[110]), "lost", 1)
     behind = first.part(slice(110, len(first.stamps)))

@@ -26,7 +26,7 @@ from hearthlog.analyzer.discover import read_sounds as read_sounds_module
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
 from hearthlog.analyzer.discover.discover import discover
 from hearthlog.analyzer.discover.group_spans import group_spans
-from hearthlog.analyzer.discover.groups import NO_GROUP, add_groups, make_space
+from hearthlog.analyzer.discover.groups import NO_GROUP, add_groups, new_groups
 from hearthlog.analyzer.discover.groups_file import GROUPS, load_groups, save_groups
 from hearthlog.analyzer.discover.hours import usual_hours
 from hearthlog.analyzer.discover.read_sounds import read_sounds
@@ -267,7 +267,7 @@ def test_a_point_is_of_the_group_with_the_nearest_example_by_its_radius(seed, co
     of = np.repeat(np.arange(k), 20)
     examples = scale * rng.normal(size=(len(of), 3))
     groups = replace(
-        make_space(("a",), rng.normal(size=(9, 3)).astype(np.float32)),
+        new_groups(("a",), rng.normal(size=(9, 3)).astype(np.float32)),
         examples=examples,
         of=of,
         radii=scale * rng.uniform(0.05, 1.0, k),
@@ -335,7 +335,7 @@ def test_what_lies_about_a_known_group_is_no_new_one():
     rng = np.random.default_rng(0)
     near, far = rng.normal(0, 1, (120, 3)), rng.normal(40, 1, (60, 3))
     points = np.concatenate([near, far])
-    space = make_space(("a",), points.astype(np.float32))
+    space = new_groups(("a",), points.astype(np.float32))
     of = np.zeros(len(points), np.int64)
     of[100:120] = NO_GROUP  # the others of the first cluster are known
     assert len(add_groups(space, points, of).numbers) == 0

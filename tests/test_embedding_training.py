@@ -21,7 +21,7 @@ from hearthlog.analyzer.training.clip_embeddings import (
     clip_embeddings,
 )
 from hearthlog.analyzer.training.dataset import (
-    HeardWindows,
+    EmbeddingWindows,
     Recording,
     build_dataset,
     cut_recordings,
@@ -78,7 +78,7 @@ def made_up(classes=4, count=48):
         collections={(f"collection {number}", "CC0"): 6 for number in range(COLLECTIONS)},
         embedded=heard_as(data.target, classes, rng),
         is_embedded=np.ones(len(data), bool),
-        heard=HeardWindows(
+        embedding_windows=EmbeddingWindows(
             heard_as(data.target[rows], classes, rng),
             data.target[rows],
             data.group[rows],
@@ -115,7 +115,7 @@ def test_metrics_and_scores_elsewhere_are_those_of_the_mix():
     data = made_up()
     with_heads = learned().description
     without = train_model(
-        replace(data, heard=HeardWindows(*(one[:0] for one in data.heard))),
+        replace(data, embedding_windows=data.embedding_windows.rows(slice(0))),
         scenario_of(data),
         ignore_progress,
         EMBEDDING,
@@ -148,21 +148,21 @@ def test_the_same_segments_give_the_same_model(tmp_path):
 
 def test_what_is_left_out_is_not_learned_from():
     data = made_up()
-    heads = learn_heads(data.heard, data.classes, HEARING.inputs)
-    other = data.heard._replace(values=data.heard.values.copy())
-    hidden = data.heard.collection == 2
+    heads = learn_heads(data.embedding_windows, data.classes, HEARING.inputs)
+    other = data.embedding_windows._replace(values=data.embedding_windows.values.copy())
+    hidden = data.embedding_windows.collection == 2
     other.values[hidden] = 100
     seen = learn_heads(other, data.classes, HEARING.inputs, ~hidden)
-    again = learn_heads(data.heard, data.classes, HEARING.inputs, ~hidden)
+    again = learn_heads(data.embedding_windows, data.classes, HEARING.inputs, ~hidden)
     np.testing.assert_array_equal(seen.weights, again.weights)
     assert (seen.weights != heads.weights).any()
 
 
 def test_a_class_of_hardly_any_source_is_left_to_others():
     data = made_up()
-    few = np.unique(data.heard.group[data.heard.target == 3])[:2]
-    seen = (data.heard.target != 3) | np.isin(data.heard.group, few)
-    heads = learn_heads(data.heard, data.classes, HEARING.inputs, seen)
+    few = np.unique(data.embedding_windows.group[data.embedding_windows.target == 3])[:2]
+    seen = (data.embedding_windows.target != 3) | np.isin(data.embedding_windows.group, few)
+    heads = learn_heads(data.embedding_windows, data.classes, HEARING.inputs, seen)
     assert not heads.weights[..., 3].any()
     assert (heads.bias[:, 3] == UNTAUGHT).all()
     mix = learned().description.embedding
@@ -172,9 +172,10 @@ def test_a_class_of_hardly_any_source_is_left_to_others():
 
 
 def test_names_are_mixed_in_where_a_class_has_hardly_any_source():
-    data, few = made_up(), np.unique(made_up().heard.group[made_up().heard.target == 3])[:2]
-    kept = (data.heard.target != 3) | np.isin(data.heard.group, few)
-    data = replace(data, heard=data.heard.rows(kept))
+    data, few = made_up(), made_up().embedding_windows
+    few = np.unique(few.group[few.target == 3])[:2]
+    kept = (data.embedding_windows.target != 3) | np.isin(data.embedding_windows.group, few)
+    data = replace(data, embedding_windows=data.embedding_windows.rows(kept))
     known = np.ones(len(data), bool)
     way = Tried(group_folds(data), np.zeros((len(data), len(data.classes))), known)
     mix = best_mix(data, HEARING, [way]).mix
@@ -224,7 +225,9 @@ def home_of(model, count, new="", seed=11):
         collections={("this home", ""): 1},
         embedded=embedded,
         is_embedded=np.ones(len(target), bool),
-        heard=HeardWindows(embedded, target, np.arange(len(target)) % 5, collection, target >= 0),
+        embedding_windows=EmbeddingWindows(
+            embedded, target, np.arange(len(target)) % 5, collection, target >= 0
+        ),
     )
 
 
@@ -273,7 +276,7 @@ def test_a_home_without_embeddings_leaves_the_heads_as_they_are():
         home,
         embedded=np.empty((len(home), 0), np.int8),
         is_embedded=np.zeros(len(home), bool),
-        heard=HeardWindows(*(one[:0] for one in home.heard)),
+        embedding_windows=EmbeddingWindows(*(one[:0] for one in home.embedding_windows)),
     )
     adapted = adapt_model(base, silent)
     np.testing.assert_array_equal(adapted.embedding_weights, base.embedding_weights)
@@ -353,8 +356,8 @@ def test_segments_take_the_window_that_is_nearest():
     scenario = Scenario("made up", {name: (name,) for name in CLASSES})
     data = cut_recordings([recording], scenario, features)
     assert data.is_embedded.all()
-    assert len(data.heard.target) == len(heard.version)
-    assert data.heard.tried.sum() == (heard.version == AS_IT_IS).sum()
+    assert len(data.embedding_windows.target) == len(heard.version)
+    assert data.embedding_windows.tried.sum() == (heard.version == AS_IT_IS).sum()
 
 
 def test_without_the_network_the_method_says_what_to_fetch(monkeypatch):

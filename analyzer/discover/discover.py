@@ -9,7 +9,7 @@ from hearthlog.analyzer.discover.groups import (
     Groups,
     add_groups,
     identified,
-    make_space,
+    new_groups,
 )
 from hearthlog.analyzer.discover.read_sounds import HomeSounds
 from hearthlog.analyzer.errors import DataError
@@ -40,7 +40,7 @@ def discover(
     of : np.ndarray [shape=(n,)], int64
         The row of the group of each sound; `NO_GROUP` for one that is of none.
     points : np.ndarray [shape=(n, d)], float64
-        Where the sounds lie.
+        Where the sounds lie by their features.
 
     Raises
     ------
@@ -57,19 +57,66 @@ def discover(
     if groups is None:
         if count < 2 * least:
             raise DataError(f"too few sounds to group: {count}, and it takes {2 * least}")
-        groups = make_space(sounds.features, sounds.descriptors[drawn])
-    points = np.concatenate(
-        [
-            groups.points(sounds.descriptors[first : first + _AT_ONCE])
-            for first in range(0, max(count, 1), _AT_ONCE)
-        ]
+        described = sounds.descriptors[drawn], sounds.embedding, sounds.embeddings[drawn]
+        groups = new_groups(sounds.features, *described)
+    points, embedded = _points(sounds, groups)
+    heard, of = groups.heard(sounds.embeddings), np.full(count, NO_GROUP)
+    for own, by_embedding in ((heard, True), (~heard, False)):
+        inside = drawn[own[drawn]]
+        where = embedded if by_embedding else points
+        of[own] = groups.space(embedded=by_embedding).find(where[own])
+        groups = add_groups(
+            groups,
+            points[inside],
+            of[inside],
+            least,
+            embedded[inside] if by_embedding else None,
+        )
+        rest = own & (of == NO_GROUP)
+        of[rest] = groups.space(embedded=by_embedding).find(where[rest])
+    return identified(groups) if is_new else groups, of, points
+
+
+def embedding_note(sounds: HomeSounds, groups: Groups) -> str:
+    """Say whose sounds are known by their features alone, though there are networks; else nothing.
+
+    Parameters
+    ----------
+    sounds : HomeSounds
+    groups : Groups
+        By which they are known.
+    """
+    others = sorted({space.network for space in sounds.other_embeddings})
+    if groups.embedding is None:
+        others = sorted({*others, sounds.embedding.network} if sounds.embedding else others)
+        return (
+            f"these groups are by features alone, and logs have embeddings of {', '.join(others)}: "
+            "another file with --groups groups by both"
+            if others
+            else ""
+        )
+    if not sounds.without_embedding:
+        return ""
+    theirs = f" (but of {', '.join(others)}, or of another projection)" if others else ""
+    return (
+        f"{sounds.without_embedding} of {len(sounds.logs)} logs are without embeddings of "
+        f"{groups.embedding.network} as the groups are by{theirs}: their sounds are known by their "
+        "features alone"
     )
-    of = groups.find(points)
-    groups = add_groups(groups, points[drawn], of[drawn], least)
-    groups = identified(groups) if is_new else groups
-    rest = of == NO_GROUP
-    of[rest] = groups.find(points[rest])
-    return groups, of, points
+
+
+def _points(sounds: HomeSounds, groups: Groups) -> tuple[Float64, Float64]:
+    """Return where sounds lie by their features, and with their embeddings; NaN without."""
+    points = np.empty((len(sounds.descriptors), len(groups.axes)))
+    space = groups.embedded
+    embedded = np.full((len(points), 0 if space is None else len(space.axes)), np.nan)
+    for first in range(0, len(points), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        descriptors, embeddings = sounds.descriptors[part], sounds.embeddings[part]
+        points[part] = groups.points(descriptors)
+        if space is not None and groups.heard(embeddings).any():
+            embedded[part] = space.points(np.concatenate([descriptors, embeddings], axis=1))
+    return points, embedded
 
 
 def _drawn(sounds: HomeSounds) -> Int64:

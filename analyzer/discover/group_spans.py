@@ -68,7 +68,7 @@ def group_spans(
         object,
     )
     found = {}
-    with read_sounds(home, ALL, start, end, progress) as sounds:
+    with read_sounds(home, ALL, start, end, progress, groups) as sounds:
         _, of, _ = discover(sounds, groups)
         of = np.where(of < len(texts), of, NO_GROUP)
         order = np.argsort(sounds.spans.starts, kind="stable")

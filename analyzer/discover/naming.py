@@ -118,7 +118,7 @@ def _spans(
             raise LogError(f"{log}: has other features than the groups; left out")
         if sounds.lost:
             losses.append(lost_text(log, sounds.lost))
-        of = groups.find(groups.points(sounds.descriptors))
+        of = groups.of_sounds(sounds.descriptors, sounds.embeddings, sounds.embedding)
         starts, ends = sounds.spans.starts.tolist(), sounds.spans.ends.tolist()
         for row, start, end in zip(of.tolist(), starts, ends, strict=True):
             if row >= 0:

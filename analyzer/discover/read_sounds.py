@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +11,17 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
+from hearthlog.analyzer.discover.groups import Groups
 from hearthlog.analyzer.discover.sound_spans import FrameLabels, SoundSpans, find_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.logs.embeddings import mean_embeddings
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 _FIELDS = {"header.stamp", "values", "label", "confidence"}
@@ -34,6 +37,10 @@ class LogSounds(NamedTuple):
         Names of the features that they are described by.
     spans : SoundSpans
     descriptors : np.ndarray [shape=(n, width)], float32
+    embedding : EmbeddingSpace or None
+        Of the embeddings; None if the log has none.
+    embeddings : np.ndarray [shape=(n, k)], float32
+        By which they are described, too; NaN for a sound without any.
     lost : int
         Sounds that are left out, for they have features that are no numbers.
     """
@@ -42,6 +49,8 @@ class LogSounds(NamedTuple):
     features: tuple[str, ...]
     spans: SoundSpans
     descriptors: Float32
+    embedding: EmbeddingSpace | None
+    embeddings: Float32
     lost: int
 
 
@@ -62,6 +71,14 @@ class HomeSounds:
         Its rows of features are those of its log.
     descriptors : np.ndarray [shape=(n, width)], float32
         On the disk.
+    embedding : EmbeddingSpace or None
+        Of the embeddings that they are described by, too.
+    embeddings : np.ndarray [shape=(n, k)], float32
+        On the disk; NaN for a sound without any, or with one of another network or projection.
+    without_embedding : int
+        Logs, once for each microphone, of which that is so.
+    other_embeddings : set of EmbeddingSpace
+        That logs have, and that are not read.
     losses : list of str
         What cannot be read, a log in a line.
     without : int
@@ -75,17 +92,22 @@ class HomeSounds:
     microphone: Int64
     spans: SoundSpans
     descriptors: Float32
+    embedding: EmbeddingSpace | None
+    embeddings: Float32
+    without_embedding: int
+    other_embeddings: AbstractSet[EmbeddingSpace]
     losses: list[str]
     without: int = 0
 
 
 @contextmanager
-def read_sounds(
+def read_sounds(  # noqa: PLR0913, PLR0917
     home: HomeLogs,
     choice: str,
     start: int | None = None,
     end: int | None = None,
     progress: Progress = ignore_progress,
+    groups: Groups | None = None,
 ) -> Iterator[HomeSounds]:
     """Read the sounds of a home; what describes them is on the disk meanwhile.
 
@@ -98,6 +120,9 @@ def read_sounds(
         In nanoseconds of UTC.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
+    groups : Groups, optional
+        By which they are to be known: only their embeddings are read. Without groups those of the
+        last log that has any.
 
     Yields
     ------
@@ -109,16 +134,19 @@ def read_sounds(
         If no log has features and labels.
     """
     entries = home.between(start, end)
-    reader = _Reader(choice, start, end)
-    with tempfile.TemporaryFile(prefix="hearthlog-sounds") as store:
+    with (
+        tempfile.TemporaryFile(prefix="hearthlog-sounds") as store,
+        tempfile.TemporaryFile(prefix="hearthlog-embeddings") as embedded,
+    ):
+        reader = _Reader(choice, (start, end), groups, store, embedded)
         # The last log first: what it has been described by, the others have to be, too.
         for number, entry in enumerate(reversed(entries), 1):
             try:
-                reader.read(entry.path, store)
+                reader.read(entry.path)
             except LogError as error:
                 reader.losses.append(str(error))
             progress(number / len(entries))
-        yield reader.sounds(store, home.losses)
+        yield reader.sounds(home.losses)
 
 
 def read_log_sounds(
@@ -157,7 +185,9 @@ def read_log_sounds(
         described = describe(values, names, spans.first, spans.last)
         is_finite: Bool = np.isfinite(described).min(axis=1, initial=True)
         lost = int((~is_finite).sum())
-        yield LogSounds(name, names, spans.rows(is_finite), described[is_finite], lost)
+        spans = spans.rows(is_finite)
+        heard = mean_embeddings(columns.get(topic(name, "embedding")), spans.starts, spans.ends)
+        yield LogSounds(name, names, spans, described[is_finite], *heard, lost)
 
 
 def lost_text(log: Path, lost: int) -> str:
@@ -166,27 +196,71 @@ def lost_text(log: Path, lost: int) -> str:
 
 
 class _Reader:
-    def __init__(self, choice: str, start: int | None, end: int | None) -> None:
+    """Reads logs, the last one first: as its sounds are described, all have to be.
+
+    Parameters
+    ----------
+    choice : str
+    span : (int or None, int or None)
+    groups : Groups or None
+        By which sounds are to be known.
+    store, embedded : file
+        For what describes them.
+    """
+
+    def __init__(
+        self,
+        choice: str,
+        span: tuple[int | None, int | None],
+        groups: Groups | None,
+        store: IO[bytes],
+        embedded: IO[bytes],
+    ) -> None:
         self.losses: list[str] = []
         self.without = 0
         self._choice = choice
-        self._span = start, end
+        self._span = span
+        self._store, self._embedded = store, embedded
         self._features: tuple[str, ...] = ()
+        self._any_embedding = groups is None
+        self._embedding = None if groups is None else groups.embedding
+        self._width = 0  # of what is embedded
+        self._without_embedding = self._count = 0
+        self._other_embeddings: set[EmbeddingSpace] = set()
         self._logs: list[Path] = []
         self._microphones: list[str] = []
         self._parts: list[tuple[Int64, Int64, SoundSpans]] = []
 
-    def read(self, log: Path, store: IO[bytes]) -> None:
+    def read(self, log: Path) -> None:
         for sounds in read_log_sounds(log, self._choice, *self._span):
             self._features = self._features or sounds.features
             if sounds.features != self._features:
                 raise LogError(f"{log}: has other features than the later logs; left out")
             if sounds.lost:
                 self.losses.append(lost_text(log, sounds.lost))
-            store.write(sounds.descriptors.tobytes())
+            self._store.write(sounds.descriptors.tobytes())
+            self._embed(sounds)
             self._add(log, sounds.microphone, sounds.spans)
         if log not in self._logs:
             self.without += 1
+
+    def _embed(self, sounds: LogSounds) -> None:
+        """Keep embeddings, if they can be compared with those of the later logs."""
+        if self._any_embedding and self._embedding is None:
+            self._embedding = sounds.embedding
+        own = sounds.embeddings
+        fits = sounds.embedding is not None and sounds.embedding == self._embedding
+        fits = fits and self._width in {0, own.shape[1]}
+        if fits and not self._width:
+            self._width = own.shape[1]
+            self._embedded.write(np.full((self._count, self._width), np.nan, np.float32).tobytes())
+        if not fits:
+            self._without_embedding += 1
+            if sounds.embedding is not None:
+                self._other_embeddings.add(sounds.embedding)
+            own = np.full((len(own), self._width), np.nan, np.float32)
+        self._embedded.write(own.tobytes())
+        self._count += len(own)
 
     def _add(self, log: Path, microphone: str, spans: SoundSpans) -> None:
         if microphone not in self._microphones:
@@ -195,17 +269,11 @@ class _Reader:
         self._parts.append((np.full(count, len(self._logs)), np.full(count, place), spans))
         self._logs.append(log)
 
-    def sounds(self, store: IO[bytes], losses: Sequence[str]) -> HomeSounds:
+    def sounds(self, losses: Sequence[str]) -> HomeSounds:
         if not self._features:
             what = self.losses[0] if self.losses else "no log has features and labels"
             raise DataError(what)
-        store.flush()
-        width = descriptor_width(self._features)
         logs, microphones, spans = zip(*self._parts, strict=True)
-        count = sum(map(len, logs))
-        descriptors: Float32 = np.empty((0, width), np.float32)
-        if count:
-            descriptors = np.memmap(store, np.float32, "r", shape=(count, width))
         return HomeSounds(
             self._features,
             self._logs,
@@ -213,10 +281,21 @@ class _Reader:
             np.concatenate(logs),
             np.concatenate(microphones),
             SoundSpans(*(np.concatenate(each) for each in zip(*spans, strict=True))),
-            descriptors,
+            _on_disk(self._store, self._count, descriptor_width(self._features)),
+            self._embedding if self._width else None,
+            _on_disk(self._embedded, self._count, self._width),
+            self._without_embedding,
+            self._other_embeddings,
             [*losses, *self.losses],
             self.without,
         )
+
+
+def _on_disk(store: IO[bytes], count: int, width: int) -> Float32:
+    store.flush()
+    if not count or not width:
+        return np.empty((count, width), np.float32)
+    return np.memmap(store, np.float32, "r", shape=(count, width))
 
 
 def _by_time(columns: Columns, *fields: str) -> tuple[Any, ...]:

@@ -159,8 +159,14 @@ def robustness(
     Raises
     ------
     DataError
-        If the classes of the model are not those of the scenario, or no clip has a segment.
+        If the classes of the model are not those of the scenario, no clip has a segment, or the
+        model takes embeddings.
     """
+    if model.description.embedding is not None:
+        raise DataError(
+            f"{model.name}: changed clips are heard by features alone, and this model takes what "
+            "a network hears: `hearthlog evaluate scenes` tries it in noise (--floor, --gain)"
+        )
     scenario = fitted(scenario, model)
     done = groups = learned = 0
     targets: list[Indices] = []

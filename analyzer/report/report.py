@@ -11,6 +11,7 @@ from hearthlog.analyzer.logs.health import Trouble
 from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
+from hearthlog.analyzer.logs.networks import network_changes
 from hearthlog.analyzer.logs.spans import common, joined, one
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.daily_metrics import HOUR, day_of
@@ -111,6 +112,7 @@ def make_report(
         model=model,
         scenarios=_scenarios(logs, days, zone, data) if labelling == LIVE else {},
         unread=len(data.losses),
+        networks=network_changes(logs.between(since, close[1]), zone),
     )
     with new_file(page) as html, new_file(picture) as png:
         if count == 1:

@@ -46,6 +46,7 @@ class Account:
     model: str  # SHA-256 of the model that labelled the days; empty if it is not known
     scenarios: ScenarioMinutes  # of `days`; of live labels only
     unread: int  # how many logs could not be read, or only in part
+    networks: Sequence[str]  # what changed of them in these weeks, a microphone in a line
 
     @property
     def home(self) -> str:

@@ -106,6 +106,8 @@ def not_heard(account: Account) -> Iterator[str]:
     if account.unread:
         logs = "1 log" if account.unread == 1 else f"{account.unread} logs"
         yield f"{logs} could not be read, or only in part."
+    for line in account.networks:
+        yield f"{plain(line)}."
 
 
 def not_well(account: Account) -> Iterator[str]:

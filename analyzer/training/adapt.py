@@ -8,7 +8,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import home_temperature
 from hearthlog.analyzer.training.cross_validation import cross_validate
-from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, HeardWindows
+from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, EmbeddingWindows
 from hearthlog.analyzer.training.home_heads import Heads, base_heads, learn_home
 from hearthlog.analyzer.training.home_spans import merged_spans
 from hearthlog.analyzer.training.installed import method_named
@@ -142,8 +142,8 @@ def adapt_model(base: Model, home: Dataset) -> Model:
 def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) -> Model:
     """Let the heads of a model learn from a home, too; the classifier's decisions are left out."""
     heads = base_heads(base, home.classes)
-    marked = home.heard.collection != _confirmed_number(home)
-    learned = learn_home(heads, home.heard, marked, home.classes)
+    marked = home.embedding_windows.collection != _confirmed_number(home)
+    learned = learn_home(heads, home.embedding_windows, marked, home.classes)
     inverse = _inverse_here(heads, home, decisions)
     mix = learned.mix.model_copy(
         update={
@@ -186,14 +186,14 @@ def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
 def _learned_without(heads: Heads, home: Dataset, seen: Indices) -> Heads:
     """Let heads learn from some segments of a home instead of all windows."""
     own = seen[home.is_embedded[seen]]
-    heard = HeardWindows(
+    windows = EmbeddingWindows(
         home.embedded[own],
         home.target[own],
         home.group[own],
         home.collection[own],
         np.ones(len(own), bool),
     )
-    return learn_home(heads, heard, heard.collection != _confirmed_number(home), home.classes)
+    return learn_home(heads, windows, windows.collection != _confirmed_number(home), home.classes)
 
 
 def _confirmed_number(home: Dataset) -> int:

@@ -244,7 +244,7 @@ def model_embedder(model: Model) -> ClipEmbedder | None:
     try:
         embedder = network_embedder(mix.network)
         source = embedder.source
-        if source is not None and source.projection_sha256 == mix.projection_sha256:
+        if source is not None and source.space == mix.space:
             return embedder
         why = f"it was learned with another projection of the network {mix.network}"
     except ModelError as error:

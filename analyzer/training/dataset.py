@@ -35,7 +35,7 @@ from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
-_HEARD_PER_GROUP = 32  # windows of each version
+_WINDOWS_PER_GROUP = 32  # windows of each version
 UNREADABLE = "cannot be read, or not all of it"
 CONFIRMED = "this home, as it was labelled"  # a collection
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
@@ -90,7 +90,7 @@ class Recording(NamedTuple):
     embedded: ClipEmbeddings | None = None
 
 
-class HeardWindows(NamedTuple):
+class EmbeddingWindows(NamedTuple):
     """Windows of sound as a network hears them, to learn heads from.
 
     Attributes
@@ -109,9 +109,9 @@ class HeardWindows(NamedTuple):
     collection: Indices
     tried: Bool
 
-    def rows(self, chosen: Indices | Bool) -> "HeardWindows":
+    def rows(self, chosen: Indices | Bool) -> "EmbeddingWindows":
         """Return some of the windows."""
-        return HeardWindows(
+        return EmbeddingWindows(
             self.values[chosen],
             self.target[chosen],
             self.group[chosen],
@@ -121,7 +121,7 @@ class HeardWindows(NamedTuple):
 
 
 _NO_NUMBERS = np.empty(0, np.intp)
-NOTHING_HEARD = HeardWindows(
+NO_WINDOWS = EmbeddingWindows(
     np.empty((0, 0), np.int8), _NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, np.empty(0, bool)
 )
 
@@ -164,7 +164,7 @@ class Dataset:
         The segments as a network hears them; W is 0 without a network.
     is_embedded : np.ndarray [shape=(n,)], bool
         Of which segments that is known.
-    heard : HeardWindows
+    embedding_windows : EmbeddingWindows
         What heads are learned from.
     """
 
@@ -186,7 +186,7 @@ class Dataset:
     left_out: Sequence[LeftOut] = ()
     embedded: Int8 = field(default_factory=lambda: np.empty((0, 0), np.int8))
     is_embedded: Bool = field(default_factory=lambda: np.empty(0, bool))
-    heard: HeardWindows = NOTHING_HEARD
+    embedding_windows: EmbeddingWindows = NO_WINDOWS
 
     def __len__(self) -> int:
         return len(self.target)
@@ -309,8 +309,8 @@ def clip_recordings(  # noqa: PLR0913, PLR0917
             segments = _segments(recording, features)[1]
             if len(segments) or len(sound.frames) < features.window_frames:
                 silence = class_name(clip.label) == SILENCE
-                heard = embedder(sound.frames, segments, silence=silence)
-                recording = recording._replace(embedded=heard)
+                embedded = embedder(sound.frames, segments, silence=silence)
+                recording = recording._replace(embedded=embedded)
         yield recording
     progress(1.0)
 
@@ -347,7 +347,7 @@ def cut_recordings(
     seconds: dict[str, float] = {}
     left_out: list[LeftOut] = []
     chosen: list[_Chosen] = []
-    heard: list[tuple[Recording, Indices]] = []
+    embedded_recordings: list[tuple[Recording, Indices]] = []
     spans: list[tuple[int, int]] = []
     rows = [np.empty((0, 3), np.intp)]
     weights = [np.empty(0)]
@@ -369,7 +369,7 @@ def cut_recordings(
         key = np.array([classes.index(name), group, collection])
         used[item.collection, item.licence] += 1
         if item.embedded is not None:
-            heard.append((item, key))
+            embedded_recordings.append((item, key))
         if reason:
             continue
         spans += [item.span] if item.span else []
@@ -402,7 +402,7 @@ def cut_recordings(
         left_out=left_out,
         embedded=embedded,
         is_embedded=is_embedded,
-        heard=_joined(heard),
+        embedding_windows=_joined(embedded_recordings),
     )
 
 
@@ -433,28 +433,30 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
     return windows, floors
 
 
-def _joined(heard: Sequence[tuple[Recording, Indices]]) -> HeardWindows:
+def _joined(embedded: Sequence[tuple[Recording, Indices]]) -> EmbeddingWindows:
     """Join the windows that teach heads, evenly spaced ones where a source has many.
 
     Each recording is of a class, a group and a collection.
     """
     parts = [
         (one.values[one.taught], one.version[one.taught], key, recording.weight)
-        for recording, key in heard
+        for recording, key in embedded
         if (one := recording.embedded) is not None and one.taught.any()
     ]
     if not parts:
-        return NOTHING_HEARD
+        return NO_WINDOWS
     counts = [len(part[1]) for part in parts]
     values = np.concatenate([part[0] for part in parts])
     version = np.concatenate([part[1] for part in parts])
     keys = np.repeat([part[2] for part in parts], counts, axis=0)
-    most = np.repeat([part[3] for part in parts], counts) * (_HEARD_PER_GROUP / SEGMENTS_PER_GROUP)
+    most = np.repeat([part[3] for part in parts], counts) * (
+        _WINDOWS_PER_GROUP / SEGMENTS_PER_GROUP
+    )
     columns = np.column_stack([keys, version])
     key = np.unique(columns, axis=0, return_inverse=True)[1].ravel()
     kept = _thinned(key, np.where(version == SHORT, SHORT_PARTS, 1.0) * most)
     target, group, collection = keys.T
-    return HeardWindows(values, target, group, collection, version == AS_IT_IS).rows(kept)
+    return EmbeddingWindows(values, target, group, collection, version == AS_IT_IS).rows(kept)
 
 
 def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.training.calibration import inverse_temperature
-from hearthlog.analyzer.training.dataset import HeardWindows
+from hearthlog.analyzer.training.dataset import EmbeddingWindows
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.embedding_heads import UNIT, UNTAUGHT
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
@@ -38,13 +38,16 @@ class LinearHeads(NamedTuple):
 
 
 def learn_heads(
-    heard: HeardWindows, classes: Sequence[str], inputs: Sequence[slice], seen: Bool | None = None
+    windows: EmbeddingWindows,
+    classes: Sequence[str],
+    inputs: Sequence[slice],
+    seen: Bool | None = None,
 ) -> LinearHeads:
     """Learn heads, each with the temperature that holds in collections left out.
 
     Parameters
     ----------
-    heard : HeardWindows
+    windows : EmbeddingWindows
         Those of silence are not learned from.
     classes : sequence of str
     inputs : sequence of slice
@@ -52,12 +55,12 @@ def learn_heads(
     seen : np.ndarray [shape=(m,)], bool, optional
         Which of the windows may be learned from; all by default.
     """
-    sound = np.array([name != SILENCE for name in classes])[heard.target]
+    sound = np.array([name != SILENCE for name in classes])[windows.target]
     chosen = sound if seen is None else sound & seen
-    pairs = np.unique(np.stack([heard.target[chosen], heard.group[chosen]]), axis=1)
+    pairs = np.unique(np.stack([windows.target[chosen], windows.group[chosen]]), axis=1)
     sources = np.bincount(pairs[0], minlength=len(classes))
-    rows = heard.rows(chosen & (sources >= FEWEST_SOURCES)[heard.target])
-    width, count = heard.values.shape[1], len(classes)
+    rows = windows.rows(chosen & (sources >= FEWEST_SOURCES)[windows.target])
+    width, count = windows.values.shape[1], len(classes)
     weights = np.zeros((len(inputs), width, count))
     bias = np.full((len(inputs), count), UNTAUGHT, np.int32)
     for number, columns in enumerate(inputs):
@@ -68,10 +71,10 @@ def learn_heads(
     return LinearHeads(in_units(weights), bias)
 
 
-def scaler_of(heard: HeardWindows, classes: Sequence[str]) -> Float64:
+def scaler_of(windows: EmbeddingWindows, classes: Sequence[str]) -> Float64:
     """Return mean and standard deviation of the values of windows with sound, shape (2, W)."""
-    sound = np.array([name != SILENCE for name in classes])[heard.target]
-    values = heard.values[sound].astype(np.float64)
+    sound = np.array([name != SILENCE for name in classes])[windows.target]
+    values = windows.values[sound].astype(np.float64)
     return np.stack([values.mean(axis=0), np.maximum(values.std(axis=0), 1.0)])
 
 
@@ -82,7 +85,7 @@ def in_units(values: Float64) -> Int32:
 
 
 def _calibrated(
-    values: Float64, rows: HeardWindows, count: int
+    values: Float64, rows: EmbeddingWindows, count: int
 ) -> tuple[Float64, Float64, Indices]:
     """Learn one head; returns weights and biases, times its inverse temperature, and which."""
     unit = rows.collection

@@ -14,7 +14,6 @@ from hearthlog.analyzer.training.dataset import Recording, spread
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.sightings import sighting_of
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
-from hearthlog.models.classifiers.description import EmbeddingMix
 from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
@@ -23,6 +22,7 @@ from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import CUT
+from hearthlog.schemas.messages.topics import EmbeddingSpace
 from hearthlog.schemas.times import NANOSECONDS
 
 _DAY = 86_400 * NANOSECONDS
@@ -35,7 +35,7 @@ def home_recordings(
     folder: Path,
     features: FeatureSet = DEFAULT,
     gate: float = 0.0,
-    mix: EmbeddingMix | None = None,
+    space: EmbeddingSpace | None = None,
 ) -> Iterator[Recording]:
     """Read the features of all marks in the logs of a folder.
 
@@ -47,7 +47,7 @@ def home_recordings(
         Marks in logs of another set give recordings without features.
     gate : float
         As of `marked_recordings`.
-    mix : EmbeddingMix, optional
+    space : EmbeddingSpace, optional
         As of `read_reviewed_sound`.
 
     Yields
@@ -62,7 +62,7 @@ def home_recordings(
     DataError
         If there are marks, and all of them are in logs of other sets.
     """
-    sounds = read_reviewed_sound(folder, features, mix=mix)
+    sounds = read_reviewed_sound(folder, features, space=space)
     for recording in marked_recordings(sounds, folder, features, gate):
         yield recording._replace(most=None)
 
@@ -136,13 +136,16 @@ def is_short_silence(mark: Mark, features: FeatureSet) -> bool:
 
 
 def lesson_recordings(
-    folder: Path, features: FeatureSet = DEFAULT, gate: float = 0.0
+    folder: Path,
+    features: FeatureSet = DEFAULT,
+    gate: float = 0.0,
+    space: EmbeddingSpace | None = None,
 ) -> Iterator[Recording]:
     """Read the marks in the logs of a folder that teach something; at most six segments of each.
 
     Parameters
     ----------
-    folder, features, gate
+    folder, features, gate, space
         As of `home_recordings`.
 
     Yields
@@ -154,7 +157,7 @@ def lesson_recordings(
     LogError, DataError
         As of `home_recordings`.
     """
-    sounds = (teaching(sound) for sound in read_reviewed_sound(folder, features))
+    sounds = (teaching(sound) for sound in read_reviewed_sound(folder, features, space=space))
     yield from marked_recordings(sounds, folder, features, gate)
 
 

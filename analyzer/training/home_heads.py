@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from hearthlog.analyzer.training.dataset import HeardWindows
+from hearthlog.analyzer.training.dataset import EmbeddingWindows
 from hearthlog.analyzer.training.heads import in_units
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
@@ -91,14 +91,16 @@ def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
     return head.model_copy(update={"classes": kept, "bias": bias})
 
 
-def learn_home(heads: Heads, heard: HeardWindows, marked: Bool, classes: Sequence[str]) -> Heads:
+def learn_home(
+    heads: Heads, windows: EmbeddingWindows, marked: Bool, classes: Sequence[str]
+) -> Heads:
     """Add what a home teaches.
 
     Parameters
     ----------
     heads : Heads
         As `base_heads` gives them.
-    heard : HeardWindows
+    windows : EmbeddingWindows
         Of the home.
     marked : np.ndarray [shape=(m,)], bool
         Whether somebody has said what it is; the others are as they were labelled.
@@ -107,13 +109,13 @@ def learn_home(heads: Heads, heard: HeardWindows, marked: Bool, classes: Sequenc
     Returns
     -------
     Heads
-        The same where no sound was heard.
+        The same where there is no window of a sound.
     """
     sounds = sounds_of(classes)
-    own = np.isin(heard.target, sounds)
+    own = np.isin(windows.target, sounds)
     if not own.any():
         return heads
-    mix, values = heads.mix, heard.values[own]
+    mix, values = heads.mix, windows.values[own]
     by_heads = EmbeddingHeads(mix, heads.weights, heads.bias, classes).log_probabilities(values)
     shares = sum(mix.head_weights) + sum(head.weight for head in mix.names)
     before = mix.inverse_temperature / shares * by_heads[:, sounds]
@@ -121,7 +123,7 @@ def learn_home(heads: Heads, heard: HeardWindows, marked: Bool, classes: Sequenc
     mean, scale = heads.scaler[:, used]
     inputs = (values[:, used] - mean) / scale
     weight = np.where(marked[own], 1.0, _CONFIRMED_WEIGHT)
-    target = np.searchsorted(sounds, heard.target[own])
+    target = np.searchsorted(sounds, windows.target[own])
     pull = np.full(len(sounds), _PULL)
     pull[len(sounds) - heads.new :] = _PULL_OF_NEW
     slopes, constants = _regressed(inputs, target, weight, before, pull)

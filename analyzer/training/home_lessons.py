@@ -38,6 +38,7 @@ from hearthlog.models.classifiers.description import MOST_CLASSES
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _FEWEST_DAYS = 2  # of a new class
 _FEWEST_SECONDS = 10.0
@@ -96,13 +97,16 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> L
     candidates: list[Candidates] = []
     counts, window = _Counts(), features.window_frames
     for folder in folders:
-        read = read_reviewed_sound(folder, features, scenario, model.description.embedding)
+        space = model.description.embedding_space
+        read = read_reviewed_sound(folder, features, scenario, space)
         sounds = list(_counted(read, counts, features))
         marked += marked_recordings(sounds, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
     taught, notes, unlearned = _with_new_classes(marked, model, features)
     marked = [one for one in marked if one.label not in unlearned]
     notes += counts.notes()
+    if note := counts.embedding_note(model):
+        notes.append(note)
     in_room = [one for one in marked if one.floor is not None]
     kept: list[Recording] = []
     if marked:
@@ -130,6 +134,7 @@ class _Counts:
         self.left_out = 0  # as they teach nothing
         self.short = 0  # pauses that are marked as silence
         self.looked_at = False
+        self.by_embedding: Counter[EmbeddingSpace | None] = Counter()  # marks
 
     def notes(self) -> list[str]:
         """Say what of the marks is not learned from."""
@@ -146,6 +151,24 @@ class _Counts:
             )
         return notes
 
+    def embedding_note(self, model: Model) -> str:
+        """Say which marks teach by features alone, though there are networks; else nothing."""
+        wanted = model.description.embedding_space
+        others = sorted({each.network for each in self.by_embedding if each not in {None, wanted}})
+        if wanted is None and others:
+            return (
+                f"the logs have embeddings of {', '.join(others)}, which {model.name} does not "
+                "take: marks teach it by features alone"
+            )
+        left = sum(self.by_embedding.values()) - self.by_embedding[wanted]
+        if wanted is None or not left:
+            return ""
+        theirs = f" (some of {', '.join(others)}, or of another projection)" if others else ""
+        return (
+            f"{left} of {self.marks} marks lie in logs without embeddings of {wanted.network} as "
+            f"{model.name} takes them{theirs}: they teach by features alone"
+        )
+
 
 def _counted(
     sounds: Iterable[HomeSound], counts: _Counts, features: FeatureSet
@@ -154,6 +177,7 @@ def _counted(
     for sound in sounds:
         taught = teaching(sound)
         counts.marks += len(sound.marks)
+        counts.by_embedding[sound.embedding] += len(sound.marks)
         counts.left_out += len(sound.marks) - len(taught.marks)
         counts.short += sum(is_short_silence(mark, features) for mark in taught.marks)
         counts.looked_at |= any(span.chosen != RANDOM for span in sound.reviewed)

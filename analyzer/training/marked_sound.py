@@ -14,7 +14,6 @@ from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
-from hearthlog.models.classifiers.description import EmbeddingMix
 from hearthlog.models.classifiers.directions import NOWHERE, Directions
 from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, Embeddings
 from hearthlog.models.features.feature_set import FeatureSet
@@ -28,6 +27,7 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     LIVE,
     EmbeddingSource,
+    EmbeddingSpace,
     scenario_labelling,
     topic,
 )
@@ -61,6 +61,8 @@ class HomeSound:
         Of an array; none where only features were wanted.
     embeddings : Embeddings
         Of the network that was asked for; none of another one.
+    embedding : EmbeddingSpace or None
+        Of those that the log has, of whatever network.
     """
 
     log: Path
@@ -74,6 +76,7 @@ class HomeSound:
     labelling: str = LIVE
     directions: Directions = NOWHERE
     embeddings: Embeddings = NO_EMBEDDINGS
+    embedding: EmbeddingSpace | None = None
 
     @property
     def enrolled(self) -> bool:
@@ -106,7 +109,7 @@ class HomeSound:
 
 
 def read_reviewed_sound(
-    folder: Path, features: FeatureSet, scenario: str = "", mix: EmbeddingMix | None = None
+    folder: Path, features: FeatureSet, scenario: str = "", space: EmbeddingSpace | None = None
 ) -> Iterator[HomeSound]:
     """Read what was marked or looked at in the logs of a folder, log by log.
 
@@ -117,8 +120,8 @@ def read_reviewed_sound(
     features : FeatureSet
     scenario : str, optional
         What is said of this scenario, by its name, instead of the sounds of the home.
-    mix : EmbeddingMix, optional
-        Of a model whose heads take embeddings: only those of its network and projection.
+    space : EmbeddingSpace, optional
+        Of the embeddings that are wanted.
 
     Raises
     ------
@@ -142,7 +145,7 @@ def read_reviewed_sound(
             elif sound.marks:
                 other = log, sound.microphone
             yield with_embeddings(
-                replace(sound, directions=_directions(log, sound.microphone, limits)), limits, mix
+                replace(sound, directions=_directions(log, sound.microphone, limits)), limits, space
             )
     if other is not None and not usable:
         name = _set_of(*other)
@@ -220,36 +223,31 @@ def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directio
 
 
 def with_embeddings(
-    sound: HomeSound, limits: tuple[int, int], mix: EmbeddingMix | None
+    sound: HomeSound, limits: tuple[int, int], space: EmbeddingSpace | None
 ) -> HomeSound:
-    """Read what a network heard in a part of a log, if it is the network of a model.
+    """Read what a network heard in a part of a log, if a model takes it.
 
     Parameters
     ----------
     sound : HomeSound
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC.
-    mix : EmbeddingMix or None
-        Of the model; None if it has no heads.
+    space : EmbeddingSpace or None
+        Of the embeddings that the model takes; None if it takes none.
 
     Raises
     ------
     LogError
         If the log has embeddings that no recorder writes.
     """
-    if mix is None:
-        return sound
     name = topic(sound.microphone, "embedding")
     start, end = limits[0] - _AROUND, limits[1] + _AROUND
     columns = read_columns([sound.log], {name}, start, end, EMBEDDING_FIELDS).get(name)
     if columns is None or columns.type != message_types.EMBEDDING or not len(columns):
         return sound
     source = EmbeddingSource.from_metadata(columns.metadata)
-    if source is None or (source.network, source.projection_sha256, len(source.names)) != (
-        mix.network,
-        mix.projection_sha256,
-        mix.values,
-    ):
+    sound = replace(sound, embedding=None if source is None else source.space)
+    if sound.embedding is None or sound.embedding != space:
         return sound
     try:
         return replace(sound, embeddings=embeddings_of(columns))

@@ -88,10 +88,10 @@ def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
         are.
     """
     seen = np.setdiff1d(np.arange(len(data)), unseen)
-    lost = np.zeros(len(data.heard.target), bool)
+    lost = np.zeros(len(data.embedding_windows.target), bool)
     for of_segments, of_windows in (
-        (data.group, data.heard.group),
-        (data.collection, data.heard.collection),
+        (data.group, data.embedding_windows.group),
+        (data.collection, data.embedding_windows.collection),
     ):
         lost |= np.isin(of_windows, np.setdiff1d(of_segments[unseen], of_segments[seen]))
     return lost
@@ -118,7 +118,7 @@ def said_unseen(
     by_heads = np.full((len(data), len(data.classes)), np.nan)
     for _, unseen in folds:
         seen = ~unseen_windows(data, unseen)
-        learned = learn_heads(data.heard, data.classes, inputs, seen)
+        learned = learn_heads(data.embedding_windows, data.classes, inputs, seen)
         heads = EmbeddingHeads(mix, *learned, data.classes)
         heard = unseen[data.is_embedded[unseen]]
         by_heads[heard] = heads.log_probabilities(data.embedded[heard])
@@ -246,7 +246,8 @@ def _candidates(data: Dataset, hearing: Hearing) -> list[tuple[tuple[slice, ...]
 
 def _sources(data: Dataset) -> Indices:
     """Return the number of sources of the windows for heads, by class."""
-    pairs = np.unique(np.stack([data.heard.target, data.heard.group]), axis=1)
+    windows = data.embedding_windows
+    pairs = np.unique(np.stack([windows.target, windows.group]), axis=1)
     return np.bincount(pairs[0], minlength=len(data.classes))
 
 
@@ -269,7 +270,7 @@ def learn_mixture(
     everything = np.ones(len(data), bool)
     inverse = _inverse_temperature(data, best.mix, ways[-1], best.by_heads[-1], everything)
     mix = best.mix.model_copy(update={"inverse_temperature": inverse})
-    heads = learn_heads(data.heard, data.classes, best.inputs)
+    heads = learn_heads(data.embedding_windows, data.classes, best.inputs)
     return Mixture(mix, heads, best.left_out[0], None if collections is None else best.left_out[1])
 
 

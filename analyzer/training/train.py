@@ -155,7 +155,7 @@ def train_model(  # noqa: PLR0913, PLR0917
             model,
             embedding_weights=mixture.heads.weights,
             embedding_bias=mixture.heads.bias,
-            embedding_scaler=scaler_of(data.heard, data.classes),
+            embedding_scaler=scaler_of(data.embedding_windows, data.classes),
         )
     model = with_directions(model, data.target, data.sightings)
     if method.remembered(model) is not None:

@@ -108,7 +108,7 @@ def _labelled(
                 begin = info.first_frame[1]
                 part = begin, begin + length
                 for one in read_sound_of(log, features, {info.microphone}, part, scenario):
-                    sound = with_embeddings(one, part, model.description.embedding)
+                    sound = with_embeddings(one, part, model.description.embedding_space)
                     yield labelled_segments(sound, model.classes, names, features.window_frames)
 
 

@@ -92,10 +92,7 @@ class Classifier:
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
         """Return whether the model was learned on embeddings of the same network and projection."""
         mix = self._mix
-        if source is None or mix is None:
-            return False
-        theirs = source.network, source.projection_sha256, len(source.names)
-        return theirs == (mix.network, mix.projection_sha256, mix.values)
+        return source is not None and mix is not None and source.space == mix.space
 
     def lacking_embeddings(self, source: EmbeddingSource | None) -> str:
         """Say which embeddings the model was learned on and does not get; empty if it gets them.
@@ -118,16 +115,17 @@ class Classifier:
         )
 
     def mix(
-        self, probabilities: Float32, embedded: Float64, evidence: Float64 | None = None
+        self, probabilities: Float32, by_heads: Float64, evidence: Float64 | None = None
     ) -> tuple[Float32, Float32]:
         """Let embeddings say which class a sound is of; whether it is silence, features say.
 
         Parameters
         ----------
         probabilities : np.ndarray [shape=(n, C)], float32
-            As `classify` gives them.
-        embedded : np.ndarray [shape=(n, C)], float64
-            Of the heads; NaN where there is no embedding, and the probabilities stay.
+            As `classify` gives them without evidence.
+        by_heads : np.ndarray [shape=(n, C)], float64
+            What the heads say, as of `EmbeddingHeads.log_probabilities`; NaN where there is no
+            embedding. Where there is no evidence either, the probabilities stay.
         evidence : np.ndarray [shape=(n, C)], float64, optional
             Of something else, as `classify` takes it.
 
@@ -137,14 +135,17 @@ class Classifier:
         novelty : np.ndarray [shape=(n,)], float32
             As of `classify`.
         """
-        decision = np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
-        self._add_heads(decision, embedded)
+        heard = np.isfinite(by_heads.sum(axis=1))
+        changed = heard if evidence is None else heard | evidence.any(axis=1)
+        decision = np.log(np.maximum(probabilities[changed], _TINY, dtype=np.float64))
+        if self._mix is not None and heard.any():
+            own = heard[changed]
+            decision[own] = mixed(decision[own], by_heads[heard], self._mix, self.classes)
         if evidence is not None:
-            decision += evidence
-        decision -= decision.max(axis=1, keepdims=True)
-        np.exp(decision, out=decision)
-        mixed = (decision / decision.sum(axis=1, keepdims=True)).astype(np.float32)
-        return self._in_steps(mixed)
+            decision += evidence[changed]
+        probabilities = probabilities.copy()
+        probabilities[changed] = _shares(decision)
+        return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
         """Compute the probability of each class in each window.
@@ -165,7 +166,7 @@ class Classifier:
         self,
         inputs: Float32,
         evidence: Float64 | None = None,
-        embedded: Float64 | None = None,
+        by_heads: Float64 | None = None,
     ) -> tuple[Float32, Float32]:
         """Compute the probability of each class, and the novelty of each window.
 
@@ -175,9 +176,8 @@ class Classifier:
             Finite.
         evidence : np.ndarray [shape=(n, C)], float64, optional
             Of something else: what is added to the logarithms of the probabilities.
-        embedded : np.ndarray [shape=(n, C)], float64, optional
-            What the heads say at each window, as of `EmbeddingHeads.log_probabilities`. Rows of NaN
-            where they say nothing: there the classifier decides alone, as without heads.
+        by_heads : np.ndarray [shape=(n, C)], float64, optional
+            As `mix` takes it.
 
         Returns
         -------
@@ -188,6 +188,8 @@ class Classifier:
             Probability that it is none of the classes but `unknown` that is likeliest, 0 to 1;
             of older models what the kind of classifier gives, or NaN.
         """
+        if by_heads is not None:
+            return self.mix(self.classify(inputs)[0], by_heads, evidence)
         result = np.empty((len(inputs), len(self.classes)), np.float32)
         novelty = np.empty(len(inputs), np.float32)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
@@ -195,13 +197,9 @@ class Classifier:
             decision, novelty[rows] = self._machine.decide(inputs[rows])
             decision += self._bias
             decision *= self._inverse_temperature
-            if embedded is not None:
-                self._add_heads(decision, embedded[rows])
             if evidence is not None:
                 decision += evidence[rows]
-            decision -= decision.max(axis=1, keepdims=True)
-            np.exp(decision, out=decision)
-            result[rows] = decision / decision.sum(axis=1, keepdims=True)
+            result[rows] = _shares(decision)
         if self._doubts:  # models of hearthlog 0.1 label as they did, to the last bit
             return self._in_steps(result)
         return result, novelty
@@ -212,8 +210,10 @@ class Classifier:
         probabilities /= _STEPS
         return probabilities, 1.0 - probabilities[:, self._known].max(axis=1, initial=0.0)
 
-    def _add_heads(self, decision: Float64, by_heads: Float64) -> None:
-        """Mix the decision values of windows with what heads say there."""
-        heard = ~np.isnan(by_heads).any(axis=1)
-        if self._mix is not None and heard.any():
-            decision[heard] = mixed(decision[heard], by_heads[heard], self._mix, self.classes)
+
+def _shares(decision: Float64) -> Float64:
+    """Return the probabilities behind decision values, which it takes for its own."""
+    decision -= decision.max(axis=1, keepdims=True)
+    np.exp(decision, out=decision)
+    shares: Float64 = decision / decision.sum(axis=1, keepdims=True)
+    return shares

@@ -17,6 +17,7 @@ from pydantic import (
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.messages.topics import EmbeddingSpace
 from hearthlog.schemas.text import printable
 
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
@@ -249,6 +250,11 @@ class EmbeddingMix(_Record):
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
     of_home: bool = False
 
+    @property
+    def space(self) -> EmbeddingSpace:
+        """Of the embeddings that the heads take."""
+        return EmbeddingSpace(self.network, self.projection_sha256, self.values)
+
 
 class Description(_Record):
     """Everything about a model but its arrays.
@@ -318,6 +324,11 @@ class Description(_Record):
     direction_microphones: Annotated[list[_Text], Field(max_length=MOST_ARRAYS)] = []
     embedding: EmbeddingMix | None = None
     versions: dict[_Text, _Text]
+
+    @property
+    def embedding_space(self) -> EmbeddingSpace | None:
+        """Of the embeddings that the model takes; None if it takes none."""
+        return None if self.embedding is None else self.embedding.space
 
     @model_serializer(mode="wrap")
     def _as_older_versions_read_it(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """Whence sound came, and what that says of its class: a home's television stays in its corner."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
+from hearthlog.models.frame_spans import FrameSpans
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 
 BLOCK_FRAMES = 4  # for which there is one direction: 0.2 s
@@ -12,69 +13,22 @@ MEMORY_BLOCKS = 5  # of which the last ones speak of a window: a second
 MOST_EVIDENCE = 5.0  # that a direction is of a class, a logarithm
 
 
-class Directions(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Directions(FrameSpans):
     """Directions of the blocks of one stream of frames in which something could be located.
 
     Attributes
     ----------
-    frames : np.ndarray [shape=(m,)], int64
-        Number of the first frame of each block, a multiple of four; increasing.
-    stamps : np.ndarray [shape=(m,)], int64
-        Starts of these frames in nanoseconds of UTC.
     azimuths : np.ndarray [shape=(m,)], float32
         In radians, -pi to pi, counter-clockwise from x.
     confidences : np.ndarray [shape=(m,)], float32
         By how much the microphones agree on this direction more than on any, 0 to 1.
     """
 
-    frames: Int64
-    stamps: Int64
+    LENGTH = BLOCK_FRAMES
+
     azimuths: Float32
     confidences: Float32
-
-    @property
-    def last_frames(self) -> Int64:
-        """Numbers of the frames with which the directions are known."""
-        return self.frames + (BLOCK_FRAMES - 1)
-
-    def rows(self, chosen: slice | Indices) -> "Directions":
-        """Return some of the directions."""
-        return Directions(
-            self.frames[chosen],
-            self.stamps[chosen],
-            self.azimuths[chosen],
-            self.confidences[chosen],
-        )
-
-    def known_at(self, first: int, count: int) -> "Directions":
-        """Return those that become known with some successive frames.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
-        """
-        begin, end = np.searchsorted(self.last_frames, [first, first + count])
-        return self.rows(slice(begin, end))
-
-    def begun_in(self, start: int, end: int) -> "Directions":
-        """Return those whose blocks begin in a span of time.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC: from `start` on, before `end`.
-        """
-        return self.rows(slice(*np.searchsorted(self.stamps, [start, end])))
-
-    def followed_by(self, later: "Directions") -> "Directions":
-        """Join these directions with those that follow."""
-        return Directions(
-            np.concatenate([self.frames, later.frames]),
-            np.concatenate([self.stamps, later.stamps]),
-            np.concatenate([self.azimuths, later.azimuths]),
-            np.concatenate([self.confidences, later.confidences]),
-        )
 
 
 NOWHERE = Directions(

@@ -60,6 +60,21 @@ class Topic:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
+class EmbeddingSpace(NamedTuple):
+    """Whose embeddings can be compared: those of one network by one projection.
+
+    Attributes
+    ----------
+    network, projection_sha256 : str
+    width : int
+        Number of the values of a window.
+    """
+
+    network: str
+    projection_sha256: str
+    width: int
+
+
 class EmbeddingSource(NamedTuple):
     """The network and the projection behind the embeddings of a microphone.
 
@@ -79,6 +94,11 @@ class EmbeddingSource(NamedTuple):
     projection_sha256: str
     names: tuple[str, ...]
     steps: tuple[float, ...]
+
+    @property
+    def space(self) -> EmbeddingSpace:
+        """With which embeddings these can be compared."""
+        return EmbeddingSpace(self.network, self.projection_sha256, len(self.names))
 
     def metadata(self) -> dict[str, str]:
         """Return what the channel says besides the names."""

@@ -18,6 +18,7 @@ import typer
 
 from hearthlog.analyzer.evaluation.event_scores import events_of
 from hearthlog.analyzer.evaluation.scenes import Colour, background, compose
+from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.logs.spans import NONE, rows_at
@@ -31,6 +32,7 @@ from hearthlog.analyzer.training.scenario import BUILTIN
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Int8
 from hearthlog.models.features.floor import FloorTracker, is_quiet
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
@@ -42,7 +44,7 @@ from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.messages.topics import LIVE, topic
+from hearthlog.schemas.messages.topics import LIVE, EmbeddingSource, topic
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.home.clips import SHIPPED
@@ -93,6 +95,8 @@ class Heard(NamedTuple):
 
     inputs: Float32
     quiet: Bool
+    embedded: Int8  # what the network of the model hears there; without one nothing
+    is_embedded: Bool
     true: "np.ndarray[tuple[int], np.dtype[np.object_]]"
 
 
@@ -326,7 +330,21 @@ def heard(scene: Recorded, model: Model) -> Heard:
     middles = recorded["header.stamp"][-count:] - (window // 2) * FRAME_NANOSECONDS
     some = slice(None, None, _EVERY)
     true = scene.truth.labels[rows_at(scene.truth, middles[some])]
-    return Heard(inputs[some], quiet[some], true)
+    return Heard(inputs[some], quiet[some], *_embedded(scene, model, middles[some]), true)
+
+
+def _embedded(scene: Recorded, model: Model, middles: Int64) -> tuple[Int8, Bool]:
+    """Return the embedding around each moment, if it is one that a model takes."""
+    name, space = topic("mic", "embedding"), model.description.embedding_space
+    fields = EMBEDDING_FIELDS
+    columns = read_columns([*scene.logs.rglob("*.mcap")], {name}, fields=fields).get(name)
+    source = None if columns is None else EmbeddingSource.from_metadata(columns.metadata)
+    if columns is None or source is None or source.space != space:
+        return np.empty((len(middles), 0), np.int8), np.zeros(len(middles), bool)
+    embeddings = embeddings_of(columns)
+    starts = embeddings.stamps + (WINDOW_FRAMES - HOP_FRAMES) // 2 * FRAME_NANOSECONDS
+    row = np.maximum(np.searchsorted(starts, middles, "right") - 1, 0)
+    return embeddings.values[row], middles - starts[row] < HOP_FRAMES * FRAME_NANOSECONDS
 
 
 def _scores(model: Model, heard: Heard) -> dict[str, float]:
@@ -334,7 +352,12 @@ def _scores(model: Model, heard: Heard) -> dict[str, float]:
     classes = np.array(model.classes, object)
     labels = np.full(len(heard.inputs), SILENCE, object)
     loud = ~heard.quiet
-    labels[loud] = classes[Classifier(model).probabilities(heard.inputs[loud]).argmax(axis=1)]
+    classifier, by_heads = Classifier(model), None
+    if classifier.embedding_heads is not None:
+        by_heads = classifier.embedding_heads.log_probabilities(heard.embedded[loud])
+        by_heads[~heard.is_embedded[loud]] = np.nan
+    probabilities, _ = classifier.classify(heard.inputs[loud], None, by_heads)
+    labels[loud] = classes[probabilities.argmax(axis=1)]
     return {
         name: 2.0 * float(((labels == name) & (heard.true == name)).sum())
         / float((labels == name).sum() + (heard.true == name).sum())

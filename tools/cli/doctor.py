@@ -65,8 +65,8 @@ def doctor(
     missing: list[str] = []
     with share_done("reading logs") as progress:
         files = examine(paths, progress, missing)
-    for error in missing:
-        tell(error)
+    for line in [*missing, *_network_changes(paths)]:
+        tell(line)
     if as_json:
         print(json.dumps(_as_json(files), indent=2))
     else:
@@ -74,6 +74,20 @@ def doctor(
     levels = {level for findings in files for level, _ in findings.counts}
     if levels or missing:
         raise typer.Exit(1 if "error" in levels or missing else 3)
+
+
+def _network_changes(paths: list[Path]) -> list[str]:
+    """Say when a home began, changed or lost a network, which is no fault of a log."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.local_time import home_zone
+    from hearthlog.analyzer.logs.networks import network_changes
+    from hearthlog.schemas.errors import LogError
+
+    try:
+        home = find_home_logs(paths)
+    except LogError:  # which the checks have told
+        return []
+    return network_changes(home.between(), home_zone(None, home.records()))
 
 
 def _write_bundle(bundle: Path, folder: Path) -> None:

@@ -72,6 +72,9 @@ evaluate = typer.Typer(
 )
 
 _Method = Annotated[str | None, typer.Argument(help=METHODS, show_default=METHOD)]
+_OfFeatures = Annotated[
+    str | None, typer.Argument(help="How to learn, by features alone.", show_default="room")
+]
 _Scenario = Annotated[str, typer.Option(help=SCENARIO)]
 _Folds = Annotated[
     Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
@@ -244,7 +247,7 @@ def evaluate_method(
 
 @evaluate.command()
 def search(
-    method: _Method = None,
+    method: _OfFeatures = None,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -258,6 +261,7 @@ def search(
     require("sklearn", "scipy", "joblib")
     from hearthlog.analyzer.evaluation import grid_search
 
+    method = _by_features(method, "its classifier has the costs and gammas of room")
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
         tried = grid_search.search(segments, chosen.variations(), folds, progress)
     if as_json:
@@ -278,7 +282,7 @@ def search(
 
 @evaluate.command()
 def adaptation(
-    method: _Method = None,
+    method: _OfFeatures = None,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -294,6 +298,7 @@ def adaptation(
     require("sklearn", "scipy", "joblib")
     from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
 
+    method = _by_features(method, "what marks teach its heads, `hearthlog train --home` tries")
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
         curve = adaptation_curve(segments, chosen, progress)
     if as_json:
@@ -315,6 +320,15 @@ def adaptation(
 
 
 evaluate.command()(paper)
+
+
+def _by_features(name: str | None, why: str) -> str:
+    """Return the name of a method of features alone, by default the best; refuse others."""
+    from hearthlog.analyzer.training.installed import DEFAULT
+
+    if name is not None and chosen_method(name).network:
+        wrong_use(f"{name}: only methods of features alone are tried so, such as room; {why}")
+    return name or DEFAULT.name
 
 
 @contextmanager

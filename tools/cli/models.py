@@ -274,7 +274,7 @@ def _recordings(
 
     features = feature_set(model.description.feature_set)
     if logs is not None:
-        return list(home_recordings(logs, features, mix=model.description.embedding))
+        return list(home_recordings(logs, features, space=model.description.embedding_space))
     assert data is not None
     clips = labelled_clips([data], scenario.labels, left_out)
     with share_done(f"listening to {len(clips)} clips") as report:

@@ -1,7 +1,7 @@
 """`hearthlog train`: labelled sound to a model file."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,12 +27,11 @@ from hearthlog.tools.cli.verdict import print_verdict, refusal
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.gate.judge import Verdict
-    from hearthlog.analyzer.training.dataset import Dataset, Recording
+    from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.method import Method
     from hearthlog.models.classifiers.description import Amount
     from hearthlog.models.classifiers.model import Model
-    from hearthlog.models.features.feature_set import FeatureSet
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
@@ -234,6 +233,7 @@ def _learned(
     left_out: "list[LeftOut]",
 ) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import build_dataset
+    from hearthlog.analyzer.training.home_data import lesson_recordings
     from hearthlog.analyzer.training.installed import clip_embedder
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.training.train import train_model
@@ -251,11 +251,22 @@ def _learned(
             "fewer than 5 sources have a label of no class, such as other_negative: the model will "
             "take every sound for one of its classes; add some to be told what is unknown"
         )
-    recordings = list(_home_recordings(home, method.features, method.gate))
+    embedder = clip_embedder(method)
+    space = None if embedder is None or embedder.source is None else embedder.source.space
+    recordings = [
+        one
+        for folder in home
+        for one in lesson_recordings(folder, method.features, method.gate, space)
+    ]
+    without = sum(one.embedded is None for one in recordings)
+    if space is not None and without:
+        tell(
+            f"{without} of {len(recordings)} marks of the home have no embedding of "
+            f"{space.network} as it is here: they teach by features alone"
+        )
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        heard = clip_embedder(method)
         segments = build_dataset(
-            clips, chosen, report, recordings, method.features, method.rooms, heard
+            clips, chosen, report, recordings, method.features, method.rooms, embedder
         )
     _tell_left_out(segments.left_out)
     left_out += segments.left_out
@@ -347,15 +358,6 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
     with share_done(what, announce=True):
         adapted = adapt_model(model, segments)
     return adapted, segments
-
-
-def _home_recordings(
-    folders: list[Path], features: "FeatureSet", gate: float
-) -> Iterator["Recording"]:
-    from hearthlog.analyzer.training.home_data import lesson_recordings
-
-    for folder in folders:
-        yield from lesson_recordings(folder, features, gate)
 
 
 def _warn_of_few(segments: "Dataset") -> None:

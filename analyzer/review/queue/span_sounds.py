@@ -1,4 +1,4 @@
-"""How spans sound: the inputs of the model that labelled them, in which alike sounds are near."""
+"""How spans sound: inputs of the model that labelled them, and what a network hears."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.embeddings import mean_embeddings
 from hearthlog.analyzer.logs.labelled_by import model_of
 from hearthlog.analyzer.logs.labellings import Labellings, LogContents
 from hearthlog.analyzer.logs.spans import ranges
@@ -23,7 +24,7 @@ from hearthlog.models.modelfile.registry import find_model
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -31,6 +32,7 @@ _FIELDS = ("header.stamp", "frame", "values")
 _BEFORE = 60 * NANOSECONDS  # in which the floor of the room is found
 _MOST_AT_ONCE = 1800 * NANOSECONDS
 _MOST_WINDOWS = 12  # of a span
+_EMBEDDED = 0.5  # what of the kernel's exponent is theirs, of two spans on average, halved
 _GAMMA = 0.5  # over the number of inputs, as of the starter models
 
 
@@ -40,7 +42,8 @@ class SpanSounds(NamedTuple):
     Attributes
     ----------
     points : np.ndarray [shape=(n, width)], float64
-        Means of scaled inputs; NaN for a span without features.
+        Means of scaled inputs, and behind them of the embeddings of one network, 0 for a span
+        without any; NaN for a span without features.
     gamma : float
         The kernel of two points is exp(-gamma |x - y|^2).
     """
@@ -98,6 +101,7 @@ def span_sounds(
         Told the share of the spans that is read, 0 to 1.
     """
     name, points = topic(microphone, "features"), np.empty((len(spans), 0))
+    embedded: dict[EmbeddingSpace, Float64] = {}
     space = None if model is None else _space(model)
     for first, last in _groups(spans):
         start, end = int(spans.starts[first]), int(spans.ends[last - 1])
@@ -110,13 +114,56 @@ def span_sounds(
             if means.shape[1] != points.shape[1]:
                 points = np.full((len(spans), means.shape[1]), np.nan)
             points[part] = means
+            _embed(embedded, sources, microphone, spans, part)
         progress(last / len(spans))
     if not points.shape[1]:
         return SpanSounds(np.full((len(spans), 1), np.nan), 1.0)
     if space is None or space.features is None:
         spread = np.nanstd(points, axis=0)
-        return SpanSounds(points / np.where(spread > 0.0, spread, 1.0), _GAMMA / points.shape[1])
-    return SpanSounds((points - space.mean) / space.scale, space.gamma)
+        points, gamma = points / np.where(spread > 0.0, spread, 1.0), _GAMMA / points.shape[1]
+    else:
+        points, gamma = (points - space.mean) / space.scale, space.gamma
+    own = None if model is None else model.description.embedding_space
+    if embedded:
+        most = max(embedded, key=lambda one: (one == own, np.isfinite(embedded[one]).sum()))
+        points = np.concatenate([points, _scaled(embedded[most], gamma)], axis=1)
+    return SpanSounds(points, gamma)
+
+
+def _embed(
+    embedded: dict[EmbeddingSpace, Float64],
+    sources: Labellings,
+    microphone: str,
+    spans: JudgeableSpans,
+    part: slice,
+) -> None:
+    """Read what networks hear of some spans, each network apart: log by log."""
+    name, starts, ends = topic(microphone, "embedding"), spans.starts[part], spans.ends[part]
+    for log in sources.logs:
+        if log.last < starts[0] or log.first >= ends[-1]:
+            continue
+        try:
+            span = int(starts[0]), int(ends[-1]) + NANOSECONDS  # known when a window has ended
+            columns = read_columns([log.path], {name}, *span, fields=_FIELDS[::2]).get(name)
+        except LogError as error:
+            sources.lose(error)
+            continue
+        space, means = mean_embeddings(columns, starts, ends)
+        if space is not None:
+            every = embedded.setdefault(space, np.full((len(spans), means.shape[1]), np.nan))
+            there = np.isfinite(means).all(axis=1)
+            if every.shape[1] == means.shape[1]:
+                every[part][there] = means[there]
+
+
+def _scaled(embedded: Float64, gamma: float) -> Float64:
+    """Scale embeddings so that two of any spans are as far apart as their inputs are."""
+    there = np.isfinite(embedded).all(axis=1)
+    own = embedded[there] - embedded[there].mean(axis=0)
+    spread = own.std(axis=0)
+    scaled = np.zeros(embedded.shape)
+    scaled[there] = own / np.where(spread > 0.0, spread, 1.0)
+    return scaled * np.sqrt(_EMBEDDED / (gamma * embedded.shape[1]))
 
 
 class _Space(NamedTuple):

@@ -1,0 +1,79 @@
+"""With which networks of sounds the microphones of a home are heard, and since when."""
+
+from collections.abc import Iterable
+from contextlib import suppress
+from datetime import tzinfo
+from itertools import pairwise
+
+from hearthlog.analyzer.logs.home_logs import HomeLog
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.recorder_info import microphones_of
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.topics import EmbeddingSource, EmbeddingSpace, topic
+
+_MOST = 4  # changes that are named
+
+
+def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
+    """Say when a home began to be heard with a network, with another one, or without any.
+
+    Parameters
+    ----------
+    logs : iterable of HomeLog
+        In the order of time.
+    zone : tzinfo
+        Of the home.
+
+    Returns
+    -------
+    list of str
+        A line for each microphone that is not always heard in one way.
+    """
+    heard: dict[tuple[str, str], list[tuple[int, EmbeddingSpace | None]]] = {}
+    for log in logs:
+        with suppress(LogError), LogFile(log.path) as file:
+            for microphone in sorted(microphones_of(file, "features")):
+                heard.setdefault((log.node, microphone), []).append(
+                    (log.start, embedding_space(file, microphone))
+                )
+    return [
+        f"{microphone}: {_changes(times, zone)}"
+        for (_, microphone), times in sorted(heard.items())
+        if len({space for _, space in times}) > 1
+    ]
+
+
+def embedding_space(file: LogFile, microphone: str) -> EmbeddingSpace | None:
+    """Return of which network and projection a log has embeddings; None if it has none.
+
+    Parameters
+    ----------
+    file : LogFile
+        Open.
+    microphone : str
+        Its name.
+    """
+    name = topic(microphone, "embedding")
+    channels = (channel for channel in file.channels.values() if channel.topic == name)
+    sources = (EmbeddingSource.from_metadata(channel.metadata) for channel in channels)
+    return next((source.space for source in sources if source is not None), None)
+
+
+def _changes(times: list[tuple[int, EmbeddingSpace | None]], zone: tzinfo) -> str:
+    parts = [f"heard {_with(times[0][1], None)}"]
+    for (_, before), (start, space) in pairwise(times):
+        if space != before:
+            moment = f"{local_time(start, zone):%Y-%m-%d %H:%M}"
+            parts.append(f"from {moment} {_with(space, before)}")
+    if len(parts) > _MOST:
+        parts = [parts[0], f"{len(parts) - _MOST} changes", *parts[1 - _MOST :]]
+    text = ", ".join(parts)
+    return f"{text}; only what one network heard is compared, all else by features"
+
+
+def _with(space: EmbeddingSpace | None, before: EmbeddingSpace | None) -> str:
+    if space is None:
+        return "without a network"
+    same = before is not None and before.network == space.network
+    return f"with another projection of {space.network}" if same else f"with {space.network}"
