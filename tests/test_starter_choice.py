@@ -14,6 +14,7 @@ from networks import model
 from onnx import helper
 from spliced import run
 
+from hearthlog.analyzer.live import _networks
 from hearthlog.models.embedding.networks import NETWORKS, YAMNET, NetworkFile
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder import embedder_probe
@@ -189,6 +190,20 @@ def test_the_network_of_a_model_is_named_and_whether_it_is_here(yamnet, capfd):
     assert "home33 above_floor, yamnet (not here)" in inputs()
     shown = run(capfd, "models", "show", "general-embedding").stderr
     assert shown == ("hearthlog: the network yamnet is not here: hearthlog models fetch yamnet\n")
+
+
+def test_the_doctor_names_the_network_that_a_model_wants(yamnet):
+    recorded(model=Path("general-embedding"))
+    yamnet.unlink()
+    recorded(model=Path("general-embedding"), hour=1)
+    recorded(hour=2)
+    heard, unheard, plain = sorted(find_logs(Path("logs")))
+    what = "general-embedding takes what the network yamnet hears"
+    assert list(_networks([plain, heard])) == [("ok", "mic", f"{what}, which is there")]
+    ((level, _, text),) = _networks([unheard])
+    assert level == "warning"
+    assert text.startswith(f"{what}, and it is not there: labels by features alone; hearthlog m")
+    assert list(_networks([plain])) == list(_networks([])) == []
 
 
 def test_on_a_terminal_it_is_said_once_what_a_network_would_gain(tmp_path, capsys, monkeypatch):
