@@ -1,5 +1,6 @@
 """The state of the recorders of a folder now: whether they run, hear, write, and what to do."""
 
+import json
 import os
 import tempfile
 import time
@@ -8,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
+from hearthlog.models.modelfile.card import DESCRIPTION, attachment_of
 from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
 from hearthlog.recorder.rest import paused_until
 from hearthlog.schemas.errors import LogError
@@ -106,6 +109,28 @@ def _recorder(
         yield State("error", "recorder", text)
     for status in statuses:
         yield from _of_status(status)
+    yield from _networks(own)
+
+
+def _networks(logs: Sequence[Path]) -> Iterator[State]:
+    """Say which networks the models of the newest log want, and whether they hear."""
+    for log in logs[-1:]:
+        with suppress(LogError, ValueError):
+            for info in read_recorder_infos(log, "features"):
+                data = {each.name: each.data for each in info.attachments}
+                own = attachment_of(DESCRIPTION, info.microphone)
+                about = json.loads(data.get(own) or data.get(DESCRIPTION) or b"{}")
+                wanted = (about.get("embedding") or {}).get("network")
+                if not wanted:
+                    continue
+                what = f"{info.model} takes what the network {wanted} hears"
+                heard = info.embedding
+                if heard is not None and heard.network == wanted:
+                    yield State("ok", info.microphone, f"{what}, which is there")
+                    continue
+                remedy = f"hearthlog models fetch {wanted}, and restart the recorder"
+                text = f"{what}, and it is not there: labels by features alone; {remedy}"
+                yield State("warning", info.microphone, text)
 
 
 def _stopped(

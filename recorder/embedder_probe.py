@@ -19,6 +19,7 @@ import numpy as np
 from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.embedding.networks import (
     NETWORKS,
+    YAMNET,
     Embedder,
     find_network,
     load_embedder,
@@ -30,7 +31,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.text import printable
 
 NO_NETWORK = "none"  # in place of a name
-DEFAULT_NETWORK = "yamnet"
+DEFAULT_NETWORK = YAMNET.name
 _HOP_SECONDS = HOP_FRAMES * FRAME_SAMPLES / SAMPLE_RATE
 _MOST_SHARE = 0.5  # of the hop
 _MOST_MEGABYTES = 300  # of the 600 that the service may take
@@ -153,6 +154,22 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
         return None, f"{error}; {_GOES_ON}"
     except Exception as error:  # noqa: BLE001  no runtime may keep a recorder from its start
         return None, f"{path}: cannot be used ({printable(repr(error))[:200]}); {_GOES_ON}"
+
+
+def likely_network(wanted: str = "") -> str:
+    """Name the network that a recorder will listen with, if its file and runtime are there.
+
+    Whether this machine is quick enough for it, and whether the file is whole, is not tried.
+
+    Parameters
+    ----------
+    wanted : str, optional
+        As of `open_embedder`.
+    """
+    name = wanted or DEFAULT_NETWORK
+    if wanted == NO_NETWORK or not NETWORKS.has(name) or find_network(name) is None:
+        return ""
+    return "" if missing_modules(NETWORKS.get(name).suffix) else name
 
 
 @lru_cache(maxsize=4)

@@ -8,10 +8,12 @@ from functools import partial
 from threading import Event as Flag
 
 from hearthlog.models.embedding.networks import Embedder
+from hearthlog.models.starter import BY_FEATURES, NETWORK
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.embedder_probe import check_network, open_embedder
+from hearthlog.recorder.embedder_probe import NO_NETWORK, check_network, open_embedder
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.recorder.journal import say
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock, check_writable
@@ -250,12 +252,31 @@ def record(
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 
 
-def _embedder(settings: Settings, microphones: int) -> Embedder | None:
-    """Return the network of sounds, if there is one; say why it is not used."""
+def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, str]:
+    """Return the network of sounds, or why there is none; say so if one was to be had."""
     embedder, why = open_embedder(settings.embedding, microphones)
     if why:
         say(why)
-    return embedder
+        return embedder, "the network cannot be used"
+    if embedder is not None:
+        return embedder, f"it takes nothing of the network {embedder.network.name}"
+    if settings.embedding == NO_NETWORK:
+        return embedder, "no network is wanted"
+    return embedder, f"the network {NETWORK} is not there"
+
+
+def _tell_of_starters(
+    models: Mapping[str, LabellingModels], embedder: Embedder | None, why: str
+) -> None:
+    """Say which starter models label, and whether a network says with them what is heard."""
+    for name in dict.fromkeys(each.starter for each in models.values()):
+        is_heard = embedder is not None and embedder.network.name == NETWORK
+        by = f"what the network {NETWORK} hears"
+        if name in BY_FEATURES or not is_heard:
+            by = f"features alone, as {why}"
+        if name:
+            who = f"the starter model {name}, which has never heard this home"
+            say(f"the labels are by {who}: by {by}")
 
 
 def _record(  # noqa: PLR0913, PLR0917
@@ -269,8 +290,17 @@ def _record(  # noqa: PLR0913, PLR0917
     with ExitStack() as stack:
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
-        models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
-        embedder = _embedder(settings, len(sources))
+        embedder, why = _embedder(settings, len(sources))
+        network = "" if embedder is None else embedder.network.name
+        models = open_models(
+            settings,
+            list(sources),
+            reload_requests,
+            stack,
+            leaves_out=leaves_out,
+            network=network,
+        )
+        _tell_of_starters(models, embedder, why)
         session = RecordingSession(settings, sources, models, lock, state, embedder)
         manager = ServiceManager(sources)
         try:

@@ -25,6 +25,7 @@ from hearthlog.models.modelfile.registry import (
     rollback,
     target,
 )
+from hearthlog.models.starter import STARTERS
 
 
 @pytest.fixture
@@ -110,8 +111,8 @@ def test_the_list_has_every_file_and_what_is_wrong_with_it(folder):
     promote(folder, "two", "candidate")
     put_by_hand(folder, "gone.safetensors")
     found = {entry.name: entry for entry in list_models(folder)}
-    assert list(found) == ["bad", "broad", "gone", "one", "two", "general", "bathroom"]
-    assert [name for name, entry in found.items() if entry.starter] == ["general", "bathroom"]
+    assert list(found) == ["bad", "broad", "gone", "one", "two", *STARTERS]
+    assert [name for name, entry in found.items() if entry.starter] == list(STARTERS)
     assert found["gone"].aliases == ("champion",)
     assert found["two"].aliases == ("candidate",)
     assert {name for name, entry in found.items() if entry.model is None} == {"bad", "gone"}
@@ -169,7 +170,7 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
         "sha256",
         "size",
     ]
-    assert [row.split()[0] for row in rows] == ["broad", "one", "two", "general", "bathroom"]
+    assert [row.split()[0] for row in rows] == ["broad", "one", "two", *STARTERS]
     assert rows[3].split()[1] == "starter"
     assert "champion" in rows[1]
     assert load(folder, "one").sha256[:12] in rows[1]
@@ -247,7 +248,7 @@ def test_the_folder_is_that_of_the_configured_model(folder, capfd, monkeypatch, 
     monkeypatch.chdir("/")
     result = run(capfd, "models", "list")
     assert result.stderr.startswith("hearthlog: models: no such folder")
-    assert [line.split()[0] for line in result.stdout.splitlines()[1:]] == ["general", "bathroom"]
+    assert [line.split()[0] for line in result.stdout.splitlines()[1:]] == list(STARTERS)
     monkeypatch.setenv("HEARTHLOG_MODEL", str(folder / "champion.safetensors"))
     assert run(capfd, "models", "show", "two").returncode == 0
 

@@ -189,6 +189,25 @@ def _has_topic(file: LogFile, name: str) -> bool:
     return any(channel.topic == name for channel in file.channels.values())
 
 
+def embedding_source(path: Path) -> EmbeddingSource | None:
+    """Read of which network and projection the embeddings of a log are; None if it has none.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    LogError
+        If it is damaged.
+    """
+    with LogFile(path) as file:
+        if not file.channels:
+            read_chunks(file, file.chunks[:1], topics=())  # as above
+        names = (_embedding(file, name) for name in sorted(microphones_of(file, "features")))
+        return next(filter(None, names), None)
+
+
 def attachments_of(file: LogFile) -> list[Attachment]:
     """Read the attachments of a log, in the order of its index.
 

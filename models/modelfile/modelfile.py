@@ -29,7 +29,14 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.starter import SHA256, STARTERS, starter_file
+from hearthlog.models.starter import (
+    BY_FEATURES,
+    NETWORK,
+    SHA256,
+    STARTERS,
+    starter_file,
+    with_network,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
 from hearthlog.schemas.storage.sealed_file import damage, read_sealed, write_sealed
@@ -148,6 +155,21 @@ def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> 
     return Model(description, arrays, **common, name=path.stem, sha256=digest)
 
 
+def starter_for(path: Path, network: str) -> Path:
+    """Return the starter model that a name means where a network is, or is not.
+
+    Parameters
+    ----------
+    path : Path
+        Any model; `general` and `bathroom` mean those that take embeddings, if they are of this
+        network, and there is no file of this name.
+    network : str
+        Whose embeddings there are; empty for none.
+    """
+    named = str(path) in BY_FEATURES and not os.path.lexists(path)
+    return Path(with_network(str(path))) if named and network == NETWORK else path
+
+
 def name_and_digest(path: Path) -> tuple[str, str]:
     """Return what tells a model from others, `Model.name` and `Model.sha256`, without loading it.
 
@@ -172,7 +194,8 @@ def _read(path: Path) -> tuple[Path, bytes]:
         raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
     if path.suffix != SUFFIX and not os.path.lexists(path):
         raise ModelError(
-            f"{path}: there is no such model file; the starter models are {' and '.join(STARTERS)}"
+            f"{path}: there is no such model file; the starter models are "
+            f"{' and '.join(BY_FEATURES)}"
         )
     return path, read_whole(path, "model file", _SIZE_LIMIT, ModelError)
 

@@ -18,7 +18,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
-from hearthlog.models.starter import GENERAL, STARTERS, starter_file
+from hearthlog.models.starter import GENERAL, STARTERS, starter_file, with_network
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import (
     locked_folder,
@@ -204,8 +204,8 @@ def first_starter(folder: Path) -> str | None:
     -------
     str or None
         The one that the champion was adapted from, over models of the folder that are still there;
-        else `general`, with which a recorder begins; None if that is the champion, or is of another
-        feature set.
+        else `general`, with which a recorder begins, or that which takes embeddings, as the
+        champion does; None if that is the champion, or is of another feature set.
     """
     try:
         champion = model = load(folder, CHAMPION)
@@ -222,9 +222,10 @@ def first_starter(folder: Path) -> str | None:
             break
         with suppress(ModelError):
             model = load_model(path)
-    general = load_model(starter_file(GENERAL))
+    name = GENERAL if champion.description.embedding is None else with_network(GENERAL)
+    general = load_model(starter_file(name))
     alike = champion.description.feature_set == general.description.feature_set
-    return GENERAL if alike and champion.sha256 != general.sha256 else None
+    return name if alike and champion.sha256 != general.sha256 else None
 
 
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:

@@ -2,10 +2,27 @@
 
 from pathlib import Path
 
-GENERAL, BATHROOM = STARTERS = ("general", "bathroom")
+GENERAL, BATHROOM = BY_FEATURES = ("general", "bathroom")
+NETWORK = "yamnet"  # whose embeddings the others take
+
+
+def with_network(name: str) -> str:
+    """Name the starter model that takes embeddings, of one that goes by features alone.
+
+    Parameters
+    ----------
+    name : str
+        One of `BY_FEATURES`.
+    """
+    return f"{name}-embedding"
+
+
+STARTERS = (*BY_FEATURES, *map(with_network, BY_FEATURES))
 SHA256 = {  # of their files, as `sha256sum` prints it
     GENERAL: "d5f6f6cb0736ba4ab933943ebbef25d1d53f99de02f49ffa509d621747f2587f",
     BATHROOM: "0344b38fa1cf06a446ee491bbad6fe8b6dd73ec89296849baf7e7adae6cb6d75",
+    with_network(GENERAL): "26a194302803451906be77cf506144032cba3bdd14e3bae4bf75dd5ceb506f4d",
+    with_network(BATHROOM): "6ebdfd0e48a60026365ec34b22dbbe1b2ca746518c6194c68bd2107fe81723c8",
 }
 
 

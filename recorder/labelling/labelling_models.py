@@ -85,6 +85,11 @@ class LabellingModels:
         return self.in_use[LIVE].model if LIVE in self.in_use else None
 
     @property
+    def starter(self) -> str:
+        """Name of the starter model that labels from the start on; empty for another one."""
+        return self._watches[LIVE].starter if LIVE in self._watches else ""
+
+    @property
     def classifier(self) -> Classifier | None:
         """Of that model."""
         return self.in_use[LIVE].classifier if LIVE in self.in_use else None

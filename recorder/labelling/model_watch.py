@@ -20,9 +20,9 @@ from hearthlog.models.modelfile.judgement import (
     judgements_of,
     read_judgement,
 )
-from hearthlog.models.modelfile.modelfile import load_model, name_and_digest
+from hearthlog.models.modelfile.modelfile import load_model, name_and_digest, starter_for
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL, is_starter
-from hearthlog.models.starter import GENERAL
+from hearthlog.models.starter import GENERAL, STARTERS
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.memory import give_back
 
@@ -75,11 +75,15 @@ class ModelWatch:
         event, a queue can be used from a signal handler at any moment.
     scenario : str, optional
         Name of the one whose model it is; by default it is the one that labels the home.
+    network : str, optional
+        Whose embeddings there are; the names of starter models mean those that take them.
 
     Attributes
     ----------
     first : Loaded
         The model at the start.
+    starter : str
+        Name of the starter model at the start; empty if it is a file.
     ready : Loaded or None
         The last model that replaced it; to be set to None by who uses it.
     held : Loaded or None
@@ -91,14 +95,18 @@ class ModelWatch:
         If the model at the start cannot be used.
     """
 
-    def __init__(self, path: Path, requests: SimpleQueue[None], scenario: str = "") -> None:
-        self._path = path
+    def __init__(
+        self, path: Path, requests: SimpleQueue[None], scenario: str = "", network: str = ""
+    ) -> None:
+        self._path = path = starter_for(path, network)
         self._requests = requests
         self._scenario = scenario
         self._seen = file_identity(path)  # before it is loaded: a later file is another one
         is_default = path == DEFAULT_MODEL and not scenario
         self._starts_with_starter = is_default and self._seen is None
-        self.first = self._load_first()
+        begins = starter_for(Path(GENERAL), network) if self._starts_with_starter else path
+        self.starter = str(begins) if str(begins) in STARTERS and self._seen is None else ""
+        self.first = self._load_first(begins)
         self.ready: Loaded | None = None
         self.held: Loaded | None = None
         self._awaited: Path | None = None  # the judgement that the model in the file lacks
@@ -110,9 +118,8 @@ class ModelWatch:
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
         self._thread.start()
 
-    def _load_first(self) -> Loaded:
+    def _load_first(self, path: Path) -> Loaded:
         """Load it; one of which a bit has changed labels all the same, rather than none."""
-        path = Path(GENERAL) if self._starts_with_starter else self._path
         damaged: list[str] = []
         try:
             loaded = load_checked(path, damaged.append)

@@ -13,13 +13,14 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
 
 
-def open_models(
+def open_models(  # noqa: PLR0913
     settings: Settings,
     microphones: Sequence[str],
     reload_requests: ReloadRequests | None,
     stack: ExitStack,
     *,
     leaves_out: bool = False,
+    network: str = "",
 ) -> dict[str, LabellingModels]:
     """Load the models of microphones, and watch their files; once for those that have the same.
 
@@ -34,6 +35,8 @@ def open_models(
         Closes what watches the files.
     leaves_out : bool
         Whether scenarios that cannot label are left out; else they are an error.
+    network : str, optional
+        Whose embeddings there are; the names of starter models mean those that take them.
 
     Returns
     -------
@@ -56,18 +59,19 @@ def open_models(
     for name in microphones:
         same = next((other for other in models if chosen[other] == chosen[name]), None)
         models[name] = (
-            _watched_models(*chosen[name], reload_requests, stack, leaves_out=leaves_out)
+            _watched_models(*chosen[name], reload_requests, stack, network, leaves_out=leaves_out)
             if same is None
             else models[same]
         )
     return models
 
 
-def _watched_models(
+def _watched_models(  # noqa: PLR0913
     path: Path,
     scenarios: Mapping[str, Path],
     reload_requests: ReloadRequests,
     stack: ExitStack,
+    network: str,
     *,
     leaves_out: bool,
 ) -> LabellingModels:
@@ -75,7 +79,7 @@ def _watched_models(
     left_out: list[str] | None = [] if leaves_out else None
     for name, file in scenarios.items():
         try:
-            watch = ModelWatch(file, reload_requests.queue(), name)
+            watch = ModelWatch(file, reload_requests.queue(), name, network)
             watches[name] = stack.enter_context(closing(watch))
         except ModelError as error:
             if left_out is None:
@@ -83,7 +87,8 @@ def _watched_models(
             left_out.append(str(error))
     if path == NO_MODEL:
         return LabellingModels(scenarios=watches, left_out=left_out)
-    watch = stack.enter_context(closing(ModelWatch(path, reload_requests.queue())))
+    watch = ModelWatch(path, reload_requests.queue(), network=network)
+    stack.enter_context(closing(watch))
     is_file = path.suffix == SUFFIX  # else the name of a starter
     folder = path.parent if is_file else DEFAULT_FOLDER
     candidates = CandidateWatch(folder, watch.first.classifier.feature_set)

@@ -43,22 +43,23 @@ def demo(
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.errors import HearthlogError
     from hearthlog.tools.cli.info import info
-    from hearthlog.tools.cli.options import parse_time
+    from hearthlog.tools.cli.options import parse_time, starter_here
     from hearthlog.tools.home.simulate import write_day
 
     if look and not has_display():
         raise HearthlogError("there is no display here: leave --open out, and look elsewhere")
     if output.exists():
         raise HearthlogError(f"{output}: exists already; delete it or choose another --output")
-    model = load_model(Path(GENERAL))
+    starter = starter_here(Path(GENERAL))
+    model = load_model(starter)
     day, logs, timeline = output / "day.flac", output / "logs", output / "day.rrd"
 
     _say(f"1. Composing a day of a home, {minutes:g} minutes long")
     truth = write_day(day, minutes, seed=_SEED)
     print(_composed_of(truth))
 
-    _say(f"2. hearthlog record {day} --model {GENERAL} --output {logs} --start {_START}")
-    settings = load_settings(None, {"output": logs, "model": Path(GENERAL)}, {})
+    _say(f"2. hearthlog record {day} --model {starter} --output {logs} --start {_START}")
+    settings = load_settings(None, {"output": logs, "model": starter}, {})
     start = parse_time(_START, "--start")
     began = time.perf_counter()
     record_files(settings, FileSource([day], start), Flag())

@@ -25,6 +25,7 @@ from hearthlog.tools.cli.options import (
     check_output,
     chosen_method,
     labelled_clips,
+    starter_here,
 )
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
@@ -166,7 +167,7 @@ def evaluate_model(
     from hearthlog.models.modelfile.modelfile import load_model
 
     check_output("--plot", plot, ".png", "a picture")
-    loaded = load_model(model)
+    loaded = load_model(starter_here(model))
     seconds = feature_set(loaded.description.feature_set).window_seconds
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     evaluation.check_classes(loaded, classes)

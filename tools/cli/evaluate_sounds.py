@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output, labelled_clips
+from hearthlog.tools.cli.options import (
+    Clips,
+    Json,
+    OwnScenario,
+    Plot,
+    check_output,
+    labelled_clips,
+    starter_here,
+)
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import (
     print_coughs,
@@ -173,7 +181,7 @@ def _read(
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.modelfile.modelfile import load_model
 
-    loaded = load_model(model)
+    loaded = load_model(starter_here(model))
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     left_out: list[LeftOut] = []
     return loaded, labelled_clips([data], classes.labels, left_out), classes, left_out

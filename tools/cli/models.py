@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import typer
 
 from hearthlog.tools.cli.fetch import fetch
-from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, labelled_clips, models_folder
+from hearthlog.tools.cli.options import (
+    CLIPS,
+    Json,
+    OwnScenario,
+    labelled_clips,
+    models_folder,
+    starter_here,
+)
 from hearthlog.tools.cli.scores import share
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong_use
@@ -79,6 +86,8 @@ def show(
         print(json.dumps(result, indent=2))
     else:
         print_lines(model_card(model).splitlines())
+    if (network := _network(model)) and not _is_here(network):
+        tell(f"the network {network} is not here: hearthlog models fetch {network}")
 
 
 @models.command()
@@ -178,6 +187,7 @@ def promote(
     from hearthlog.models.modelfile.registry import promote as promote_model
 
     place = models_folder(folder)
+    name = _starter_here(place, name)
     if to == "champion":
         _check_harmless(place, name, logs or [_logs_folder()], anyway=anyway)
     else:
@@ -204,10 +214,13 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.judgement import insist
     from hearthlog.models.modelfile.registry import first_starter, is_starter, load
+    from hearthlog.models.starter import BY_FEATURES, with_network
     from hearthlog.tools.cli.progress import share_done
 
-    model = load(folder, name)
-    is_first = is_starter(model.name, model.sha256) and model.name == first_starter(folder)
+    model, first = load(folder, name), first_starter(folder)
+    pairs = ((one, with_network(one)) for one in BY_FEATURES)
+    firsts = next((pair for pair in pairs if first in pair), ())
+    is_first = is_starter(model.name, model.sha256) and model.name in firsts
     if anyway or is_first:
         insist(folder, model.sha256)
         return
@@ -220,6 +233,24 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
         judgement = verdict.judgement
     if not judgement.may_label:
         raise ModelError(refusal(judgement, model.name))
+
+
+def _starter_here(folder: Path, name: str) -> str:
+    """Return the starter that a name means here, unless another model of the folder has the name.
+
+    One that was promoted before there was a network lies in the folder, too.
+    """
+    from hearthlog.models.errors import ModelError
+    from hearthlog.models.modelfile.registry import is_starter, load
+
+    other = str(starter_here(Path(name)))
+    if other == name:
+        return name
+    try:
+        model = load(folder, name)
+    except ModelError:
+        return name
+    return other if is_starter(model.name, model.sha256) else name
 
 
 def _check_beside_champion(folder: Path, name: str) -> None:
@@ -383,18 +414,32 @@ def _verdict(comparison: "Comparison") -> str:
     return f"{better.name} is better than {worse.name}: {change}"
 
 
+def _network(model: "Model") -> str:
+    """Name the network whose embeddings a model takes; empty for none."""
+    mix = model.description.embedding
+    return "" if mix is None else mix.network
+
+
+def _is_here(network: str) -> bool:
+    from hearthlog.recorder.embedder_probe import likely_network
+
+    return likely_network(network) == network
+
+
 def _row(entry: "ModelEntry") -> tuple[str, ...]:
     alias = ", ".join((*entry.aliases, *["starter"] * entry.starter))
     size = f"{entry.size / 1e6:.2f} MB"
     if entry.model is None:
         return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
     description = entry.model.description
-    directions = ", directions" if description.direction_microphones else ""
+    more = ", directions" if description.direction_microphones else ""
+    if network := _network(entry.model):
+        more += f", {network}" if _is_here(network) else f", {network} (not here)"
     return (
         entry.name,
         alias,
         f"{description.scenario_name} ({len(description.classes)})",
-        f"{description.feature_set} {description.inputs}{directions}",
+        f"{description.feature_set} {description.inputs}{more}",
         f"{description.metrics.macro_f1:.3f}{' simulated' * description.training_data.simulated}",
         f"{description.metrics.expected_calibration_error:.3f}",
         entry.model.sha256[:12],
@@ -411,13 +456,15 @@ def _as_json(entry: "ModelEntry") -> dict[str, object]:
         "problem": entry.problem or None,
     }
     if entry.model is not None:
-        description = entry.model.description
+        description, network = entry.model.description, _network(entry.model)
         result |= {
             "sha256": entry.model.sha256,
             "scenario": description.scenario_name,
             "classes": description.classes,
             "feature_set": description.feature_set,
             "inputs": description.inputs,
+            "network": network or None,
+            "network_is_here": _is_here(network) if network else None,
             "direction_microphones": description.direction_microphones,
             "simulated": description.training_data.simulated,
             "macro_f1": description.metrics.macro_f1,

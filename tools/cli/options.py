@@ -1,6 +1,7 @@
 """Options and arguments that several verbs have, and how they are read."""
 
 import getpass
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,7 @@ import typer
 from hearthlog.tools.cli.text import wrong_use
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
     from hearthlog.analyzer.training.method import Method
@@ -186,6 +187,41 @@ def models_folder(given: Path | None = None) -> Path:
         return DEFAULT_FOLDER
     assert configured is not None
     return configured.parent
+
+
+def starter_here(model: Path) -> Path:
+    """Return the model that a name means here: of a starter, that for the network that is there."""
+    from hearthlog.models.modelfile.modelfile import starter_for
+    from hearthlog.recorder.config import load_settings
+    from hearthlog.recorder.embedder_probe import likely_network
+
+    return starter_for(model, likely_network(load_settings(None, {}, {}).embedding))
+
+
+def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
+    """Return the model that a name means for logs: of a starter, that which takes what one has.
+
+    It is one for all, so that what is labelled has one name: without embeddings it is about as
+    right as the other starter.
+    """
+    from hearthlog.analyzer.logs.recorder_info import embedding_source
+    from hearthlog.models.classifiers.classifier import Classifier
+    from hearthlog.models.modelfile.modelfile import load_model, starter_for
+    from hearthlog.models.starter import NETWORK
+    from hearthlog.schemas.errors import LogError
+    from hearthlog.schemas.logs.files import find_logs
+
+    other = starter_for(model, NETWORK)
+    if other == model:
+        return model
+    classifier = Classifier(load_model(other))
+    for path in logs:
+        with suppress(LogError):  # which is told where they are read
+            for log in reversed(find_logs(path)):
+                with suppress(LogError):
+                    if classifier.takes_embeddings(embedding_source(log)):
+                        return other
+    return model
 
 
 def check_output(option: str, path: Path | None, suffix: str, what: str) -> None:

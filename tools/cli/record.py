@@ -153,6 +153,8 @@ def record(
     settings = with_model(configured)
     for line in exposed_passwords(settings, config):
         tell(line)
+    if sys.stderr.isatty():
+        _tell_of_network(settings)
     os.umask(_HIDDEN[settings.readable_by])
     losses: list[str] = []
     stop = Flag()
@@ -210,17 +212,33 @@ def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
 
 
 def with_model(settings: "Settings") -> "Settings":
-    """Choose the model where none is configured, and say so where it has not heard the home."""
+    """Choose the model where none is configured."""
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
-    from hearthlog.models.starter import GENERAL, STARTERS, starter_file
 
     model = DEFAULT_MODEL if settings.model is None else settings.model
-    starter = GENERAL if model == DEFAULT_MODEL and not model.exists() else str(model)
-    if starter == GENERAL and model.is_symlink():
+    if model == DEFAULT_MODEL and model.is_symlink() and not model.exists():
         tell(f"{model}: the model that it points to is gone; promote another one")
-    if starter in STARTERS and not Path(starter).exists() and starter_file(starter).exists():
-        tell(f"the labels are by the starter model {starter}, which has never heard this home")
     return settings.model_copy(update={"model": model})
+
+
+def _tell_of_network(settings: "Settings") -> None:
+    """Say what a network would gain, and how to get it, where nobody has decided on one."""
+    from hearthlog.analyzer.extras import remedy
+    from hearthlog.models.embedding.networks import YAMNET, find_network
+    from hearthlog.models.embedding.runtimes import missing_modules
+    from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+    from hearthlog.models.starter import BY_FEATURES
+
+    model = settings.model or DEFAULT_MODEL
+    by_starter = str(model) in BY_FEATURES or model == DEFAULT_MODEL
+    if settings.embedding or not by_starter or model.exists() or find_network(YAMNET.name):
+        return
+    absent = missing_modules(YAMNET.suffix)
+    tell(
+        "labels are truer in a home that nobody has heard with a network that has heard two "
+        f"million clips: hearthlog models fetch {YAMNET.name} (4 MB, once)"
+        + (f"; it wants LiteRT, too; {remedy(*absent)}" if absent else "")
+    )
 
 
 def _say(recording: "RecordingSummary", losses: list[str]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.schemas.text import listed
-from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location
+from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location, starter_of
 from hearthlog.tools.cli.text import first_of, number, tell
 
 if TYPE_CHECKING:
@@ -44,13 +44,14 @@ def relabel(
     from hearthlog.analyzer.workers import open_workers
     from hearthlog.tools.cli.progress import share_done
 
-    where = model.resolve() if model.exists() else model  # the name of a starter model
     count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler, _TASKS) as pool:
         # Here, since it takes as long as the workers take to be ready.
         from hearthlog.analyzer.relabel.run import relabel as run
         from hearthlog.models.modelfile.modelfile import load_model
 
+        model = starter_of(model, logs)
+        where = model.resolve() if model.exists() else model  # the name of a starter model
         loaded = load_model(model)
         with share_done("labelling logs", announce=True) as report:
             result = run(logs, loaded, where, pool, report)

@@ -18,6 +18,7 @@ from hearthlog.tools.cli.options import (
     chosen_method,
     labelled_clips,
     models_folder,
+    starter_of,
 )
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
@@ -102,7 +103,8 @@ def train(
             "--scheduler, --cost and --gamma go with --data"
         )
     else:
-        base = base or _model_of(home, check_scenario_name(scenario) if scenario else "")
+        named = check_scenario_name(scenario) if scenario else ""
+        base = _model_of(home, named) if base is None else starter_of(base, home)
     if output is not None:
         check_output(output)
     if not data and not speakers:
