@@ -44,7 +44,7 @@ def relabel(
     from hearthlog.analyzer.workers import open_workers
     from hearthlog.tools.cli.progress import share_done
 
-    where = model.resolve() if model.exists() else model  # the name of a starter model
+    where = model.resolve() if model.is_file() else model  # else the name of a starter
     count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler, _TASKS) as pool:
         # Here, since it takes as long as the workers take to be ready.
