@@ -180,6 +180,20 @@ def check_network(wanted: str, microphones: int = 1) -> None:
         check_pace(path, probe_network(wanted, path), microphones)
 
 
+def is_there(wanted: str) -> bool:
+    """Tell whether there is a file of the network that a recorder listens with.
+
+    Parameters
+    ----------
+    wanted : str
+        As of `open_embedder`.
+    """
+    try:
+        return wanted != NO_NETWORK and find_network(wanted or DEFAULT_NETWORK) is not None
+    except ModelError:
+        return False
+
+
 def network_path(name: str) -> Path:
     """Return the file of a network.
 

@@ -9,7 +9,7 @@ from threading import Event as Flag
 
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.embedder_probe import check_network, open_embedder
+from hearthlog.recorder.embedder_probe import check_network, is_there, open_embedder
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
@@ -178,14 +178,19 @@ def recording_problems(settings: Settings) -> list[HearthlogError]:
         for name in sources:
             check(partial(open_models, settings, [name], None, stack))
         if not problems:
-            check(
-                lambda: RecordingSession(
-                    settings, sources, open_models(settings, list(sources), None, stack)
-                )
-            )
+            check(lambda: _check_session(settings, sources, stack))
     check(partial(check_network, settings.embedding, len(settings.microphone)))
     check(partial(check_writable, settings.output))
     return list(problems.values())
+
+
+def _check_session(
+    settings: Settings, sources: Mapping[str, SoundSource], stack: ExitStack
+) -> None:
+    models = open_models(settings, list(sources), None, stack)
+    session = RecordingSession(settings, sources, models)
+    if not is_there(settings.embedding):  # a network that is will give what models take
+        session.say_lacking_embeddings()
 
 
 @dataclass
@@ -272,6 +277,7 @@ def _record(  # noqa: PLR0913, PLR0917
         models = open_models(settings, list(sources), reload_requests, stack, leaves_out=leaves_out)
         embedder = _embedder(settings, len(sources))
         session = RecordingSession(settings, sources, models, lock, state, embedder)
+        session.say_lacking_embeddings()
         manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):
