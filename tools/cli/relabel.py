@@ -23,7 +23,7 @@ def relabel(
     model: Annotated[
         Path,
         typer.Option(
-            help="Model file, where workers find it too, or general or bathroom.",
+            help="Model file, where workers find it too, or general, bathroom or audioset.",
             parser=log_location,
         ),
     ],
