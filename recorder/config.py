@@ -164,7 +164,7 @@ class Settings(BaseModel):
         default={},
         examples=_SCENARIOS,
         description="Models that label beside it, by the name of what for: as "
-        '{speakers = "models/speakers.safetensors"}.',
+        '{speakers = "models/speakers.safetensors"}; audioset: the names of the network.',
     )
     feature_set: str = Field(
         default="", examples=["home33"], description="Empty: that of the model, or the default one."

@@ -10,7 +10,12 @@ from threading import Event as Flag
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.starter import BY_FEATURES, NETWORK
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.embedder_probe import NO_NETWORK, check_network, open_embedder
+from hearthlog.recorder.embedder_probe import (
+    NO_NETWORK,
+    check_network,
+    likely_network,
+    open_embedder,
+)
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
@@ -180,14 +185,19 @@ def recording_problems(settings: Settings) -> list[HearthlogError]:
         for name in sources:
             check(partial(open_models, settings, [name], None, stack))
         if not problems:
-            check(
-                lambda: RecordingSession(
-                    settings, sources, open_models(settings, list(sources), None, stack)
-                )
-            )
+            check(lambda: _check_session(settings, sources, stack))
     check(partial(check_network, settings.embedding, len(settings.microphone)))
     check(partial(check_writable, settings.output))
     return list(problems.values())
+
+
+def _check_session(
+    settings: Settings, sources: Mapping[str, SoundSource], stack: ExitStack
+) -> None:
+    models = open_models(settings, list(sources), None, stack)
+    session = RecordingSession(settings, sources, models)
+    if not likely_network(settings.embedding):  # a network that is will give what models take
+        session.say_lacking_embeddings()
 
 
 @dataclass
@@ -302,6 +312,7 @@ def _record(  # noqa: PLR0913, PLR0917
         )
         _tell_of_starters(models, embedder, why)
         session = RecordingSession(settings, sources, models, lock, state, embedder)
+        session.say_lacking_embeddings()
         manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):

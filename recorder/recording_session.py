@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.models.modelfile.audioset import is_by_names
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk.keeper import DiskKeeper
@@ -129,10 +130,6 @@ class RecordingSession:
             name: MicrophoneStream(settings, name, source, models[name], embedder)
             for name, source in sources.items()
         }
-        for name, stream in self._streams.items():
-            model, classifier = models[name].model, models[name].classifier
-            if classifier and model and (why := stream.pipeline.lacking_embeddings(classifier)):
-                say(f"{name}: model {model.name}: {why}")
         is_live = not any(isinstance(source, FileSource) for source in sources.values())
         is_read_ahead = any(
             isinstance(source, FileSource) and not source.realtime for source in sources.values()
@@ -155,6 +152,14 @@ class RecordingSession:
         self._journal = HealthJournal()
         self._now = 0  # time of the last event
         self.summary = RecordingSummary(self._log.finished)
+
+    def say_lacking_embeddings(self) -> None:
+        """Say which models do not get the embeddings that they take."""
+        for name, stream in self._streams.items():
+            for labelling, (model, classifier) in stream.models.in_use.items():
+                of_it = labelling == LIVE or is_by_names(model)
+                if of_it and (why := stream.pipeline.lacking_embeddings(classifier)):
+                    say(f"{name}: model {model.name}: {why}")
 
     def add(self, microphone: str, event: Event) -> None:
         """Record one event of a source.

@@ -15,6 +15,7 @@ from hearthlog.analyzer.doctor.topic_types import (
     LABEL,
     SEGMENT,
 )
+from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
 from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -26,7 +27,7 @@ STAMP = "header.stamp"
 _SUM_TOLERANCE = 1e-4
 _LATE = {  # ns, with what stamps may be off
     LABEL: 1_010_000_000,
-    BESIDE_LABEL: 1_010_000_000,
+    BESIDE_LABEL: MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000,
     SEGMENT: 75_000_000_000,
     DIRECTION: 400_000_000,
     EMBEDDING: 1_010_000_000,

@@ -3,7 +3,8 @@
 from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import Floors, FloorTracker
-from hearthlog.models.labels.labeller import FrameLabels, Labeller
+from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -49,7 +50,7 @@ class StreamLabeller:
         self.segments: list[Segment] = []
         self.floor_converged = from_start or not classifier.timing.needs_floor
         self._label_from = label_from
-        self._labeller = Labeller(classifier, microphone, embedding)
+        self._labeller = labeller_of(classifier, microphone, embedding)
         self._powers = classifier.feature_set.band_powers
         self._floor = None if self._powers is None else FloorTracker()
         self._next: int | None = None  # number of the next frame

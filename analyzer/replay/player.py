@@ -14,8 +14,9 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
+from hearthlog.models.modelfile.audioset import is_by_names, without_classes
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.labelling.clashes import clash
+from hearthlog.recorder.labelling.clashes import clash, shared_classes
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -176,7 +177,8 @@ class Player:
         classifier = None if model is None else Classifier(model)
         clips = self._options.kind != "features"  # which do not say how often
         every = LOGGED_EVERY if clips else configuration.statistics_every
-        beside = self._scenarios(info, features, model)
+        self._beside = self._scenarios(info, features, model)
+        beside = {scenario_labelling(name): Classifier(one) for name, one in self._beside.items()}
         self._pipeline = Pipeline(
             info.microphone, features, classifier, every, beside, embedding=info.embedding
         )
@@ -187,7 +189,7 @@ class Player:
                 configuration.flush_seconds,
                 configuration.sync_seconds,
             )
-        self._sha256 = None if model is None else model.sha256
+        self._sha256 = _digest(model)
         self._info = info
         self._next, self._end, self._after_gap = 0, None, False
 
@@ -201,29 +203,32 @@ class Player:
 
     def _scenarios(
         self, info: RecorderInfo, features: FeatureSet, live: Model | None
-    ) -> dict[str, Classifier]:
-        """Return what labels beside the model, by labelling."""
+    ) -> dict[str, Model]:
+        """Return what labels beside the model, by the name of the scenario.
+
+        A class of two models is refused, as the recorder does; names leave it to the other.
+        """
+        known = {} if live is None else {LIVE: live}
         beside = {}
         for name, model in self._options.scenarios.items():
-            classifier = Classifier(model)
-            if classifier.feature_set != features:
-                theirs = classifier.feature_set.name
+            if is_by_names(model):
+                continue
+            theirs = model.description.feature_set
+            if theirs != features.name:
                 raise LogError(
                     f"{info.path}: is replayed with feature set {features.name}; model "
                     f"{model.name} of scenario {name} is for {theirs}: {models_for(features.name)}"
                 )
-            beside[scenario_labelling(name)] = classifier
-        self._check_clashes(info, live)
-        return beside
-
-    def _check_clashes(self, info: RecorderInfo, live: Model | None) -> None:
-        """Refuse a class of two models, as the recorder does."""
-        known = {} if live is None else {LIVE: live}
-        for name, model in self._options.scenarios.items():
             if reason := clash(model, known):
                 where = f"model {model.name} of scenario {name}"
                 raise LogError(f"{info.path}: cannot be replayed so: {where} {reason}")
-            known[scenario_labelling(name)] = model
+            known[scenario_labelling(name)] = beside[name] = model
+        for name, model in self._options.scenarios.items():
+            if is_by_names(model):
+                own = without_classes(model, shared_classes(model, known.values()), features)
+                if len(own.classes) > 1:
+                    beside[name] = own
+        return {name: beside[name] for name in self._options.scenarios if name in beside}
 
     def _goes_on(self, info: RecorderInfo) -> bool:
         """Tell whether a log is of the same run of a recorder, but of another model."""
@@ -239,14 +244,24 @@ class Player:
         """Change the model where the recorder did, if it is another one here too."""
         self._info = info
         model = self._options.model(info)
-        sha256 = None if model is None else model.sha256
+        sha256 = _digest(model)
         if sha256 == self._sha256:
             return
         assert info.first_frame is not None
-        self._features(info, model)
-        self._check_clashes(info, model)
+        before = self._beside
+        self._beside = self._scenarios(info, self._features(info, model), model)
         classifier = None if model is None else Classifier(model)
         closing, opening = self._pipeline.change_model(model, classifier, *info.first_frame)
+        for name in self._options.scenarios:  # names may have to leave other classes out now
+            own = self._beside.get(name)
+            if _digest(own) != _digest(before.get(name)):
+                last, first = self._pipeline.change_model(
+                    own,
+                    None if own is None else Classifier(own),
+                    *info.first_frame,
+                    scenario_labelling(name),
+                )
+                closing, opening = [*closing, *last], [*opening, *first]
         self._write(closing)
         if self._log is not None:
             self._log.begin_anew(self._describe(info, model), [])
@@ -258,8 +273,7 @@ class Player:
         kind = "clips" if self._options.kind == "audio" else self._options.kind
         replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
         features = self._pipeline.feature_set
-        scenarios = self._options.scenarios
-        return describe(info, features, model, scenarios, self._options.output, replayed)
+        return describe(info, features, model, self._beside, self._options.output, replayed)
 
     def _join(self, event: Features) -> None:
         """Begin anew or add a gap where frames do not follow the last ones, as the recorder did."""
@@ -302,7 +316,7 @@ class Player:
             self._write(messages)
             if end > self._start:
                 self._progress(end)
-        if self._sha256 is None and not self._options.scenarios:
+        if self._sha256 is None and not self._beside:
             self.converged |= len(event.stamps) >= self._pipeline.feature_set.window_frames
         return True
 
@@ -363,6 +377,10 @@ def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool
         return True
     same = _without(info, *_BESIDE) == _without(last, *_BESIDE)
     return not same or info.model_sha256 != last.model_sha256
+
+
+def _digest(model: Model | None) -> str | None:
+    return None if model is None else model.sha256
 
 
 def _without(info: RecorderInfo, *models: str) -> dict[str, str]:

@@ -6,6 +6,7 @@ from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.names import BY_NAMES, NamesParameters, names_parameters
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32, Float64
@@ -43,6 +44,8 @@ class Classifier:
         Whether probabilities hold in homes of which nothing was learned.
     embedding_heads : EmbeddingHeads or None
         Of a model that takes the embeddings of a network.
+    names : NamesParameters or None
+        Of a model that labels by the names of a network alone.
 
     Raises
     ------
@@ -73,6 +76,8 @@ class Classifier:
         if self._mix is not None:
             heads = model.embedding_weights, model.embedding_bias
             self.embedding_heads = EmbeddingHeads(self._mix, *heads, self.classes)
+        by_names = description.kind == BY_NAMES
+        self.names: NamesParameters | None = names_parameters(model) if by_names else None
 
     def direction_weights(self, microphone: str) -> Float64 | None:
         """Return what the directions of an array say, as `DirectionEvidence` takes it.
@@ -91,8 +96,11 @@ class Classifier:
 
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
         """Return whether the model was learned on embeddings of the same network and projection."""
-        mix = self._mix
-        return source is not None and mix is not None and source.space == mix.space
+        if source is None:
+            return False
+        if self.names is not None:
+            return source.space[:2] == (self.names.network, self.names.projection_sha256)
+        return self._mix is not None and source.space == self._mix.space
 
     def lacking_embeddings(self, source: EmbeddingSource | None) -> str:
         """Say which embeddings the model was learned on and does not get; empty if it gets them.
@@ -102,16 +110,20 @@ class Classifier:
         source : EmbeddingSource or None
             Of the embeddings that there are.
         """
-        if self._mix is None or self.takes_embeddings(source):
+        taken = self._mix or self.names
+        if taken is None or self.takes_embeddings(source):
             return ""
         theirs = "there are none"
         if source is not None:
             theirs = f"these are of {source.network} with another projection"
-            if source.network != self._mix.network:
+            if source.network != taken.network:
                 theirs = f"these are of {source.network}"
+        so = "labels by features alone, which are less true"
+        if self.names is not None:
+            so = "it labels nothing"
         return (
-            f"it takes embeddings of {self._mix.network}, and {theirs}: labels by features alone, "
-            f"which are less true (hearthlog models fetch {self._mix.network})"
+            f"it takes embeddings of {taken.network}, and {theirs}: {so} "
+            f"(hearthlog models fetch {taken.network})"
         )
 
     def mix(

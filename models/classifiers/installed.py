@@ -2,6 +2,7 @@
 
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.layers import LAYERS
+from hearthlog.models.classifiers.names import NAMES
 from hearthlog.models.classifiers.neighbours import NEIGHBOURS
 from hearthlog.models.classifiers.one_class import ONE_CLASS
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
@@ -12,7 +13,7 @@ CLASSIFIERS = Extensions(
     "hearthlog.classifiers",
     ClassifierKind,  # type: ignore[type-abstract]
     "classifier kind",
-    [SVM_RBF, LAYERS, NEIGHBOURS, ONE_CLASS, TREES],
+    [SVM_RBF, LAYERS, NAMES, NEIGHBOURS, ONE_CLASS, TREES],
 )
 
 

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from hearthlog.models.classifiers.description import Description
+from hearthlog.models.classifiers.names import BY_NAMES, NamesParameters
 from hearthlog.models.embedding.embeddings import DELAY_FRAMES
 from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import feature_set
@@ -58,6 +59,9 @@ def label_timing(description: Description) -> LabelTiming:
     ModelError
         If its feature set is not installed.
     """
+    if description.kind == BY_NAMES:  # of each frame, by the windows around it
+        parameters = NamesParameters.model_validate(description.parameters)
+        return LabelTiming(1, 0, needs_floor=False, ahead=parameters.ahead)
     inputs = feature_set(description.feature_set).inputs[description.inputs]
     needs_floor = description.gate > 0.0 or inputs.needs_floor
     timing = LabelTiming(inputs.window_frames, description.label_frame, needs_floor)

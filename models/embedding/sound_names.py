@@ -19,7 +19,7 @@ from hearthlog.models.embedding.projection import Projection
 from hearthlog.schemas.arrays import Float64
 
 _FILE = Path(__file__).with_name("audioset_names.csv")
-_RELEASE = 1.0  # logits below the threshold at which a sound still goes on
+RELEASE = 1.0  # logits below the threshold at which a sound still goes on
 _PAUSE_FRAMES = 2 * HOP_FRAMES  # between windows of one sound at most
 _MARGIN = (WINDOW_FRAMES - HOP_FRAMES) // 2  # frames of a window before and behind its middle
 
@@ -159,7 +159,7 @@ class NamedSounds:
         self._thresholds = np.array([name.threshold for name in self._names])
         self._columns = columns = _columns(projection, self._names)
         above_low = (projection.lows + projection.steps)[columns]  # the low itself is nothing heard
-        self._release = np.maximum(self._thresholds - _RELEASE, above_low)
+        self._release = np.maximum(self._thresholds - RELEASE, above_low)
         self._least = np.array([name.windows for name in self._names])
         count = len(self._names)
         self._first = np.full(count, -1, np.int64)  # where a sound goes on

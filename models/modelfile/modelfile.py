@@ -29,6 +29,7 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
+from hearthlog.models.modelfile.audioset import AUDIOSET, KEY, audioset_file
 from hearthlog.models.starter import (
     BY_FEATURES,
     NETWORK,
@@ -43,7 +44,6 @@ from hearthlog.schemas.storage.sealed_file import damage, read_sealed, write_sea
 from hearthlog.schemas.storage.small_file import read_whole
 
 SUFFIX = ".safetensors"
-_KEY = "hearthlog"
 _SIZE_LIMIT = 64 << 20  # a hundred times the usual size
 _HEADER_LIMIT = 4 << 20  # its parsed form takes many times as much
 _LARGEST = 1e9  # no product of finite inputs overflows
@@ -106,7 +106,7 @@ def save_model(model: Model, path: Path) -> None:
     arrays = {name: np.ascontiguousarray(a) for name, a in {**model.arrays, **common}.items()}
     _check(path, model.description, arrays)
     text = json.dumps(model.description.model_dump(), ensure_ascii=False)
-    data = write_sealed({name: _halved(array) for name, array in arrays.items()}, _KEY, text)
+    data = write_sealed({name: _halved(array) for name, array in arrays.items()}, KEY, text)
     _check_header(path, data)
     try:
         with new_file(path) as temporary:
@@ -122,7 +122,8 @@ def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> 
     ----------
     path : Path
         The file, or a symbolic link to it: the model has the name of the file. Where there is none,
-        the name of a starter model (`hearthlog.models.starter`) means that.
+        the name of a starter model (`hearthlog.models.starter`) means that, and `audioset` the
+        names of YAMNet.
     on_damage : callable, optional
         Told in a line that the file is not as it was written; by default that is an error.
 
@@ -136,7 +137,7 @@ def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> 
     path, data = _read(path)
     _check_header(path, data)
     try:
-        arrays, text, damaged = read_sealed(path, data, _KEY)
+        arrays, text, damaged = read_sealed(path, data, KEY)
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
         raise ModelError(f"{path}: is not a model file ({one_line(error)})") from error
     digest = hashlib.sha256(data).hexdigest()
@@ -189,6 +190,8 @@ def name_and_digest(path: Path) -> tuple[str, str]:
 
 def _read(path: Path) -> tuple[Path, bytes]:
     """Return the file that is meant, and its content."""
+    if str(path) == AUDIOSET:  # whatever folder of recordings has this name
+        return path.with_suffix(SUFFIX), audioset_file()
     path = _starter(path) or _pointed_to(path)
     if not path.stem.isprintable():
         raise ModelError(f"{str(path)!a}: give the model a name that can be printed")

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.audioset import AUDIOSET, is_by_names
 from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.models.starter import GENERAL, STARTERS, starter_file, with_network
@@ -143,7 +144,8 @@ def load(folder: Path, name: str) -> Model:
     folder : Path
         Folder of model files.
     name : str
-        Name of a model, of its file, or an alias; a starter of which there is no file.
+        Name of a model, of its file, or an alias; a starter of which there is no file, or
+        `audioset`.
 
     Raises
     ------
@@ -151,8 +153,8 @@ def load(folder: Path, name: str) -> Model:
         If there is no such folder, or `resolve` or `load_model` refuses the model.
     """
     stem = name.removesuffix(SUFFIX)
-    if stem in STARTERS and not os.path.lexists(_path(folder, stem)):
-        return load_model(starter_file(stem))
+    if stem in {*STARTERS, AUDIOSET} and not os.path.lexists(_path(folder, stem)):
+        return load_model(Path(AUDIOSET) if stem == AUDIOSET else starter_file(stem))
     _check_folder(folder)
     return load_model(_path(folder, resolve(folder, name)))
 
@@ -259,6 +261,11 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
     with _locked(folder, make=name.removesuffix(SUFFIX) in STARTERS):
         before = target(folder, alias)
         model = load(folder, name)
+        if is_by_names(model):
+            raise ModelError(
+                f"{name} has learned nothing and labels beside the champion: write "
+                f'scenarios = {{{AUDIOSET} = "{AUDIOSET}"}} into the configuration of the recorder'
+            )
         _copy_starter(folder, model)
         if model.name != before:
             if alias == CHAMPION and before is not None:

@@ -1,6 +1,6 @@
 """Classes that two models label at once: who counts sounds by class could not tell them apart."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from hearthlog.models.classes import OF_EVERY_SCENARIO, class_name
 from hearthlog.models.classifiers.model import Model
@@ -34,6 +34,18 @@ def clash(model: Model, others: Mapping[str, Model]) -> str:
                     "can be of one only: leave one of them out, or train one without the class"
                 )
     return ""
+
+
+def shared_classes(model: Model, others: Iterable[Model]) -> list[str]:
+    """Return the classes of a model that others label as well, by its names.
+
+    Parameters
+    ----------
+    model : Model
+    others : iterable of Model
+    """
+    theirs = {name for other in others for name in _classes(other)}
+    return [label for name, label in _classes(model).items() if name in theirs]
 
 
 def _classes(model: Model) -> dict[str, str]:

@@ -5,10 +5,13 @@ from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.audioset import is_by_names, without_classes
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
-from hearthlog.recorder.labelling.clashes import clash
+from hearthlog.recorder.labelling.clashes import clash, shared_classes
 from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labelling
 
@@ -45,6 +48,8 @@ class LabellingModels:
     left_out : list of str, optional
         Why scenarios cannot label; those are added that cannot beside the others. By default it is
         an error if there are any.
+    features : FeatureSet, optional
+        What is recorded where no model labels.
 
     Attributes
     ----------
@@ -64,6 +69,7 @@ class LabellingModels:
         candidates: CandidateWatch | None = None,
         scenarios: Mapping[str, ModelWatch] | None = None,
         left_out: list[str] | None = None,
+        features: FeatureSet = DEFAULT,
     ) -> None:
         self._watches = {} if watch is None else {LIVE: watch}
         for name, each in (scenarios or {}).items():
@@ -73,10 +79,15 @@ class LabellingModels:
         self.in_use: dict[str, Loaded] = {}
         self._left_out = left_out
         for labelling, each in list(self._watches.items()):
+            if is_by_names(each.first.model):
+                continue
             if reason := clash(each.first.model, self._others(labelling)):
                 self.leave_out(labelling, f"model {each.first.model.name} {reason}")
             else:
                 self.in_use[labelling] = each.first
+        live = self.in_use.get(LIVE)
+        self._features = features if live is None else live.classifier.feature_set
+        self._change_names()
         self._change_trial()
 
     @property
@@ -143,7 +154,7 @@ class LabellingModels:
         """Refuse what is ready and shares a class with what would label beside it."""
         refused = []
         for labelling, watch in self._watches.items():
-            if watch.ready is None:
+            if watch.ready is None or is_by_names(watch.first.model):
                 continue
             if reason := clash(watch.ready.model, self._others(labelling)):
                 refused.append(watch.refuse_ready(reason, self.in_use[labelling].model))
@@ -161,13 +172,39 @@ class LabellingModels:
             if watch.ready is not None:
                 self.in_use[labelling], watch.ready, watch.held = watch.ready, None, None
                 changes.append(Change(labelling, *self.in_use[labelling]))
+        changes += self._change_names()
         if self._trial_changes():
             changes.append(self._change_trial())
         return changes
 
+    def _change_names(self) -> list[Change]:
+        """Leave to other models the classes that they were taught, and names only what is left."""
+        changes = []
+        for labelling, watch in self._watches.items():
+            if not is_by_names(watch.first.model):
+                continue
+            whole = watch.first.model
+            shared = shared_classes(whole, self._others(labelling).values())
+            model = without_classes(whole, shared, self._features)
+            before = self.in_use.pop(labelling, None)
+            loaded = None
+            if len(model.classes) > 1:
+                same = before is not None and before.model.sha256 == model.sha256
+                loaded = before if same else Loaded(model, Classifier(model))
+            if loaded is not None:
+                self.in_use[labelling] = loaded
+            if _identity(loaded) != _identity(before):
+                of_none = None, None
+                changes.append(Change(labelling, *(of_none if loaded is None else loaded)))
+        return changes
+
     def _others(self, labelling: str) -> dict[str, Model]:
         """Return the models that a model of a labelling must not share classes with."""
-        others = {name: watch for name, watch in self._watches.items() if name != labelling}
+        others = {
+            name: watch
+            for name, watch in self._watches.items()
+            if name != labelling and not is_by_names(watch.first.model)
+        }
         loaded = {name: watch.ready or self.in_use.get(name) for name, watch in others.items()}
         return {name: each.model for name, each in loaded.items() if each is not None}
 

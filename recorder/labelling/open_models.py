@@ -5,6 +5,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from hearthlog.models.errors import ModelError
+from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.recorder.config import NO_MODEL, Settings
@@ -59,14 +60,17 @@ def open_models(  # noqa: PLR0913
     for name in microphones:
         same = next((other for other in models if chosen[other] == chosen[name]), None)
         models[name] = (
-            _watched_models(*chosen[name], reload_requests, stack, network, leaves_out=leaves_out)
+            _watched_models(
+                settings, *chosen[name], reload_requests, stack, network, leaves_out=leaves_out
+            )
             if same is None
             else models[same]
         )
     return models
 
 
-def _watched_models(  # noqa: PLR0913
+def _watched_models(  # noqa: PLR0913, PLR0917
+    settings: Settings,
     path: Path,
     scenarios: Mapping[str, Path],
     reload_requests: ReloadRequests,
@@ -86,7 +90,8 @@ def _watched_models(  # noqa: PLR0913
                 raise
             left_out.append(str(error))
     if path == NO_MODEL:
-        return LabellingModels(scenarios=watches, left_out=left_out)
+        features = feature_set(settings.feature_set or DEFAULT.name)
+        return LabellingModels(scenarios=watches, left_out=left_out, features=features)
     watch = ModelWatch(path, reload_requests.queue(), network=network)
     stack.enter_context(closing(watch))
     is_file = path.suffix == SUFFIX  # else the name of a starter

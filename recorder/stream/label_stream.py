@@ -7,7 +7,8 @@ import numpy as np
 from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import Floors
-from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
+from hearthlog.models.labels.labeller import FrameLabels, segment_columns
+from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -39,6 +40,8 @@ class LabelStream:
     ----------
     classes : tuple of str
         Names behind the columns of the probabilities.
+    by_names : bool
+        Whether it labels by what is logged of a network alone.
     segments_converged : bool
         Whether sound before the first frame would leave no trace in the segments to come.
     last : FrameLabels or None
@@ -53,11 +56,12 @@ class LabelStream:
         embedding: EmbeddingSource | None = None,
     ) -> None:
         self.classes = classifier.classes
+        self.by_names = classifier.names is not None
         self.segments_converged = False
         self.last: FrameLabels | None = None
         self._microphone = microphone
         self._labelling = labelling
-        self._labeller = Labeller(classifier, microphone, embedding)
+        self._labeller = labeller_of(classifier, microphone, embedding)
 
     @property
     def delay(self) -> int:

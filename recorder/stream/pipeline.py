@@ -211,6 +211,7 @@ class Pipeline:
         labels = [
             message
             for stream in self._streams.values()
+            if self._veil is None or not stream.by_names
             for message in stream.push(features, floors, first, stamps, auxiliary)
         ]
         logged = features, first, stamps
@@ -227,11 +228,19 @@ class Pipeline:
         return self.hold(messages)
 
     def _veiled(self, frames: LoggedFrames) -> list[EncodedMessage]:
-        """Encode frames that may be logged, and the embeddings that end with them."""
+        """Encode frames that may be logged, and the embeddings that end with them.
+
+        Names go by these embeddings alone: what is left out for somebody may be speaking has none.
+        """
         embeddings = self._embedding_veil.release(frames)
         known = frames.stamps[embeddings.last_frames - frames.first]
         messages = self._feature_messages(frames.features, frames.first, frames.stamps)
-        return [*messages, *embedding_messages(self.microphone, embeddings, known)]
+        messages += embedding_messages(self.microphone, embeddings, known)
+        sound = frames.features, None, frames.first, frames.stamps
+        for stream in self._streams.values():
+            if stream.by_names and len(frames.stamps):
+                messages += stream.push(*sound, Auxiliary(embeddings=embeddings))
+        return messages
 
     def _located(self, auxiliary: Auxiliary, first: int, stamps: Int64) -> list[EncodedMessage]:
         """Encode the directions of frames, and remember the last ones, and the last embeddings."""

@@ -23,7 +23,7 @@ def relabel(
     model: Annotated[
         Path,
         typer.Option(
-            help="Model file, where workers find it too, or general or bathroom.",
+            help="Model file, where workers find it too, or general, bathroom or audioset.",
             parser=log_location,
         ),
     ],
@@ -51,7 +51,7 @@ def relabel(
         from hearthlog.models.modelfile.modelfile import load_model
 
         model = starter_of(model, logs)
-        where = model.resolve() if model.exists() else model  # the name of a starter model
+        where = model.resolve() if model.is_file() else model  # else the name of a starter
         loaded = load_model(model)
         with share_done("labelling logs", announce=True) as report:
             result = run(logs, loaded, where, pool, report)

@@ -11,6 +11,8 @@ from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_
 from hearthlog.analyzer.bridge.listeners import microphone_of_listener
 from hearthlog.analyzer.routine.compare import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
+from hearthlog.models.embedding.sound_names import audioset_names
+from hearthlog.models.modelfile.audioset import AUDIOSET
 from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.text import listed
@@ -272,8 +274,18 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
     there = listed(sorted(set().union(*own) - {SILENCE}), "and")
     return (
         f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard; "
-        f"there are {there}"
+        f"there are {there}{_of_network(rule.label)}"
     )
+
+
+def _of_network(label: str) -> str:
+    """Say what the names of the network of sounds have of a class; empty if they have it not."""
+    name = next((each for each in audioset_names() if each.name == label), None)
+    if name is None:
+        return ""
+    if name.is_event:
+        return f'; scenarios = {{{AUDIOSET} = "{AUDIOSET}"}} brings it, with a network of sounds'
+    return "; a network of sounds has a name for it, which is a hint alone: it is not counted"
 
 
 def unknown_microphone(

@@ -26,6 +26,7 @@ from hearthlog.analyzer.review.timeline.model import (
     SoundClip,
     Timeline,
 )
+from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
 from hearthlog.schemas.arrays import Float32, Int16
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -46,7 +47,8 @@ OFF = "the recorder was off"
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
-_LATE = NANOSECONDS + FRAME_NANOSECONDS  # at most, from the time of a label until it is known
+# At most, from the time of a label until it is known: names wait for windows.
+_LATE = (MOST_AHEAD_FRAMES + 1) * FRAME_NANOSECONDS
 _OF_SPANS = (message_types.SEGMENT, message_types.GAP)  # logged at their end
 
 

@@ -1,0 +1,276 @@
+"""From the embeddings of one stream to labels and segments, by the names of a network alone.
+
+A sound begins with a window whose logged value is above the threshold of a name, and goes on while
+windows at most a second apart are above it or a little below; it is labelled once enough windows
+were above. That is how `hearthlog.models.embedding.sound_names` finds sounds, here with a bounded
+delay and one name for each frame.
+"""
+
+import numpy as np
+
+from hearthlog.models.classes import SILENCE
+from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.names import MARGIN_FRAMES
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Embeddings
+from hearthlog.models.features.floor import Floors
+from hearthlog.models.labels.labeller import FrameLabels, Labeller
+from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
+from hearthlog.schemas.messages.topics import EmbeddingSource
+
+_PAUSE = 2  # hops between windows of one sound, at most
+_DONE = -1  # in place of a window: all has converged
+_STEPS = 1 << 16  # of a probability, as of the classifiers
+
+
+class NamesLabeller:
+    """Labels one stream of frames by names; as `Labeller` for other models.
+
+    Where the embeddings are not those of the model's network and projection, all is silence.
+
+    Parameters
+    ----------
+    classifier : Classifier
+        With names.
+    embedding : EmbeddingSource, optional
+        Of the embeddings.
+
+    Attributes
+    ----------
+    classes : tuple of str
+    timing : LabelTiming
+    segmenter : Segmenter
+    takes_auxiliary : bool
+        Whether embeddings change its labels.
+    """
+
+    def __init__(self, classifier: Classifier, embedding: EmbeddingSource | None = None) -> None:
+        assert classifier.names is not None
+        self.classes = classifier.classes
+        self.timing = classifier.timing
+        self.takes_auxiliary = classifier.takes_embeddings(embedding)
+        self.segmenter = Segmenter(classifier.classes, classifier.smoothing, classifier.transitions)
+        self._calibrated_elsewhere = classifier.calibrated_elsewhere
+        rules = classifier.names.rules if self.takes_auxiliary else {}
+        # Of names at once the first counts: the shorter a sound is, the less would be left of it.
+        names = sorted(rules, key=lambda name: rules[name].seconds)
+        own = [rules[name] for name in names]
+        self._labels = np.array([self.classes.index(name) for name in names], np.intp)
+        self._columns = np.array([rule.value for rule in own], np.intp)
+        self._begins = np.array([rule.begins for rule in own], np.int64)
+        self._goes_on = np.array([rule.goes_on for rule in own], np.int64)
+        self._least = np.array([rule.windows for rule in own], np.int64)
+        precisions = np.array([rule.precision for rule in own])
+        self._nothing = np.full(len(own), -(1 << 15))
+        self._precision = (np.rint(_STEPS * precisions) / _STEPS).astype(np.float32)
+        self._silence = self.classes.index(SILENCE)
+        self._later = (self.timing.ahead - WINDOW_FRAMES + 1 + MARGIN_FRAMES) // HOP_FRAMES
+        self._restart()
+
+    def _restart(self) -> None:
+        count = len(self._labels)
+        self._stamps = np.empty(0, np.int64)  # of the frames without a label
+        self._end: int | None = None  # number of the next frame
+        self._window = 0  # number of the next window: a tenth of that of its first frame
+        self._open = np.zeros(count, bool)  # whether a sound goes on
+        self._first = np.zeros(count, np.int64)  # its first window, and its last one so far
+        self._last = np.zeros(count, np.int64)
+        self._above = np.zeros(count, np.int64)  # windows above the threshold
+        # Whether the last windows are within sounds that are labelled.
+        self._named = np.zeros((self._later + 1, count), bool)
+        self._below = np.zeros(count, np.int64)  # windows with which no sound goes on, in a row
+        self._known = np.zeros(count, bool)  # whether earlier windows leave no trace in a sound
+        self._converged: int | None = None  # window behind which they leave none in any
+
+    @property
+    def states_converged(self) -> bool:
+        """Whether frames before the first one would leave no trace in the states to come."""
+        return self._converged == _DONE and self.segmenter.states_converged
+
+    @property
+    def segments_converged(self) -> bool:
+        """Whether frames before the first one would leave no trace in the segments to come."""
+        return self._converged == _DONE and self.segmenter.segments_converged
+
+    def follow(  # noqa: PLR0913, PLR0917
+        self,
+        features: Float32,
+        floors: Float64 | None,
+        stamps: Int64,
+        frame: int,
+        unlabelled: int,
+        auxiliary: Auxiliary = NO_AUXILIARY,
+    ) -> None:
+        """Take the place of another labeller: what was heard before does not count.
+
+        Parameters
+        ----------
+        features, floors, stamps, frame, unlabelled, auxiliary
+            As of `Labeller.follow`.
+        """
+
+    def push(
+        self,
+        features: Float32,
+        floors: Floors | None,
+        first: int,
+        stamps: Int64,
+        auxiliary: Auxiliary = NO_AUXILIARY,
+    ) -> tuple[FrameLabels, list[Segment]]:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        features, floors, first, stamps, auxiliary
+            As of `Labeller.push`; features and floors say nothing here.
+
+        Returns
+        -------
+        labels : FrameLabels
+        segments : list of Segment
+        """
+        del features, floors
+        if self._end is None:
+            self._window = -(-first // HOP_FRAMES)
+        self._end = end = first + len(stamps)
+        window, named = self._add_windows(auxiliary.embeddings)
+        known = np.append(self._stamps, stamps)
+        count = max(len(known) - self.timing.ahead, 0)
+        frames = np.arange(end - len(known), end - len(known) + count)
+        labelled = LabelledFrames(
+            self._probabilities(frames, window, named),
+            np.zeros(count),
+            known[:count],
+            known[self.timing.ahead :],
+        )
+        self._stamps = known[count:]
+        labels = FrameLabels(
+            self.classes,
+            frames,
+            labelled.stamps,
+            labelled.known_at,
+            labelled.probabilities,
+            labelled.probabilities,
+            np.full(count, np.nan, np.float32),
+            self._calibrated_elsewhere,
+            self.timing.ahead,
+        )
+        return labels, self._segments(labelled, end - len(known))
+
+    def close(self, end: int) -> list[Segment]:
+        """Return the remaining segments of a sound that ends, and begin anew.
+
+        Parameters
+        ----------
+        end : int
+            End of the sound, in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Segment
+            In the order of time.
+        """
+        segments: list[Segment] = []
+        count = len(self._stamps)
+        if self._end is not None and count:  # whose labels nobody waits for
+            frames = np.arange(self._end - count, self._end)
+            window = self._window - len(self._named)
+            nothing = np.zeros((1, len(self._labels)), bool)  # said by a window that is not whole
+            labelled = LabelledFrames(
+                self._probabilities(frames, window, np.concatenate([self._named, nothing])),
+                np.zeros(count),
+                self._stamps,
+                np.full(count, end),
+            )
+            segments = self._segments(labelled, self._end - count)
+        segments += self.segmenter.close(end)
+        self._restart()
+        self._converged = _DONE
+        return segments
+
+    def _add_windows(self, embeddings: Embeddings) -> tuple[int, Bool]:
+        """Add the windows that are complete now.
+
+        Return which names each window has that the next labels speak of, and the number of the
+        first of these windows.
+        """
+        assert self._end is not None
+        begin = self._window
+        self._window = max((self._end - WINDOW_FRAMES) // HOP_FRAMES + 1, begin)
+        named = np.concatenate(
+            [self._named, np.zeros((self._window - begin, len(self._labels)), bool)]
+        )
+        first = begin - len(self._named)
+        logged = embeddings.values[:, self._columns] if len(embeddings.frames) else None
+        numbers = (embeddings.frames // HOP_FRAMES).tolist()
+        rows = dict(zip(numbers, () if logged is None else logged, strict=True))
+        for window in range(begin, self._window):
+            row = rows.get(window)
+            if row is None and self._converged is not None and not self._open.any():
+                continue
+            heard = self._add(window, self._nothing if row is None else row.astype(np.int64))
+            place = window - first
+            recent = np.arange(place - self._later, place + 1)
+            named[recent] |= heard & (recent[:, np.newaxis] >= self._first - first)
+        self._named = named[len(named) - len(self._named) :]
+        return first, named
+
+    def _add(self, window: int, values: Int64) -> Bool:
+        """Add a window; return which sounds are labelled that go on with it."""
+        self._open &= window - self._last <= _PAUSE
+        above, goes_on = values >= self._begins, values >= self._goes_on
+        begins = above & ~self._open
+        self._first[begins], self._above[begins] = window, 0
+        self._open |= above
+        goes_on_here = goes_on & self._open
+        self._last[goes_on_here] = window
+        self._above[above] += 1
+        counts = self._open & (self._above >= self._least)
+        self._below = np.where(goes_on, 0, self._below + 1)
+        self._known |= counts | (self._below > _PAUSE)
+        if self._converged is None and self._known.all():
+            self._converged = window
+        heard: Bool = goes_on_here & counts
+        return heard
+
+    def _probabilities(self, frames: Int64, window: int, named: Bool) -> Float32:
+        """Return the probabilities of frames, each by the window that has it in the middle."""
+        result = np.zeros((len(frames), len(self.classes)), np.float32)
+        if not named.any() or not len(frames):
+            result[:, self._silence] = 1.0
+            return result
+        of_frames = named[(frames - MARGIN_FRAMES) // HOP_FRAMES - window]
+        chosen, rows = of_frames.argmax(axis=1), np.arange(len(frames))
+        sure = np.where(of_frames.any(axis=1), self._precision[chosen], np.float32(0.0))
+        result[rows, self._labels[chosen]] = sure
+        result[:, self._silence] = 1.0 - sure
+        return result
+
+    def _segments(self, labelled: LabelledFrames, first: int) -> list[Segment]:
+        """Return the segments whose end frames decide, of which the first has a number."""
+        segments: list[Segment] = []
+        if self._converged not in {None, _DONE}:
+            doubtful = (self._converged + 1) * HOP_FRAMES + MARGIN_FRAMES - first
+            if doubtful < len(labelled.stamps):
+                before = labelled.part(slice(max(doubtful, 0)))
+                labelled = labelled.part(slice(max(doubtful, 0), None))
+                segments = self.segmenter.push(before) if len(before.stamps) else []
+                self.segmenter.forget()
+                self._converged = _DONE
+        return segments + (self.segmenter.push(labelled) if len(labelled.stamps) else [])
+
+
+def labeller_of(
+    classifier: Classifier, microphone: str = "", embedding: EmbeddingSource | None = None
+) -> Labeller | NamesLabeller:
+    """Return what labels a stream of frames by a classifier.
+
+    Parameters
+    ----------
+    classifier, microphone, embedding
+        As of `Labeller`.
+    """
+    if classifier.names is not None:
+        return NamesLabeller(classifier, embedding)
+    return Labeller(classifier, microphone, embedding)
