@@ -93,9 +93,10 @@ bench-history: $(VENV)/.dev
 bench-check: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.bench --check docs/benchmarks.jsonl
 
-# The models that come with hearthlog, learned anew: make starter DATA="a/manifest.csv b/manifest.csv"
+# The models that come with hearthlog, learned anew: make starter DATA="a/manifest.csv b/manifest.csv", and those for a
+# network with METHOD=embedding
 starter: $(VENV)/.dev
-	$(BIN)/python -m hearthlog.tools.starter $(DATA) -o models/starter
+	$(BIN)/python -m hearthlog.tools.starter $(DATA) -o models/starter --method $(or $(METHOD),room)
 
 $(VENV)/.analyzer: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

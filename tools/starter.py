@@ -27,17 +27,19 @@ from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import EMBEDDING, ROOM, SvmMethod
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING
+from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING, SILENCE
 from hearthlog.models.classifiers.description import SIMULATED
+from hearthlog.models.classifiers.embedding_heads import UNTAUGHT
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.licences import may_be_shipped
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.starter import STARTERS, starter_file
+from hearthlog.models.starter import BY_FEATURES, starter_file
 from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.text import listed
 from hearthlog.tools.home.sounds import synthesize
 
 _FEWEST_SOURCES = 3  # a class of fewer would only mislead
@@ -52,9 +54,15 @@ _METHODS: dict[str, SvmMethod] = {
 _COLUMNS = ("path", "label", "source_group", "source", "licence", "seconds", "credit", "url")
 _ABOUT = """# The starter models
 
-`sources.csv` lists every recording that they have learned from, with its licence and its author.
+`{sources}` lists every recording that they have learned from, with its licence and its author.
 It is a manifest: with the recordings in the places that it names, it learns the same models again.
 The collections are repositories at https://github.com, or packages of Debian where they say so.
+"""
+_OF_NETWORK = """
+They take what the network {network} hears, whose file is not part of hearthlog:
+`hearthlog models fetch {network}` brings it. AudioSet's names, by which it was taught, count as
+evidence as they are, without a recording: each class has a head that goes by the names which mean
+it. {by_names}Without the network they label by the features alone.
 """
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
 
@@ -82,10 +90,10 @@ def learn_starters(
     clips = list(_usable(manifests))
     with TemporaryDirectory() as temporary:
         sounds = [*_joined(clips, Path(temporary)), *_ring_tones(Path(temporary))]
-        models = [_learn(name, sounds, folder, method) for name in STARTERS]
+        models = [_learn(name, sounds, folder, method) for name in BY_FEATURES]
     suffix = _suffix(method)
     _write_sources(folder / f"sources{suffix}.csv", manifests, clips)
-    (folder / f"README{suffix}.md").write_text(_page(models), "utf-8")
+    (folder / f"README{suffix}.md").write_text(_page(models, method), "utf-8")
 
 
 def _suffix(method: SvmMethod) -> str:
@@ -206,15 +214,31 @@ def _crediting(model: Model, before: Model) -> Model:
     return replace(model, description=described)
 
 
-def _page(models: Sequence[Model]) -> str:
+def _page(models: Sequence[Model], method: SvmMethod) -> str:
     """Describe the models, and name the classes that they lack."""
+    about = _ABOUT.format(sources=f"sources{_suffix(method)}.csv")
+    if method.network:
+        about += _OF_NETWORK.format(network=method.network, by_names=_by_names(models))
     lacking = [
         f"- `{model.name}` has no class `{one}`: its recordings are too few, or too alike."
-        for name, model in zip(STARTERS, models, strict=True)
+        for name, model in zip(BY_FEATURES, models, strict=True)
         for one in BUILTIN[name].classes
         if one not in model.classes
     ]
-    return "\n".join([_ABOUT, *lacking, "", *map(model_card, models)])
+    return "\n".join([about, *lacking, "", *map(model_card, models)])
+
+
+def _by_names(models: Sequence[Model]) -> str:
+    """Say of which classes the recordings were too few to teach a head anything."""
+    untaught = [
+        f"`{name}` of `{model.name}`"
+        for model in models
+        for name, biases in zip(model.classes, model.embedding_bias.T.tolist(), strict=True)
+        if name != SILENCE and UNTAUGHT in biases
+    ]
+    if not untaught:
+        return ""
+    return f"Of {listed(untaught, 'and')} there is hardly any recording, and they alone say it. "
 
 
 def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[LabelledClip]) -> None:
