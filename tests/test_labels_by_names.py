@@ -15,6 +15,7 @@ from spliced import run
 from test_scenarios_at_once import keep, renamed, replace_file
 
 from hearthlog.analyzer.bridge.alerts.rules import MoreThan, unknown_class
+from hearthlog.analyzer.training.adapt import base_classes
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
@@ -318,6 +319,21 @@ def test_a_scenario_of_names_without_a_network_says_so_and_is_silent(sound, tmp_
     (log,) = record_files(asked, FileSource([sound], START), Flag()).logs
     assert heard(log) == []
     assert "it labels nothing (hearthlog models fetch yamnet)" in capfd.readouterr().err
+
+
+def test_names_alone_can_label_a_home_and_the_log_is_sound(sound, tmp_path, monkeypatch, capfd):
+    log = record(sound, tmp_path, monkeypatch, model=AUDIOSET, scenarios={})
+    assert [label for label, _, _ in heard(log, "/mic/segment")] == ["dog", "speech", "rain"]
+    assert run(capfd, "doctor", log).returncode == 0
+
+
+def test_what_was_not_taught_is_neither_evaluated_nor_adapted(capfd):
+    clips = Path(__file__).parents[1] / "tools/home/clips/manifest.csv"
+    refused = run(capfd, "evaluate", "model", AUDIOSET, "--data", clips)
+    assert refused.returncode == 1
+    assert "audioset labels by the names of a network and has learned nothing" in refused.stderr
+    with pytest.raises(ModelError, match="nor can it be adapted"):
+        base_classes(load_model(Path(AUDIOSET)))
 
 
 def test_an_alert_of_a_name_says_where_it_is_to_be_had():

@@ -25,9 +25,10 @@ from hearthlog.schemas.messages.topics import ROSOUT, EmbeddingSource
 
 STAMP = "header.stamp"
 _SUM_TOLERANCE = 1e-4
+_LABEL_LATE = MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000  # ns; those by names
 _LATE = {  # ns, with what stamps may be off
-    LABEL: 1_010_000_000,
-    BESIDE_LABEL: MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000,
+    LABEL: _LABEL_LATE,
+    BESIDE_LABEL: _LABEL_LATE,
     SEGMENT: 75_000_000_000,
     DIRECTION: 400_000_000,
     EMBEDDING: 1_010_000_000,

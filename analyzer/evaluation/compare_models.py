@@ -26,6 +26,7 @@ from hearthlog.analyzer.training.sightings import evidence_of
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.window_inputs import of_segments
+from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Bool, Float32, Float64
 
 
@@ -92,6 +93,8 @@ def compare_models(
         If the classes of a model are not those of the scenario, the models are for different
         feature sets, or there is no segment.
     """
+    for model in (a, b):
+        insist_taught(model)
     check_features(a, b)
     check_classes(a, scenario)
     check_classes(b, scenario)

@@ -34,6 +34,7 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.labels.labeller import Labeller
+from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
@@ -78,6 +79,7 @@ def evaluate_model(
     DataError
         If the classes of the model are not those of the scenario, or no clip has a segment.
     """
+    insist_taught(model)
     scenario = fitted(scenario, model)
     classifier = Classifier(model)
     features, embedder = classifier.feature_set, model_embedder(model)

@@ -27,6 +27,7 @@ from hearthlog.models.classifiers.description import (
 )
 from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed, sounds_of
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.progress import ignore_progress
 
@@ -47,6 +48,7 @@ def base_classes(model: Model) -> tuple[str, ...]:
     DataError, ModelError
         If the method is not installed, or cannot be imported.
     """
+    insist_taught(model)
     description = model.description
     remembered = method_named(description.method).as_of(description).remembered(model)
     target = model.training_target if remembered is None else remembered[1]
@@ -80,6 +82,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     ModelError
         If the method cannot be imported, or its feature set is not installed.
     """
+    insist_taught(base)
     description = base.description
     if not len(home):
         raise DataError("the home has no segments of a class of the model")

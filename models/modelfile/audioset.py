@@ -33,6 +33,7 @@ from hearthlog.models.embedding.embeddings import WINDOW_FRAMES
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import Projection, read_projection
 from hearthlog.models.embedding.sound_names import RELEASE, SoundName, audioset_names
+from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -60,7 +61,7 @@ def audioset_file() -> bytes:
         format=FORMAT,
         kind=BY_NAMES,
         parameters=parameters.model_dump(),
-        method="",
+        method=BY_NAMES,
         classes=[SILENCE, *chosen],
         **_of_features(DEFAULT),
         window_seconds=WINDOW_FRAMES * FRAME_SECONDS,
@@ -105,6 +106,24 @@ def is_by_names(model: Model) -> bool:
     model : Model
     """
     return model.description.kind == BY_NAMES
+
+
+def insist_taught(model: Model) -> None:
+    """Refuse a model that labels by names where one is asked for that was taught.
+
+    Parameters
+    ----------
+    model : Model
+
+    Raises
+    ------
+    ModelError
+    """
+    if is_by_names(model):
+        raise ModelError(
+            f"{model.name} labels by the names of a network and has learned nothing: clips are "
+            "not needed to measure it (docs/audioset.md has its figures), nor can it be adapted"
+        )
 
 
 def without_classes(model: Model, names: Collection[str], features: FeatureSet) -> Model:

@@ -76,7 +76,7 @@ def _print(result: "Relabelled", model: str) -> None:
         tell(f"left out, as {model} is for other features: {listed(named, 'and')}")
     if result.by_features:
         logs_there = number(len(result.by_features), "log")
-        tell(f"{logs_there} without the embeddings that {model} takes: labelled by features alone")
+        tell(f"{logs_there} without the embeddings that {model} takes: labelled without them")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
         for line in first_of(what, sorted(named)):
