@@ -52,9 +52,12 @@ _METHODS: dict[str, SvmMethod] = {
 _COLUMNS = ("path", "label", "source_group", "source", "licence", "seconds", "credit", "url")
 _ABOUT = """# The starter models
 
-`sources.csv` lists every recording that they have learned from, with its licence and its author.
+`{sources}` lists every recording that they have learned from, with its licence and its author.
 It is a manifest: with the recordings in the places that it names, it learns the same models again.
 The collections are repositories at https://github.com, or packages of Debian where they say so.
+"""
+_REMEMBERED = """Where it has hardly any recordings of a class, they keep what the starters without a network have
+learned of it, from those in `sources.csv`.
 """
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
 
@@ -84,8 +87,10 @@ def learn_starters(
         sounds = [*_joined(clips, Path(temporary)), *_ring_tones(Path(temporary))]
         models = [_learn(name, sounds, folder, method) for name in STARTERS]
     suffix = _suffix(method)
-    _write_sources(folder / f"sources{suffix}.csv", manifests, clips)
-    (folder / f"README{suffix}.md").write_text(_page(models), "utf-8")
+    sources = folder / f"sources{suffix}.csv"
+    _write_sources(sources, manifests, clips)
+    about = _ABOUT.format(sources=sources.name) + (_REMEMBERED if method.network else "")
+    (folder / f"README{suffix}.md").write_text(_page(about, models), "utf-8")
 
 
 def _suffix(method: SvmMethod) -> str:
@@ -206,7 +211,7 @@ def _crediting(model: Model, before: Model) -> Model:
     return replace(model, description=described)
 
 
-def _page(models: Sequence[Model]) -> str:
+def _page(about: str, models: Sequence[Model]) -> str:
     """Describe the models, and name the classes that they lack."""
     lacking = [
         f"- `{model.name}` has no class `{one}`: its recordings are too few, or too alike."
@@ -214,7 +219,7 @@ def _page(models: Sequence[Model]) -> str:
         for one in BUILTIN[name].classes
         if one not in model.classes
     ]
-    return "\n".join([_ABOUT, *lacking, "", *map(model_card, models)])
+    return "\n".join([about, *lacking, "", *map(model_card, models)])
 
 
 def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[LabelledClip]) -> None:
