@@ -56,8 +56,9 @@ _ABOUT = """# The starter models
 It is a manifest: with the recordings in the places that it names, it learns the same models again.
 The collections are repositories at https://github.com, or packages of Debian where they say so.
 """
-_REMEMBERED = """Where it has hardly any recordings of a class, they keep what the starters without a network have
-learned of it, from those in `sources.csv`.
+_REMEMBERED = """\
+Where it has hardly any recordings of a class, they keep what the starters without a network
+have learned of it, from those in `sources.csv`.
 """
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
 
