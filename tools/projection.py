@@ -26,7 +26,7 @@ from hearthlog.schemas.arrays import Float32
 _COMPONENTS = 64
 _HOP = 8000  # samples
 _PADDING = 75.0  # dB below full scale
-_STEP_OF_COMPONENT = 0.25  # standard deviations: finer ones took bytes and gave nothing
+_STEP_OF_COMPONENT = 0.5  # standard deviations: finer ones take bytes and give nothing
 _STEP_OF_CLASS, _LOW_OF_CLASS = 0.25, -12.5  # logits
 _STEP_OF_NAME, _LOW_OF_NAME = 0.5, -5.0  # what is less likely says nothing
 _CLASSES = tuple(GROUPS).index("outside") + 1  # those before are of a name each

@@ -58,11 +58,14 @@ _ABOUT = """# The starter models
 It is a manifest: with the recordings in the places that it names, it learns the same models again.
 The collections are repositories at https://github.com, or packages of Debian where they say so.
 """
-_OF_NETWORK = """
+_OF_NETWORK = """\
+Where it has hardly any recordings of a class, they keep what the starters without a network
+have learned of it, from those in `sources.csv`.
+
 They take what the network {network} hears, whose file is not part of hearthlog:
 `hearthlog models fetch {network}` brings it. AudioSet's names, by which it was taught, count as
 evidence as they are, without a recording: each class has a head that goes by the names which mean
-it. {by_names}Without the network they label by the features alone.
+it.{by_names} Without the network they label by the features alone.
 """
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
 
@@ -238,7 +241,7 @@ def _by_names(models: Sequence[Model]) -> str:
     ]
     if not untaught:
         return ""
-    return f"Of {listed(untaught, 'and')} there is hardly any recording, and they alone say it. "
+    return f"\nOf {listed(untaught, 'and')} these and the features alone say what it is."
 
 
 def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[LabelledClip]) -> None:

@@ -39,6 +39,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.provenance import METADATA, THINNED, describes_model
+from hearthlog.schemas.mcap.chunk_writer import GATHERED_SPAN
 from hearthlog.schemas.messages.fields import difference
 from hearthlog.schemas.messages.gaps import LOG_DAMAGED
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
@@ -81,7 +82,9 @@ class MessageChecks:
         self.frames: dict[str, FrameSequence] = {}  # by microphone
         self._data = data
         self._findings = findings
-        self._last: int | None = None
+        self._last: int | None = None  # log time of the last message
+        self._last_gathered: int | None = None  # and of the last that was gathered
+        self._interrupted = 0  # log time before which messages are missing
         self._parts: dict[str, list[int]] = {}  # where further ones begin, in a merged log
         self._troubles: set[str] = set()
         self._named = LOG_NAME.fullmatch(findings.path.name) is not None
@@ -112,7 +115,7 @@ class MessageChecks:
         for microphone, frames in self.frames.items():
             for time in self._parts.pop(microphone, []):
                 frames.begin_anew(time)
-            frames.settle(self._last)
+            frames.settle(self._settled())
 
     def finish(self) -> None:
         """Check the last frames: no more messages will come."""
@@ -121,7 +124,8 @@ class MessageChecks:
 
     def interrupt(self) -> None:
         """Note that messages are missing here, because the file is damaged."""
-        self._last = None
+        self._interrupted = self._last or self._interrupted
+        self._last = self._last_gathered = None
         for frames in self.frames.values():
             frames.interrupt()
 
@@ -136,19 +140,26 @@ class MessageChecks:
         except LogError:
             return False
 
+    def _settled(self) -> int | None:
+        """Return the log time before which all messages were added."""
+        if self._last is None or not self._gathered_channels():
+            return self._last
+        return self._last - GATHERED_SPAN
+
+    def _gathered_channels(self) -> list[int]:
+        """Return the channels whose messages may stand in chunks behind those of the others."""
+        channels = self._data.definitions.channels.items()
+        return [i for i, one in channels if split_topic(one.topic)[1] == EMBEDDING]
+
     def _check_times(self, batch: MessageBatch) -> None:
         heads = batch.heads
         times = heads["log_time"]
         if self._last is None:
             self._check_begin(heads)
-        before = np.concatenate([times[:1] if self._last is None else [self._last], times[:-1]])
+        gathered = np.isin(heads["channel"], self._gathered_channels())
+        self._last = self._check_order(times[~gathered], self._last)
+        self._last_gathered = self._check_order(times[gathered], self._last_gathered)
         report = self._findings.rows
-        report(
-            "log-time",
-            times < before - allowed_delay(self._data),
-            times,
-            lambda i: f"log time runs backwards by {(before[i] - times[i]) / 1e9:.3f} s",
-        )
         late = heads["publish_time"] - times
         late[self._may_be_older(heads["channel"])] = 0
         report(
@@ -157,7 +168,19 @@ class MessageChecks:
             times,
             lambda i: f"publish time is not log time, but {late[i] / 1e9:+.3f} s later",
         )
-        self._last = int(times[-1])
+
+    def _check_order(self, times: Int64, last: int | None) -> int | None:
+        """Check that log times do not run backwards; return the last one."""
+        if not len(times):
+            return last
+        before = np.concatenate([times[:1] if last is None else [last], times[:-1]])
+        self._findings.rows(
+            "log-time",
+            times < before - allowed_delay(self._data),
+            times,
+            lambda i: f"log time runs backwards by {(before[i] - times[i]) / 1e9:.3f} s",
+        )
+        return int(times[-1])
 
     def _may_be_older(self, channels: NDArray[np.uint16]) -> NDArray[np.bool_]:
         """Tell which messages may be older than their log time: what `cut` puts at the beginning.
@@ -193,6 +216,8 @@ class MessageChecks:
             self.frames[microphone] = self._frame_sequence(microphone, info)
         self._check_content(kind, columns, info)
         rows = _sequence_rows(kind, columns)
+        if rows is not None and kind == EMBEDDING:  # gathered behind what is missing
+            rows = rows[rows[:, 0] > self._interrupted]
         if rows is not None:
             self.frames[microphone].add(kind, rows)
         if kind == GAP and rows is not None:

@@ -21,8 +21,8 @@ STARTERS = (*BY_FEATURES, *map(with_network, BY_FEATURES))
 SHA256 = {  # of their files, as `sha256sum` prints it
     GENERAL: "d5f6f6cb0736ba4ab933943ebbef25d1d53f99de02f49ffa509d621747f2587f",
     BATHROOM: "0344b38fa1cf06a446ee491bbad6fe8b6dd73ec89296849baf7e7adae6cb6d75",
-    with_network(GENERAL): "26a194302803451906be77cf506144032cba3bdd14e3bae4bf75dd5ceb506f4d",
-    with_network(BATHROOM): "6ebdfd0e48a60026365ec34b22dbbe1b2ca746518c6194c68bd2107fe81723c8",
+    with_network(GENERAL): "76241cd08060bef6dad7e2fca613e287db59f9b89ccd3c69cd1db55282cacef0",
+    with_network(BATHROOM): "0ce962cceee649cf86314c0c00a6ac615c497f58a7fb05aa6bd5f759b7270168",
 }
 
 

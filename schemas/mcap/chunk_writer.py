@@ -19,10 +19,12 @@ from hearthlog.schemas.mcap.message_blocks import Block, MessageRecords, merge_b
 from hearthlog.schemas.mcap.records import encode
 from hearthlog.schemas.mcap.stored_chunk import LATEST, ChunkBuilder, StoredChunk
 from hearthlog.schemas.storage.prefetch import prefetch
+from hearthlog.schemas.times import NANOSECONDS
 
 CHUNK_SIZE = 1 << 20
 _LEAST = 4 << 10  # bytes that a chunk has before the span of time can end it
 _COMPRESSORS = 2  # threads
+GATHERED_SPAN = 60 * NANOSECONDS  # of messages that have chunks of their own
 
 
 class ChunkWriter:
@@ -56,6 +58,7 @@ class ChunkWriter:
         self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._chunk = ChunkBuilder()  # in progress
+        self._gathered = ChunkBuilder()  # of the channels that have chunks of their own
 
     def start(self, profile: str, library: str) -> None:
         """Write the magic bytes and the header.
@@ -238,7 +241,14 @@ class ChunkWriter:
             self._append(merge_blocks(blocks))
 
     def flush(self) -> None:
-        """End the chunk in progress, if it has messages, and write it."""
+        """End the chunks in progress, if they have messages, and write them."""
+        self._flush_chunk()
+        # Behind the other, which may define its channels.
+        if self._gathered.entries:
+            self._put(self._gathered.compress())
+            self._gathered = ChunkBuilder()
+
+    def _flush_chunk(self) -> None:
         if self._chunk.entries:
             self._put(self._chunk.compress())
             self._chunk = ChunkBuilder()
@@ -266,7 +276,13 @@ class ChunkWriter:
         self.flush()
         self._put_pieces(chunk, length, data)
 
-    def join_chunk(self, chunk: StoredChunk, span: int, dropped: Collection[int] = ()) -> None:
+    def join_chunk(
+        self,
+        chunk: StoredChunk,
+        span: int,
+        dropped: Collection[int] = (),
+        gathered: Collection[int] = (),
+    ) -> None:
         """Append the records of another file's chunk to the chunk in progress.
 
         Parameters
@@ -276,12 +292,34 @@ class ChunkWriter:
             Nanoseconds of log time that the joined chunk may have; a longer one is not joined.
         dropped : collection of int
             Numbers of channels whose messages are left out.
+        gathered : collection of int
+            Numbers of channels whose messages get chunks of their own, of `GATHERED_SPAN`.
         """
-        begun = self._chunk
+        own = {number for number in chunk.entries if number in gathered} - set(dropped)
+        rest = chunk.entries.keys() - own - set(dropped)
+        if rest:
+            begun = self._chunk
+            start, end = min(begun.start, chunk.start), max(begun.end, chunk.end)
+            if end - start > span or len(begun.content) + chunk.size > self._chunk_size:
+                self._flush_chunk()
+                begins = self._gathered.start
+                if self._gathered.entries and begun.end + span - begins > GATHERED_SPAN:
+                    self.flush()
+            self._chunk.add_chunk(chunk, {*dropped, *own})
+        if own:
+            self._gather(chunk, own, whole=not rest, dropped=dropped)
+
+    def _gather(
+        self, chunk: StoredChunk, own: Collection[int], *, whole: bool, dropped: Collection[int]
+    ) -> None:
+        begun = self._gathered
         start, end = min(begun.start, chunk.start), max(begun.end, chunk.end)
-        if end - start > span or len(begun.content) + chunk.size > self._chunk_size:
+        if end - start > GATHERED_SPAN or len(begun.content) + chunk.size > self._chunk_size:
             self.flush()
-        self._chunk.add_chunk(chunk, dropped)
+        if whole:
+            self._gathered.add_chunk(chunk, dropped)
+        else:
+            self._gathered.gather(chunk, own)
 
     def finish(self) -> None:
         """Write the chunk in progress, the index and the footer; the stream stays open."""

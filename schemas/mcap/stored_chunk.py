@@ -148,6 +148,27 @@ class ChunkBuilder:
         for first, last in zip(firsts, lasts, strict=True):
             self.content += content[first:last]
 
+    def gather(self, chunk: StoredChunk, channels: Collection[int]) -> None:
+        """Append the messages of some channels of a chunk, and nothing else that it holds.
+
+        Parameters
+        ----------
+        chunk : StoredChunk
+        channels : collection of int
+            Numbers of the channels.
+        """
+        content = chunk.content()
+        for channel, rows in chunk.entries.items():
+            if channel not in channels:
+                continue
+            entries = np.frombuffer(rows, INDEX_ENTRIES)
+            sizes = gather_heads(content, entries["offset"].astype(np.int64))["length"] + HEAD.size
+            for row, size in zip(entries.tolist(), sizes.tolist(), strict=True):
+                time, offset = row
+                self.entries[channel] += INDEX_ENTRY.pack(time, len(self.content))
+                self.content += content[offset : offset + size]
+                self.start, self.end = min(self.start, time), max(self.end, time)
+
     def compress(self) -> StoredChunk:
         """Compress the records; return the chunk as a file will hold it."""
         return compress_chunk(self.content, (self.start, self.end), self.entries)

@@ -15,6 +15,7 @@ from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
 from hearthlog.schemas.mcap.chunk_table import LAST_TIME
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.messages.gaps import LOG_DAMAGED, encode_gap
+from hearthlog.schemas.messages.message_types import EMBEDDING
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.gap_channel import gap_channel
@@ -94,7 +95,8 @@ class SalvagedCopy:
     profile : str
         What the header of the new log says if that of the old one is lost.
     chunk_span : int
-        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged.
+        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged. Where they
+        are joined, embeddings get chunks of their own.
     selection : Selection or None
         What is left out; chunks are joined then.
     """
@@ -232,7 +234,8 @@ class SalvagedCopy:
             return
         self._define(kept, piece.definitions[: piece.leading])
         if self._chunk_span:
-            self._writer.join_chunk(chunk, self._chunk_span, dropped)
+            gathered = {number for number in kept if self._is_gathered(number)}
+            self._writer.join_chunk(chunk, self._chunk_span, dropped, gathered)
         else:
             self._writer.copy_chunk(chunk)
         for number in kept:
@@ -268,6 +271,15 @@ class SalvagedCopy:
         if self._selection is None:
             return False
         return self._selection.drops(self._salvage.definitions.channels[number].topic)
+
+    def _is_gathered(self, number: int) -> bool:
+        """Tell whether the messages of a channel get chunks of their own.
+
+        Among features, whose bytes are as good as random, embeddings take half as much again.
+        """
+        definitions = self._salvage.definitions
+        schema = definitions.schemas.get(definitions.channels[number].schema_id)
+        return schema is not None and schema.name == EMBEDDING
 
     def _add_messages(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
         waiting = deque(losses)

@@ -1,20 +1,27 @@
-"""Embeddings of a network: ours, and the network's bare invocation."""
+"""Embeddings of a network: ours, and the network's bare invocation; and their bytes in a log."""
+
+from io import BytesIO
 
 import numpy as np
 
 from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
-from hearthlog.models.embedding.networks import YAMNET, find_network, load_embedder
+from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
 from hearthlog.models.embedding.session import TfliteSession
 from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.recorder.embedder_probe import probe_network
+from hearthlog.recorder.stream.embedding_messages import embedding_messages
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
+from hearthlog.schemas.mcap.chunk_writer import GATHERED_SPAN, ChunkWriter
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of
 from hearthlog.tools.bench.workload import Workload
 
 _SECONDS = 60.0
+_SECONDS_OF_LOG = 300.0
+_DAY = 86_400
 _AS_FAST = Target(0.8)
 _SHARE = Target(1.0, at_most=True)
+_MEGABYTES = Target(15.0, at_most=True)
 _HOP_MS = 1e3 * HOP_FRAMES * FRAME_SECONDS
 
 
@@ -45,5 +52,22 @@ def measure(work: Workload) -> Table:
         Row(f"{YAMNET.name} by LiteRT, bare", theirs, "ms"),
         Row("share of a core while there is sound", 100 * ours / _HOP_MS, "%", target=_SHARE),
         Row("a process that does nothing else", megabytes, "MB"),
+        Row("in a log that is never quiet", _logged(embedder, work), "MB a day", target=_MEGABYTES),
     ]
     return Table(title, rows)
+
+
+def _logged(embedder: Embedder, work: Workload) -> float:
+    """Measure the embeddings of sounds in the chunks that a finished log has of them."""
+    frames = work.frames(_SECONDS_OF_LOG)
+    stamps = np.arange(len(frames)) * FRAME_NANOSECONDS
+    found = EmbeddingStream(embedder).push(frames, np.ones(len(frames), bool), 0, stamps)
+    stream = BytesIO()
+    writer, begun = ChunkWriter(stream), 0
+    for message in embedding_messages("mic", found, stamps[found.last_frames]):
+        if message.log_time - begun >= GATHERED_SPAN:
+            writer.flush()
+            begun = message.log_time
+        writer.add_message(1, message.log_time, message.data, message.log_time)
+    writer.finish()
+    return len(stream.getvalue()) * _DAY / (len(frames) * FRAME_SECONDS) / 1e6
