@@ -4,6 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from hearthlog.analyzer.doctor import examine
@@ -19,8 +21,10 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.messages.topics import EmbeddingSource
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import EmbeddingSource, Topic
 from hearthlog.schemas.salvage.thin import STEPS, thin_log
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -115,6 +119,24 @@ def test_readers_find_all_messages_in_the_order_of_time(active, finished):
     assert times == [time for _, time, _ in after]
     columns = (read_columns([path], [TOPIC])[TOPIC] for path in (active, finished))
     np.testing.assert_array_equal(*(each["values"] for each in columns))
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.lists(st.integers(0, 200), min_size=1, max_size=5), max_size=30))
+def test_none_is_lost_whatever_the_times_are(tmp_path_factory, blocks):
+    path = tmp_path_factory.mktemp("log") / "home_20260301T070000Z.mcap"
+    topics = [Topic("/mic/gap", message_types.GAP), Topic(TOPIC, message_types.EMBEDDING)]
+    writer = LogWriter(path, topics, {"node": "home"})
+    for number, seconds in enumerate([[0], *blocks]):
+        for place, second in enumerate(seconds):
+            data = np.random.default_rng([number, place]).bytes(40)
+            topic = topics[(number + place) % 2].name
+            writer.write(topic, START + second * NANOSECONDS, data)
+        writer.flush()
+    writer.complete()
+    before = messages(writer.active_path)
+    finish_log(writer.active_path)
+    assert by_topic(messages(path)) == by_topic(before)
 
 
 def test_the_doctor_finds_nothing_wrong(finished):
