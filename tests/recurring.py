@@ -19,7 +19,7 @@ _LONGEST = 4 * 16_000
 
 def record_recurring(folder, start, seed, seconds=720):
     """Record some minutes, beginning at a time in ns; return when each sound was."""
-    kinds = {name: _samples(CLIPS / path) for name, path in RECURRING.items()}
+    kinds = {name: [_samples(CLIPS / path)] for name, path in RECURRING.items()}
     others = [*CLIPS.glob("coughing/*"), *CLIPS.glob("crying/*")]
     clips = [_samples(path) for path in sorted(others)]
     return recurring_scene.record_scene(kinds, clips, seconds, -60.0, folder, start, seed)

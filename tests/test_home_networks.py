@@ -21,6 +21,7 @@ from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.analyzer.review.queue.span_sounds import span_sounds
+from hearthlog.analyzer.training.home_data import lesson_recordings
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.models.features.installed import DEFAULT
@@ -158,6 +159,8 @@ def test_marks_teach_only_by_the_embeddings_that_a_model_takes(home):
         assert [one.embedding for one in found] == [e and e.source.space for e in EARS]
         heard = [len(one.embeddings.frames) > 0 for one in found]
         assert heard == [each is ear for each in EARS]
+        lessons = lesson_recordings(home, space=ear.source.space)
+        assert [one.embedded is not None for one in lessons] == heard
     wider = EmbeddingSpace("one", "a" * 64, WIDTH)
     found = read_reviewed_sound(home, DEFAULT, space=wider)
     assert not any(len(one.embeddings.frames) for one in found)
@@ -190,7 +193,7 @@ def test_doctor_and_report_say_when_a_home_began_changed_or_lost_its_network(
     days, hearthlog, tmp_path
 ):
     said = (
-        "mic: heard without a network, 1 changes, from 2026-03-03 08:00 with other, from 2026-03-04"
+        "mic: heard without a network, …, from 2026-03-03 08:00 with other, from 2026-03-04"
         " 08:00 with one, from 2026-03-05 08:00 with another projection of one"
     )
     done = hearthlog("doctor", days)

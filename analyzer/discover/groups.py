@@ -16,6 +16,7 @@ MOST_DIMENSIONS = 16
 _CLOSE = 3  # neighbours by which a density is judged
 MOST_EXAMPLES = 200  # that are kept of a group
 _FEWEST_EMBEDDED = 16  # sounds, of which a space is made
+_LARGEST = 0.75  # of the sounds: a cluster of more is several things, and what is between them
 _RADIUS = 95  # percentile of the distances of its examples to the next one
 _LEAST_RADIUS = 1e-6  # of sounds that are all the same
 _AT_ONCE = 1024  # points
@@ -221,7 +222,12 @@ def add_groups(
 
     if len(points) < max(2 * least, _CLOSE + 1):
         return groups
-    clusters = HDBSCAN(min_cluster_size=least, min_samples=_CLOSE, copy=True)
+    clusters = HDBSCAN(
+        min_cluster_size=least,
+        min_samples=_CLOSE,
+        max_cluster_size=max(int(_LARGEST * len(points)), least),
+        copy=True,
+    )
     labels = clusters.fit_predict(points if embedded is None else embedded)
     sizes = np.bincount(labels[labels >= 0])
     for label in np.argsort(-sizes, kind="stable"):

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 from hearthlog.analyzer.logs.home_logs import HomeLog
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.logs.recorder_info import microphones_of
+from hearthlog.analyzer.logs.recorder_info import embedding_source, microphones_of
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.messages.topics import EmbeddingSource, EmbeddingSpace, topic
+from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _MOST = 4  # changes that are named
 
@@ -34,30 +34,14 @@ def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
     for log in logs:
         with suppress(LogError), LogFile(log.path) as file:
             for microphone in sorted(microphones_of(file, "features")):
-                heard.setdefault((log.node, microphone), []).append(
-                    (log.start, embedding_space(file, microphone))
-                )
+                source = embedding_source(file, microphone)
+                space = None if source is None else source.space
+                heard.setdefault((log.node, microphone), []).append((log.start, space))
     return [
         f"{microphone}: {_changes(times, zone)}"
         for (_, microphone), times in sorted(heard.items())
         if len({space for _, space in times}) > 1
     ]
-
-
-def embedding_space(file: LogFile, microphone: str) -> EmbeddingSpace | None:
-    """Return of which network and projection a log has embeddings; None if it has none.
-
-    Parameters
-    ----------
-    file : LogFile
-        Open.
-    microphone : str
-        Its name.
-    """
-    name = topic(microphone, "embedding")
-    channels = (channel for channel in file.channels.values() if channel.topic == name)
-    sources = (EmbeddingSource.from_metadata(channel.metadata) for channel in channels)
-    return next((source.space for source in sources if source is not None), None)
 
 
 def _changes(times: list[tuple[int, EmbeddingSpace | None]], zone: tzinfo) -> str:
@@ -67,7 +51,7 @@ def _changes(times: list[tuple[int, EmbeddingSpace | None]], zone: tzinfo) -> st
             moment = f"{local_time(start, zone):%Y-%m-%d %H:%M}"
             parts.append(f"from {moment} {_with(space, before)}")
     if len(parts) > _MOST:
-        parts = [parts[0], f"{len(parts) - _MOST} changes", *parts[1 - _MOST :]]
+        parts = [parts[0], "…", *parts[1 - _MOST :]]
     text = ", ".join(parts)
     return f"{text}; only what one network heard is compared, all else by features"
 

@@ -163,7 +163,7 @@ def _info_of(
         attachments=attachments,
         first_frame=first,
         has_directions=kind == "features" and _has_topic(file, topic(microphone, "direction")),
-        embedding=_embedding(file, microphone) if kind == "features" else None,
+        embedding=embedding_source(file, microphone) if kind == "features" else None,
     )
 
 
@@ -178,8 +178,16 @@ def _set_of_names(file: LogFile, name: str) -> str:
     return ours.get(tuple(names), _UNNAMED) if names else ""
 
 
-def _embedding(file: LogFile, microphone: str) -> EmbeddingSource | None:
-    """Return what the channel of embeddings says of their network."""
+def embedding_source(file: LogFile, microphone: str) -> EmbeddingSource | None:
+    """Return of which network and projection a log has embeddings; None if it has none.
+
+    Parameters
+    ----------
+    file : LogFile
+        Open.
+    microphone : str
+        Its name.
+    """
     name = topic(microphone, "embedding")
     channels = (channel for channel in file.channels.values() if channel.topic == name)
     return next((EmbeddingSource.from_metadata(channel.metadata) for channel in channels), None)

@@ -1,8 +1,9 @@
 """`python -m hearthlog.tools.bench.recurring MANIFEST`: how well sounds that recur are known again.
 
-Ten kinds of sounds that no class of the starter model is about are drawn from a manifest with a
-column `detail`, one clip of each. They recur for some days among other sounds. The groups of the
-first day are named by what most of their sounds are; the other days show what those names give.
+Ten kinds of sounds that no class of the starter model is about are drawn from manifests with a
+column `detail`, one clip of each or several. They recur for some days among other sounds. The
+groups of the first day are named by what most of their sounds are; the other days show what those
+names give: by features, and where there is a network by what it hears, too.
 """
 
 import csv
@@ -10,6 +11,7 @@ import random
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -19,8 +21,8 @@ from numpy.typing import NDArray
 from sklearn.metrics import adjusted_rand_score
 
 from hearthlog.analyzer.discover.discover import discover
-from hearthlog.analyzer.discover.groups import NO_GROUP, Groups
-from hearthlog.analyzer.discover.read_sounds import read_sounds
+from hearthlog.analyzer.discover.groups import NO_GROUP
+from hearthlog.analyzer.discover.read_sounds import HomeSounds, read_sounds
 from hearthlog.analyzer.discover.sound_spans import ALL
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -39,26 +41,31 @@ _START = 1_772_352_000 * NANOSECONDS
 _DAY = 86_400 * NANOSECONDS
 
 
-def recurring(
-    manifest: Annotated[Path, typer.Argument(help="Of clips, with a column detail.")],
+def recurring(  # noqa: PLR0913, PLR0917
+    manifests: Annotated[list[Path], typer.Argument(help="Of clips, with a column detail.")],
+    clips: Annotated[int, typer.Option(min=1, help="Of each kind, of as many sources.")] = 1,
     days: Annotated[int, typer.Option(min=2)] = 4,
     minutes: Annotated[float, typer.Option(min=2, help="A day.")] = 30.0,
     noise: Annotated[float, typer.Option(help="Level of the room, dBFS.")] = -48.0,
     seed: Annotated[int, typer.Option(help="Of what is drawn.")] = 1,
 ) -> None:
     """Draw ten kinds of sounds that recur, and tell how well groups of them are found."""
-    kinds, others = _drawn(manifest, seed)
+    kinds, others = _drawn(manifests, seed, clips)
     print(", ".join(kinds), flush=True)
     with tempfile.TemporaryDirectory(prefix="hearthlog-recurring-") as folder:
         logs, truth = Path(folder) / "logs", list[Sounded]()
         for day in range(days):
             start = _START + day * _DAY
             truth += record_scene(kinds, others, 60 * minutes, noise, logs, start, 100 * seed + day)
-        groups, _ = _grouped(logs, truth, None, _START + _DAY)
-        _, sounds = _grouped(logs, truth, groups)
-    known = len(groups.numbers)
-    sounds = sounds._replace(of=np.where(sounds.of < known, sounds.of, NO_GROUP))
-    print(Table(f"recurring: ten sounds on {days} days", _rows(list(kinds), sounds, truth, known)))
+        with read_sounds(find_home_logs([logs]), ALL) as sounds:
+            none = np.empty((len(sounds.descriptors), 0), np.float32)
+            ways = {"features": replace(sounds, embedding=None, embeddings=none)}
+            if sounds.embedding is not None:
+                ways[f"features and {sounds.embedding.network}"] = sounds
+            for way, described in ways.items():
+                grouped, known = _grouped(described, truth)
+                rows = _rows(list(kinds), grouped, truth, known)
+                print(Table(f"recurring: ten sounds on {days} days, by {way}", rows))
 
 
 class _Grouped(NamedTuple):
@@ -82,34 +89,56 @@ class _Grouped(NamedTuple):
     is_early: Bool
 
 
-def _drawn(manifest: Path, seed: int) -> tuple[dict[str, Float32], list[Float32]]:
-    with manifest.open(newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    first: dict[str, str] = {}
-    for row in rows:
-        if row["label"] in _UNNAMED:
-            first.setdefault(row.get("detail", ""), row["path"])
-    if len(first) < _KINDS:
-        raise DataError(f"{manifest}: {len(first)} kinds of sounds by detail; it takes {_KINDS}")
+def _drawn(
+    manifests: Sequence[Path], seed: int, clips: int
+) -> tuple[dict[str, list[Float32]], list[Float32]]:
+    kinds: dict[str, dict[str, Path]] = {}  # and their clips, one of a source
+    background: list[Path] = []
+    for manifest in manifests:
+        with manifest.open(newline="", encoding="utf-8") as stream:
+            for row in csv.DictReader(stream):
+                path = manifest.parent / row["path"]
+                if row["label"] in _UNNAMED:
+                    own = kinds.setdefault(row.get("detail", ""), {})
+                    own.setdefault(row.get("source_group", row["path"]), path)
+                elif row["label"] in _BACKGROUND:
+                    background.append(path)
+    kinds = {name: own for name, own in kinds.items() if len(own) >= clips}
+    if len(kinds) < _KINDS:
+        raise DataError(
+            f"{manifests[0]}: {len(kinds)} kinds of sounds by detail with {clips} clips; it takes "
+            f"{_KINDS}"
+        )
     rng = random.Random(1000 + seed)
-    kinds = {name: _samples(manifest, first[name]) for name in rng.sample(sorted(first), _KINDS)}
-    paths = [row["path"] for row in rows if row["label"] in _BACKGROUND]
-    chosen = rng.sample(paths, min(len(paths), _MOST_OTHERS))
-    return kinds, [_samples(manifest, path) for path in chosen]
+    drawn = {
+        name: [_samples(path) for path in [*kinds[name].values()][:clips]]
+        for name in rng.sample(sorted(kinds), _KINDS)
+    }
+    chosen = rng.sample(background, min(len(background), _MOST_OTHERS))
+    return drawn, [_samples(path) for path in chosen]
 
 
-def _samples(manifest: Path, path: str) -> Float32:
-    return np.concatenate([*read_audio(manifest.parent / path)])
+def _samples(path: Path) -> Float32:
+    return np.concatenate([*read_audio(path)])
 
 
-def _grouped(
-    logs: Path, truth: Sequence[Sounded], groups: Groups | None, end: int | None = None
-) -> tuple[Groups, _Grouped]:
-    with read_sounds(find_home_logs([logs]), ALL, None, end) as sounds:
-        found, of, _ = discover(sounds, groups)
-        names, events = names_of(sounds.spans, truth)
-        is_early = sounds.spans.starts < _START + _DAY
-    return found, _Grouped(of, np.array(names), np.array(events), is_early)
+def _grouped(sounds: HomeSounds, truth: Sequence[Sounded]) -> tuple[_Grouped, int]:
+    """Group the sounds of the first day, and know those of all days by these groups."""
+    names, events = names_of(sounds.spans, truth)
+    is_early = sounds.spans.starts < _START + _DAY
+    first = replace(
+        sounds,
+        log=sounds.log[is_early],
+        microphone=sounds.microphone[is_early],
+        spans=sounds.spans.rows(is_early),
+        descriptors=sounds.descriptors[is_early],
+        embeddings=sounds.embeddings[is_early],
+    )
+    groups, _, _ = discover(first, None)
+    _, of, _ = discover(sounds, groups)
+    known = len(groups.numbers)
+    of = np.where(of < known, of, NO_GROUP)
+    return _Grouped(of, np.array(names), np.array(events), is_early), known
 
 
 def _rows(
@@ -117,7 +146,11 @@ def _rows(
 ) -> list[Row]:
     names = np.array([*(_name(sounds, group) for group in range(groups)), OTHER])
     named = names[sounds.of]  # the last one for those of no group
-    recurs = sounds.kinds != OTHER
+    recurs, is_grouped = sounds.kinds != OTHER, sounds.of != NO_GROUP
+    right = sum(
+        np.unique(sounds.kinds[sounds.of == g], return_counts=True)[1].max(initial=0)
+        for g in range(groups)
+    )
     shares = [_share(kind, named, sounds, truth) for kind in kinds]
     single = sum(_is_one_group(kind, sounds) for kind in kinds)
     index = float(adjusted_rand_score(sounds.kinds[recurs], sounds.of[recurs]))
@@ -125,6 +158,8 @@ def _rows(
     return [
         Row("one group each", single, "of 10", target=Target(8)),
         Row("adjusted Rand index", index, target=Target(0.7)),
+        Row("purity of the groups", float(right / max(is_grouped.sum(), 1))),
+        Row("sounds that recur and are of a group", float(is_grouped[recurs].mean())),
         Row("events of the later days that names give", given, target=Target(0.7)),
         *(
             Row(f"  {kind}", share, note=f"{right:.0%} of what gets the name")

@@ -35,7 +35,7 @@ class Sounded(NamedTuple):
 
 
 def record_scene(  # noqa: PLR0913, PLR0917
-    recurring: Mapping[str, Float32],
+    recurring: Mapping[str, Sequence[Float32]],
     others: Sequence[Float32],
     seconds: float,
     noise: float,
@@ -50,8 +50,8 @@ def record_scene(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    recurring : mapping of str to np.ndarray [shape=(n,)], float32
-        Samples at 16 kHz, by name.
+    recurring : mapping of str to sequence of np.ndarray [shape=(n,)], float32
+        Samples at 16 kHz, by name: clips, one of which is drawn each time.
     others : sequence of np.ndarray [shape=(n,)], float32
         Sounds of which one is drawn each time.
     seconds : float
@@ -68,7 +68,8 @@ def record_scene(  # noqa: PLR0913, PLR0917
     truth, at = [], 2.0
     while at < seconds - (_LONGEST + _ROOM) / SAMPLE_RATE - 1:
         name = OTHER if rng.random() < _SHARE_OF_OTHERS else rng.choice(sorted(recurring))
-        clip = recurring[name] if name else rng.choice(others)
+        clips = recurring[name] if name else others
+        clip = clips[0] if len(clips) == 1 else rng.choice(clips)
         take = _another_take(clip[:_LONGEST], rng, noises)
         scene[int(at * SAMPLE_RATE) :][: len(take)] += take
         end = at + len(take) / SAMPLE_RATE
