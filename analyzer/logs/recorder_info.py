@@ -197,7 +197,7 @@ def _has_topic(file: LogFile, name: str) -> bool:
     return any(channel.topic == name for channel in file.channels.values())
 
 
-def embedding_source(path: Path) -> EmbeddingSource | None:
+def first_embedding_source(path: Path) -> EmbeddingSource | None:
     """Read of which network and projection the embeddings of a log are; None if it has none.
 
     Parameters
@@ -212,7 +212,7 @@ def embedding_source(path: Path) -> EmbeddingSource | None:
     with LogFile(path) as file:
         if not file.channels:
             read_chunks(file, file.chunks[:1], topics=())  # as above
-        names = (_embedding(file, name) for name in sorted(microphones_of(file, "features")))
+        names = (embedding_source(file, name) for name in sorted(microphones_of(file, "features")))
         return next(filter(None, names), None)
 
 

@@ -204,7 +204,7 @@ def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
     It is one for all, so that what is labelled has one name: without embeddings it is about as
     right as the other starter.
     """
-    from hearthlog.analyzer.logs.recorder_info import embedding_source
+    from hearthlog.analyzer.logs.recorder_info import first_embedding_source
     from hearthlog.models.classifiers.classifier import Classifier
     from hearthlog.models.modelfile.modelfile import load_model, starter_for
     from hearthlog.models.starter import NETWORK
@@ -219,7 +219,7 @@ def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
         with suppress(LogError):  # which is told where they are read
             for log in reversed(find_logs(path)):
                 with suppress(LogError):
-                    if classifier.takes_embeddings(embedding_source(log)):
+                    if classifier.takes_embeddings(first_embedding_source(log)):
                         return other
     return model
 
