@@ -269,7 +269,7 @@ def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, st
         say(why)
         return embedder, "the network cannot be used"
     if embedder is not None:
-        return embedder, f"it takes nothing of the network {embedder.network.name}"
+        return embedder, f"it takes nothing of the network {embedder.source.network}"
     if settings.embedding == NO_NETWORK:
         return embedder, "no network is wanted"
     return embedder, f"the network {NETWORK} is not there"
@@ -280,7 +280,7 @@ def _tell_of_starters(
 ) -> None:
     """Say which starter models label, and whether a network says with them what is heard."""
     for name in dict.fromkeys(each.starter for each in models.values()):
-        is_heard = embedder is not None and embedder.network.name == NETWORK
+        is_heard = embedder is not None and embedder.source.network == NETWORK
         by = f"what the network {NETWORK} hears"
         if name in BY_FEATURES or not is_heard:
             by = f"features alone, as {why}"
@@ -301,7 +301,7 @@ def _record(  # noqa: PLR0913, PLR0917
         # Who records for years goes on without a scenario that has become impossible.
         leaves_out = lock is not None
         embedder, why = _embedder(settings, len(sources))
-        network = "" if embedder is None else embedder.network.name
+        network = "" if embedder is None else embedder.source.network
         models = open_models(
             settings,
             list(sources),
