@@ -597,7 +597,7 @@ DATA = {
     "a label by the stamp of another moment": (label_stamp(1), {"frame-stamp"}),
     "a label by the stamp of another frame": (label_stamp(FRAME_NANOSECONDS), {"frame-stamp"}),
     "a label of what is not over": (label_stamp(NANOSECONDS), {"frame-stamp", "stamp"}),
-    "a label that is known too late": (label_stamp(-NANOSECONDS), {"frame-stamp", "stamp"}),
+    "a label that is known too late": (label_stamp(-3 * NANOSECONDS), {"frame-stamp", "stamp"}),
     "a label of another width": (change(LABEL, probabilities=np.ones(1, np.float32)), {"width"}),
     "a label of no class": (change(LABEL, label="murder"), {"class"}),
     "a confidence that is another's": (change(LABEL, confidence=0.123), {"confidence"}),

@@ -142,7 +142,7 @@ def test_a_pause_follows_no_link_and_belongs_to_whom_the_folder_belongs_to(tmp_p
 
 def test_a_pause_ends_by_itself(tmp_path):
     rest = Rest([], UTC, tmp_path)
-    pause(tmp_path, timedelta(seconds=1))
+    pause(tmp_path, timedelta(seconds=5))
     assert rest.reason() == "paused"
     wait_for(lambda: rest.reason() == "")
 

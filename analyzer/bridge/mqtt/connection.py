@@ -22,7 +22,8 @@ from hearthlog.schemas.storage.small_file import read_whole
 
 _KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
 _QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection
-_KEPT_SECONDS = 0.5  # in which a broker sends what it kept to who has subscribed
+_KEPT_SECONDS = 0.5  # without a message that a broker kept: it has sent all of them
+_MOST_KEPT_SECONDS = 10.0  # for a broker that keeps very much, or does not confirm subscriptions
 _ANSWER_SECONDS = 2.0  # in which a broker has taken an event
 _TIMELY_SECONDS = 60.0  # after which an event is no news
 _FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
@@ -193,7 +194,7 @@ class Connection:
         client.on_disconnect = self._on_disconnect
         client.on_publish = self._on_publish
         client.on_subscribe = self._on_subscribe
-        client.on_message = lambda _client, _data, message: self._received(message)
+        client.on_message = self._on_message
         client.connect_async(settings.host, _port(settings), _KEEPALIVE)
         client.loop_start()
         return client
@@ -229,7 +230,9 @@ class Connection:
             client.subscribe([(topic, _QOS) for topic in self._subscriptions])
         client.publish(self._alive, "online", _QOS, retain=True)
         self._is_new = True
-        self._ready_at = self._connected + _KEPT_SECONDS
+        self._ready_at = self._connected
+        if self._subscriptions:
+            self._ready_at += _MOST_KEPT_SECONDS
 
     def _on_connect_fail(self, _client: mqtt.Client, _data: Any) -> None:
         error = sys.exc_info()[1]  # called while it is handled
@@ -275,9 +278,21 @@ class Connection:
     def _on_subscribe(
         self, _client: mqtt.Client, _data: Any, _number: int, reasons: list[ReasonCode], _more: Any
     ) -> None:
+        self._wait_for_kept()
         for topic, reason in zip(self._subscriptions, reasons, strict=False):
             if reason.is_failure:
                 self._say(f"{self._place}: may not read {topic}: {reason}")
+
+    def _on_message(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
+        if message.retain:
+            self._wait_for_kept()
+        self._received(message)
+
+    def _wait_for_kept(self) -> None:
+        """Be ready a while from now, for more of what the broker kept may come."""
+        since = self._connected
+        if since is not None:
+            self._ready_at = min(time.monotonic() + _KEPT_SECONDS, since + _MOST_KEPT_SECONDS)
 
 
 def place_of(settings: MqttSettings) -> str:
