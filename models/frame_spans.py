@@ -1,4 +1,4 @@
-"""What is known of spans of frames of one stream: directions of blocks, embeddings of windows."""
+"""Spans of frames with values: the base of directions of blocks and embeddings of windows."""
 
 from dataclasses import dataclass, fields
 from typing import ClassVar, Self

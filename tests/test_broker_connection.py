@@ -3,6 +3,7 @@
 import gc
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from brokers import Broker, Listener, settled_values
@@ -55,6 +56,44 @@ def test_a_broker_that_forgot_everything_is_told_everything_again(broker):
             ALIVE: "online",
             "hearthlog/home/mic/class/coughing/on": "OFF",
         }
+
+
+def test_a_closed_connection_keeps_no_socket_open(broker):
+    before = open_sockets()
+    with connected(broker) as (connection, _):
+        flush_until(connection, connection.is_ready)
+        own = open_sockets() - before
+        assert own
+    assert not own & open_sockets()  # though the connection is still referred to
+
+
+def test_a_connection_is_not_ready_before_all_that_the_broker_kept_has_come(broker):
+    topics = [f"hearthlog/old/{number}" for number in range(8)]
+    with Listener(broker.port) as listener:
+        for topic in topics:
+            listener.publish(topic, "x", retain=True)
+    came = []
+
+    def received(message):
+        time.sleep(0.2)  # a machine that is busy
+        came.append(message.topic)
+
+    settings = MqttSettings(host="127.0.0.1", port=broker.port)
+    subscriptions = ("hearthlog/old/#",)
+    connection = Connection(
+        settings, "x", ALIVE, print, subscriptions=subscriptions, received=received
+    )
+    try:
+        flush_until(connection, connection.is_ready)
+        assert sorted(came) == topics
+    finally:
+        connection.close()
+
+
+def open_sockets() -> set[str]:
+    """Return the sockets that this process has open."""
+    files = [file for file in Path("/proc/self/fd").iterdir() if file.is_symlink()]
+    return {name for file in files if (name := str(file.readlink())).startswith("socket:")}
 
 
 def test_a_value_is_said_once_and_an_event_each_time(broker):

@@ -212,12 +212,12 @@ def sound(tmp_path_factory) -> Path:
     return path
 
 
-def record(sound, logs, monkeypatch, **settings) -> Path:
+def record(sound, logs, monkeypatch, **changes) -> Path:
     monkeypatch.setattr("hearthlog.recorder.recording.open_embedder", lambda *_: (Tones(), ""))
-    asked = Settings(
-        **{"output": logs, "model": GENERAL, "scenarios": {"audioset": AUDIOSET}, **settings}
+    settings = Settings(
+        **{"output": logs, "model": GENERAL, "scenarios": {"audioset": AUDIOSET}, **changes}
     )
-    (log,) = record_files(asked, FileSource([sound], START), Flag()).logs
+    (log,) = record_files(settings, FileSource([sound], START), Flag()).logs
     return log
 
 
@@ -315,8 +315,8 @@ def test_a_model_that_is_taught_a_class_takes_it_from_the_names(tmp_path, monkey
 
 
 def test_a_scenario_of_names_without_a_network_says_so_and_is_silent(sound, tmp_path, capfd):
-    asked = Settings(output=tmp_path, model=GENERAL, scenarios={"audioset": AUDIOSET})
-    (log,) = record_files(asked, FileSource([sound], START), Flag()).logs
+    settings = Settings(output=tmp_path, model=GENERAL, scenarios={"audioset": AUDIOSET})
+    (log,) = record_files(settings, FileSource([sound], START), Flag()).logs
     assert heard(log) == []
     assert "it labels nothing (hearthlog models fetch yamnet)" in capfd.readouterr().err
 

@@ -171,7 +171,7 @@ def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
 def _fits(
     arrays: dict[str, NDArray[Any]], prefix: str, count: int, widths: tuple[int, int]
 ) -> bool:
-    """Tell whether the arrays of a space fit each other."""
+    """Return whether shapes, classes and scales of the arrays of a space are consistent."""
     mean, scale, axes, examples, of, radii = (arrays[prefix + name] for name in _ARRAYS)
     return bool(
         mean.shape == scale.shape == axes.shape[1:]

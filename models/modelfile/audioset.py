@@ -99,7 +99,7 @@ def audioset_file() -> bytes:
 
 
 def is_by_names(model: Model) -> bool:
-    """Tell whether a model labels by names, which give way to any model that was taught a class.
+    """Return whether a model labels by names, which leave a class to any model that learned it.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ class Topic:
 
 
 class EmbeddingSpace(NamedTuple):
-    """Whose embeddings can be compared: those of one network by one projection.
+    """Network and projection of embeddings; only those of the same space can be compared.
 
     Attributes
     ----------

@@ -273,7 +273,7 @@ class SalvagedCopy:
         return self._selection.drops(self._salvage.definitions.channels[number].topic)
 
     def _is_gathered(self, number: int) -> bool:
-        """Tell whether the messages of a channel get chunks of their own.
+        """Return whether the messages of a channel get chunks of their own.
 
         Among features, whose bytes are as good as random, embeddings take half as much again.
         """
