@@ -16,7 +16,7 @@ from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.recorder.stream.private_frames import PrivateFrames
+from hearthlog.recorder.stream.private_frames import PRIVATE_LOGIT, PrivateFrames
 from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.topics import EmbeddingSource
@@ -34,11 +34,9 @@ class Doubling:
         return np.rint(100 * np.array([window.min(), window.max()])).astype(np.int8)
 
 
-class AsTheyAre:
-    """Heads that say what the integers are."""
-
-    def log_probabilities(self, values):
-        return values.astype(np.float64)
+def as_they_are(values):
+    """Evidence that is the integers."""
+    return values.astype(np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +102,7 @@ def test_a_restart_embeds_no_window_from_both_sides():
 
 
 def test_frames_between_two_windows_have_both_in_proportion_and_others_the_only_one():
-    evidence = EmbeddingEvidence(AsTheyAre(), 2)
+    evidence = EmbeddingEvidence(as_they_are, 2)
     evidence.push(embeddings_at(0, 10, 40), 0)
     said = evidence.at(0, 70)
     np.testing.assert_allclose(said[10:20, 0], np.arange(10) + 0.5)  # from 0 at 10 to 10 at 20
@@ -115,13 +113,23 @@ def test_frames_between_two_windows_have_both_in_proportion_and_others_the_only_
     assert np.isnan(said[60:]).all()
 
 
+def test_names_around_a_frame_count_as_the_higher_of_the_two_windows():
+    evidence = EmbeddingEvidence(as_they_are, 2)
+    evidence.push(embeddings_at(0, 10, 40), 0)
+    highest = evidence.highest_at(0, 70)
+    np.testing.assert_array_equal(highest[10:30, 0], 10.0)
+    np.testing.assert_array_equal(highest[0:10, 0], 0.0)
+    np.testing.assert_array_equal(highest[40:60, 0], 40.0)
+    assert np.isnan(highest[30:40]).all()
+
+
 @pytest.mark.parametrize("step", [1, 7, 30])
 def test_what_is_said_of_frames_is_the_same_in_pieces_of_any_size(step):
     embeddings = embeddings_at(*range(0, 300, 10))
-    whole = EmbeddingEvidence(AsTheyAre(), 2)
+    whole = EmbeddingEvidence(as_they_are, 2)
     whole.push(embeddings, 0)
     expected = whole.at(0, 300)
-    parts, pieces = EmbeddingEvidence(AsTheyAre(), 2), []
+    parts, pieces = EmbeddingEvidence(as_they_are, 2), []
     for first in range(0, 300, step):
         parts.push(embeddings.known_at(first, step), first)
         begin, end = max(first - 19, 0), max(first + step - 19, 0)
@@ -147,6 +155,37 @@ def test_private_frames_are_those_of_labels_that_wait_for_embeddings_too():
     np.testing.assert_array_equal(early[:count], late[:count])
     assert early[60:90].any()
     assert not early[20:50].any()
+
+
+def private_frames(said, logit, *, elsewhere=True):
+    """Which of 100 frames are private, of one probability of speech and one logit of its names."""
+    from test_veil import labels_of  # noqa: PLC0415  its labels of speech
+
+    labels = labels_of(np.full(100, said, np.float32))
+    names = np.full(labels.probabilities.shape, logit)
+    guard = PrivateFrames(["speech"], 20)
+    decided = guard.push(100, labels._replace(by_names=names, calibrated_elsewhere=elsewhere))
+    return decided[20:]
+
+
+@pytest.mark.parametrize(
+    ("said", "logit", "elsewhere", "private"),
+    [
+        (0.0, PRIVATE_LOGIT, True, True),  # the network alone may forbid
+        (0.0, PRIVATE_LOGIT - 0.25, True, False),
+        (0.09, PRIVATE_LOGIT - 0.25, True, False),  # both must be unsure
+        (0.11, PRIVATE_LOGIT - 0.25, True, True),
+        (0.05, np.nan, True, True),  # no embedding: as without a network
+        (0.03, np.nan, True, False),
+        (0.03, PRIVATE_LOGIT - 0.25, False, True),  # a model that is surer than it should be
+    ],
+)
+def test_names_of_a_network_forbid_and_where_they_do_not_features_may_be_less_sure(
+    said, logit, elsewhere, private
+):
+    decided = private_frames(said, logit, elsewhere=elsewhere)
+    assert len(decided)
+    assert (decided == private).all()
 
 
 def test_embeddings_are_dropped_whose_windows_reach_into_what_is_private():

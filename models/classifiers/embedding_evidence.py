@@ -1,6 +1,6 @@
-"""The probabilities of frames by embeddings, interpolated between the middles of windows."""
+"""What embeddings say of frames, by the windows around them."""
 
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,28 +15,21 @@ from hearthlog.schemas.arrays import Float64
 _MIDDLE = WINDOW_FRAMES // 2
 
 
-class Heads(Protocol):
-    """Turns embeddings into logarithms of probabilities."""
-
-    def log_probabilities(self, values: Int8) -> Float64:
-        """Compute the logarithms of the probabilities of C classes, shape (m, C)."""
-
-
 class EmbeddingEvidence:
-    """Interpolates the log-probabilities of windows to frames.
+    """Brings the evidence of windows, a value for each class, to frames.
 
-    A frame between the middles of two windows has both of them in proportion, or the only one that
-    there is.
+    A frame lies between the middles of two windows, of which one or both may be missing.
 
     Parameters
     ----------
-    heads : Heads
+    of_windows : callable
+        Turns embeddings, shape (m, W), into values, shape (m, C).
     classes : int
         Number of classes.
     """
 
-    def __init__(self, heads: Heads, classes: int) -> None:
-        self._heads = heads
+    def __init__(self, of_windows: Callable[[Int8], Float64], classes: int) -> None:
+        self._evidence_of = of_windows
         self._classes = classes
         self.restart()
 
@@ -59,7 +52,7 @@ class EmbeddingEvidence:
             self._first = first
         if not len(embeddings.frames):
             return
-        values = self._heads.log_probabilities(embeddings.values)
+        values = self._evidence_of(embeddings.values)
         self._windows = np.append(self._windows, embeddings.frames // HOP_FRAMES)
         self._values = np.concatenate([self._values, values])
 
@@ -75,7 +68,7 @@ class EmbeddingEvidence:
         return self._first is not None and begin >= self._first
 
     def at(self, first: int, count: int) -> Float64:
-        """Return the log-probabilities of successive frames, and forget those of earlier ones.
+        """Interpolate the evidence to successive frames, and forget that of earlier ones.
 
         Parameters
         ----------
@@ -87,16 +80,25 @@ class EmbeddingEvidence:
         np.ndarray [shape=(count, C)], float64
             NaN where there is no window.
         """
-        frames = np.arange(first, first + count)
-        before = (frames - _MIDDLE) // HOP_FRAMES
-        share = ((frames - _MIDDLE) % HOP_FRAMES + 0.5)[:, np.newaxis] / HOP_FRAMES
+        share = ((np.arange(first, first + count) - _MIDDLE) % HOP_FRAMES + 0.5) / HOP_FRAMES
+        earlier, later = self._around(first, count)
+        earlier = np.where(np.isnan(earlier), later, earlier)
+        later = np.where(np.isnan(later), earlier, later)
+        by_heads: Float64 = (1.0 - share[:, np.newaxis]) * earlier + share[:, np.newaxis] * later
+        return by_heads
+
+    def highest_at(self, first: int, count: int) -> Float64:
+        """Return the higher evidence of the two windows, as `at` returns the interpolated one."""
+        highest: Float64 = np.fmax(*self._around(first, count))
+        return highest
+
+    def _around(self, first: int, count: int) -> tuple[Float64, Float64]:
+        """Return the values of the windows before and after frames, and forget earlier windows."""
+        before = (np.arange(first, first + count) - _MIDDLE) // HOP_FRAMES
         earlier, later = self._of_windows(before), self._of_windows(before + 1)
         keep = np.searchsorted(self._windows, (first + count - _MIDDLE) // HOP_FRAMES)
         self._windows, self._values = self._windows[keep:], self._values[keep:]
-        earlier = np.where(np.isnan(earlier), later, earlier)
-        later = np.where(np.isnan(later), earlier, later)
-        by_heads: Float64 = (1.0 - share) * earlier + share * later
-        return by_heads
+        return earlier, later
 
     def _of_windows(self, numbers: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64:
         """Return the log-probabilities of windows; NaN where there is none."""

@@ -1,6 +1,7 @@
 """From the features of one stream to labels and segments, and to columns of their messages."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.directions import DirectionEvidence
 from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
+from hearthlog.models.embedding.embeddings import Int8
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
 from hearthlog.schemas.arrays import Float32, Float64, Int64
@@ -40,6 +42,9 @@ class FrameLabels(NamedTuple):
         As of the classifier.
     ahead : int
         Frames behind the window that they waited for.
+    by_names : np.ndarray [shape=(n, C)], float64, or None
+        Highest logit that a network gives to the names of each class around the frame; NaN where
+        there is no embedding, or the class has no names.
     """
 
     classes: tuple[str, ...]
@@ -51,6 +56,7 @@ class FrameLabels(NamedTuple):
     novelty: Float32
     calibrated_elsewhere: bool
     ahead: int = 0
+    by_names: Float64 | None = None
 
     def columns(self, microphone: str) -> dict[str, Column]:
         """Return the fields of one `AudioLabel` for each frame.
@@ -112,8 +118,13 @@ class Labeller:
         weights = classifier.direction_weights(microphone)
         self._evidence = None if weights is None else DirectionEvidence(weights)
         self._embedded: EmbeddingEvidence | None = None
-        if classifier.embedding_heads and classifier.takes_embeddings(embedding):
-            self._embedded = EmbeddingEvidence(classifier.embedding_heads, len(self.classes))
+        self._named: EmbeddingEvidence | None = None
+        if embedding and classifier.embedding_heads and classifier.takes_embeddings(embedding):
+            heads = classifier.embedding_heads.log_probabilities
+            logits = partial(_logits_of_names, source=embedding, classes=self.classes)
+            self._embedded = EmbeddingEvidence(heads, len(self.classes))
+            self._named = EmbeddingEvidence(logits, len(self.classes))
+        self._of_windows = [one for one in (self._embedded, self._named) if one is not None]
         self._pending: LabelledFrames | None = None  # that embeddings to come say something of
         self._pending_evidence: Float64 | None = None  # of directions, for them
         self._inputs_converged = (
@@ -167,8 +178,8 @@ class Labeller:
         if self._evidence is not None:
             before = frame - len(features), len(features)
             self._evidence.push(auxiliary.directions, *before, 0)
-        if self._embedded is not None:
-            self._embedded.push(auxiliary.embeddings, frame - len(features))
+        for evidence_of_windows in self._of_windows:
+            evidence_of_windows.push(auxiliary.embeddings, frame - len(features))
 
     def push(
         self,
@@ -219,11 +230,12 @@ class Labeller:
         )
         labelled, end = by_features, first + len(features) - self.timing.delay
         if ahead:
-            if self._embedded is not None:
-                self._embedded.push(auxiliary.embeddings, first)
+            for evidence_of_windows in self._of_windows:
+                evidence_of_windows.push(auxiliary.embeddings, first)
             by_features, evidence = self._complete(by_features, evidence)
             labelled, novelty = self._mixed(by_features, end - len(by_features.stamps), evidence)
         count, first = len(labelled.stamps), end - len(labelled.stamps)
+        by_names = None if self._named is None else self._named.highest_at(first, count)
         again = max(self._first_label - first, 0)  # frames that were labelled before
         labels = FrameLabels(
             self.classes,
@@ -235,6 +247,7 @@ class Labeller:
             novelty[again:],
             self._classifier.calibrated_elsewhere,
             self.timing.ahead,
+            None if by_names is None else by_names[again:],
         )
         labelled = labelled.part(slice(max(self._first_segment - first, 0), None))
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
@@ -255,8 +268,8 @@ class Labeller:
         self._inputs.restart()
         if self._evidence is not None:
             self._evidence.restart()
-        if self._embedded is not None:
-            self._embedded.restart()
+        for evidence_of_windows in self._of_windows:
+            evidence_of_windows.restart()
         self._pending = self._pending_evidence = None
         self._window, self._first_label, self._first_segment = None, 0, 0
         return self.segmenter.close(end)
@@ -339,6 +352,16 @@ class Labeller:
         loud = None if evidence is None else evidence[~quiet]
         probabilities[~quiet], novelty[~quiet] = self._classifier.classify(inputs[~quiet], loud)
         return probabilities, novelty
+
+
+def _logits_of_names(values: Int8, source: EmbeddingSource, classes: Sequence[str]) -> Float64:
+    """Return the logit of the names of each class in windows; NaN for a class without names."""
+    logits = np.full((len(values), len(classes)), np.nan)
+    for number, name in enumerate(classes):
+        if name in source.names:
+            column = source.names.index(name)
+            logits[:, number] = source.steps[column] * values[:, column].astype(np.float64)
+    return logits
 
 
 class _Frames(NamedTuple):

@@ -17,18 +17,18 @@ import typer
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.scenes import background
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
-from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
-from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import SIZE_LIMIT, LabelledClip, read_manifest
 from hearthlog.analyzer.training.rooms import reverberated
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import MUSIC, SILENCE, SPEECH
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.clips.clip_choice import ClipFinder
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
@@ -110,7 +110,11 @@ class Kept(NamedTuple):
 
 
 def measure(
-    clips: Sequence[LabelledClip], way: Way, maskers: Sequence[Float64], classifier: Classifier
+    clips: Sequence[LabelledClip],
+    way: Way,
+    maskers: Sequence[Float64],
+    classifier: Classifier,
+    embedder: Embedder | None = None,
 ) -> Kept:
     """Hear clips one after another, and count what is kept of them.
 
@@ -122,6 +126,8 @@ def measure(
         Sounds of which one is heard with each clip; none, if it is heard alone.
     classifier : Classifier
         Has a class `speech`.
+    embedder : Embedder, optional
+        Of a classifier that takes embeddings.
 
     Raises
     ------
@@ -130,7 +136,7 @@ def measure(
     """
     rng = np.random.default_rng(_SEED)
     pieces = [_settling(rng), *(heard_clip(clip, way, maskers, rng) for clip in clips)]
-    kept = _kept([piece.frames for piece in pieces], classifier)
+    kept = _kept([piece.frames for piece in pieces], classifier, embedder)
     counts = []
     start = 0
     for piece in pieces:
@@ -200,19 +206,22 @@ def _heard(sound: Float64, rng: np.random.Generator) -> Float32:
     return (pcm / 32768.0).astype(np.float32).reshape(-1, FRAME_SAMPLES)
 
 
-def _kept(pieces: Iterable[Float32], classifier: Classifier) -> Bool:
+def _kept(pieces: Iterable[Float32], classifier: Classifier, embedder: Embedder | None) -> Bool:
     """Tell which frames of a sound the recorder would keep."""
     features = classifier.feature_set
-    extractor, labeller = features.extractor(), StreamLabeller(classifier, from_start=True)
-    finder = ClipFinder("always", [SPEECH], 0, features.window_frames)
+    pipeline = Pipeline("mic", features, classifier, embedder=embedder)
+    finder = ClipFinder(
+        "always", [SPEECH], 0, features.window_frames, most_ahead=pipeline.most_ahead
+    )
     stamps: list[Int64] = []
     first = 0
     for piece in pieces:
         for start in range(0, len(piece), _BLOCK_FRAMES):
             frames = piece[start : start + _BLOCK_FRAMES]
             times = (first + np.arange(len(frames))) * FRAME_NANOSECONDS
-            labels = labeller.push(Features(first, extractor(frames), times))
-            sounds = finder.push(Frames(first, frames, times), labels)
+            pipeline.push(Frames(first, frames, times))
+            assert pipeline.last_frames is not None
+            sounds = finder.push(pipeline.last_frames, pipeline.last_labels)
             stamps += [sound.stamps for sound in sounds]
             first += len(frames)
     stamps += [sound.stamps for sound in finder.close()]
@@ -233,6 +242,11 @@ def guard(
     classifier = Classifier(load_model(model))
     if SPEECH not in classifier.classes:
         raise DataError(f"{model}: has no class {SPEECH!r}")
+    embedder = None
+    if classifier.embedding_heads is not None:
+        path = find_network(YAMNET.name)
+        embedder = None if path is None else load_embedder(YAMNET.name, path)
+        print(f"with {YAMNET.name}" if path else f"without {YAMNET.name}, which is not there")
     clips = unheard(manifests, learned)
     speech = [clip for clip in clips if clip.label == SPEECH]
     print(f"speech, {len(speech)} clips        sources  loud frames   kept  most of a collection")
@@ -240,7 +254,7 @@ def guard(
         maskers = maskers_of(clips, way.over)
         if not speech or (way.over and not maskers):
             raise DataError(f"no clips of {' or '.join(way.over or [SPEECH])} from other sources")
-        kept = measure(speech, way, maskers, classifier)
+        kept = measure(speech, way, maskers, classifier, embedder)
         print(
             f"{way.name:28s} {_sources(speech):7d} {kept.loud.sum():12d} {kept.share:5.2f}%", end=""
         )
@@ -248,7 +262,7 @@ def guard(
     print(f"\n{'other sounds':28s} {'sources':>7s} {'near':>12s} {FAR.name:>14s}")
     for label in sorted({clip.label for clip in clips} - {SPEECH, SILENCE}):
         chosen = [clip for clip in clips if clip.label == label]
-        near, far = (measure(chosen, way, [], classifier).share for way in (NEAR, FAR))
+        near, far = (measure(chosen, way, [], classifier, embedder).share for way in (NEAR, FAR))
         print(f"{label:28s} {_sources(chosen):7d} {near:11.0f}% {far:13.0f}%", flush=True)
 
 
