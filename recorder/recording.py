@@ -275,14 +275,14 @@ def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, st
     return embedder, f"the network {NETWORK} is not there"
 
 
-def _tell_of_starters(
+def _report_starters(
     models: Mapping[str, LabellingModels], embedder: Embedder | None, why: str
 ) -> None:
-    """Say which starter models label, and whether a network says with them what is heard."""
+    """Report which starter models label, and whether they take the embeddings of a network."""
     for name in dict.fromkeys(each.starter for each in models.values()):
-        is_heard = embedder is not None and embedder.source.network == NETWORK
+        takes_embeddings = embedder is not None and embedder.source.network == NETWORK
         by = f"what the network {NETWORK} hears"
-        if name in BY_FEATURES or not is_heard:
+        if name in BY_FEATURES or not takes_embeddings:
             by = f"features alone, as {why}"
         if name:
             who = f"the starter model {name}, which has never heard this home"
@@ -310,7 +310,7 @@ def _record(  # noqa: PLR0913, PLR0917
             leaves_out=leaves_out,
             network=network,
         )
-        _tell_of_starters(models, embedder, why)
+        _report_starters(models, embedder, why)
         session = RecordingSession(settings, sources, models, lock, state, embedder)
         session.say_lacking_embeddings()
         manager = ServiceManager(sources)

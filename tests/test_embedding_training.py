@@ -29,10 +29,10 @@ from hearthlog.analyzer.training.dataset import (
 from hearthlog.analyzer.training.heads import learn_heads
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.mixture import (
-    Hearing,
+    HeadInputs,
     Tried,
     best_mix,
-    hearing_of,
+    head_inputs_of,
     names_head,
     rejecting_head,
 )
@@ -48,7 +48,7 @@ from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.progress import ignore_progress
 
-HEARING = hearing_of("yamnet")
+HEARING = head_inputs_of("yamnet")
 WIDTH = len(HEARING.names)
 COLLECTIONS = 4
 CLASSES = ("silence", "speech", "music", "coughing")
@@ -392,7 +392,7 @@ def test_clips_are_heard_by_the_network(network, household):
     data = build_dataset(some, scenario, ignore_progress, embedder=embedder)
     assert data.is_embedded.all()
     assert data.embedded.shape == (len(data), WIDTH)
-    assert isinstance(HEARING, Hearing)
+    assert isinstance(HEARING, HeadInputs)
     speech = data.embedded[:, HEARING.names.index("speech")].astype(int)
     music = data.embedded[:, HEARING.names.index("music")].astype(int)
     more = speech - music

@@ -11,7 +11,7 @@ import numpy as np
 import spliced
 from recurring import record_recurring
 
-from hearthlog.analyzer.discover.discover import discover, embedding_note
+from hearthlog.analyzer.discover.discover import discover, unembedded_note
 from hearthlog.analyzer.discover.groups import NO_GROUP
 from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
 from hearthlog.analyzer.discover.read_sounds import read_log_sounds, read_sounds
@@ -93,7 +93,7 @@ def test_sounds_are_described_by_the_embeddings_of_one_network_and_projection(da
         assert set(day_of(sounds)[heard].tolist()) == {1, 4}
         assert sounds.without_embedding == 3
         assert sounds.other_embeddings == {OTHER.source.space, PROJECTED.source.space}
-        note = embedding_note(sounds, discover(sounds, None)[0])
+        note = unembedded_note(sounds, discover(sounds, None)[0])
     assert note == (
         "3 of 5 logs are without embeddings of one as the groups are by (but of one, other, or of "
         "another projection): their sounds are known by their features alone"

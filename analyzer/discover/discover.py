@@ -60,7 +60,7 @@ def discover(
         described = sounds.descriptors[drawn], sounds.embedding, sounds.embeddings[drawn]
         groups = new_groups(sounds.features, *described)
     points, embedded = _points(sounds, groups)
-    heard, of = groups.heard(sounds.embeddings), np.full(count, NO_GROUP)
+    heard, of = groups.are_comparable(sounds.embeddings), np.full(count, NO_GROUP)
     for own, by_embedding in ((heard, True), (~heard, False)):
         inside = drawn[own[drawn]]
         where = embedded if by_embedding else points
@@ -77,7 +77,7 @@ def discover(
     return identified(groups) if is_new else groups, of, points
 
 
-def embedding_note(sounds: HomeSounds, groups: Groups) -> str:
+def unembedded_note(sounds: HomeSounds, groups: Groups) -> str:
     """Say whose sounds are known by their features alone, though there are networks; else nothing.
 
     Parameters
@@ -114,7 +114,7 @@ def _points(sounds: HomeSounds, groups: Groups) -> tuple[Float64, Float64]:
         part = slice(first, first + _AT_ONCE)
         descriptors, embeddings = sounds.descriptors[part], sounds.embeddings[part]
         points[part] = groups.points(descriptors)
-        if space is not None and groups.heard(embeddings).any():
+        if space is not None and groups.are_comparable(embeddings).any():
             embedded[part] = space.points(np.concatenate([descriptors, embeddings], axis=1))
     return points, embedded
 

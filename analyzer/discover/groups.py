@@ -115,7 +115,7 @@ class Groups(Space):
         embedding : EmbeddingSpace or None
             Theirs; with another one than that of the groups sounds are known by their features.
         """
-        of, heard = np.empty(len(descriptors), np.int64), self.heard(embeddings)
+        of, heard = np.empty(len(descriptors), np.int64), self.are_comparable(embeddings)
         heard &= embedding == self.embedding
         of[~heard] = self.find(self.points(descriptors[~heard]))
         if self.embedded is not None and heard.any():
@@ -127,8 +127,8 @@ class Groups(Space):
         """Return the space with embeddings, if it is wanted and there; else that of features."""
         return self.embedded if embedded and self.embedded is not None else self
 
-    def heard(self, embeddings: Float32) -> Bool:
-        """Tell of which sounds it is known by their embeddings whether they are of a group."""
+    def are_comparable(self, embeddings: Float32) -> Bool:
+        """Return which sounds have embeddings that can be compared with the groups."""
         if self.embedded is None or embeddings.shape[1] != len(self.embedded.mean) - len(self.mean):
             return np.zeros(len(embeddings), bool)
         return is_embedded(embeddings)

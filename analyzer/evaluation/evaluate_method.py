@@ -12,7 +12,7 @@ from hearthlog.analyzer.training.calibration import inverse_temperature, nested_
 from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import Method, prepare
-from hearthlog.analyzer.training.mixture import Tried, best_mix, has_lessons, hearing_of
+from hearthlog.analyzer.training.mixture import Tried, best_mix, can_learn_heads, head_inputs_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
 from hearthlog.models.classes import UNKNOWN
@@ -60,7 +60,7 @@ def evaluate_method(
     examples = prepare(method, data)
     [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
     probabilities = nested_probabilities(decisions, data.target, folds)
-    if method.network and has_lessons(data):
+    if method.network and can_learn_heads(data):
         probabilities = _mixed(data, method, folds, decisions)
     return CrossValidation(
         len(folds),
@@ -75,7 +75,7 @@ def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Floa
     inverse = inverse_temperature(decisions, data.target)
     known = np.array([name != UNKNOWN for name in data.classes])[data.target]
     way = Tried(folds, inverse * decisions, known)
-    return softmax(best_mix(data, hearing_of(method.network), [way]).left_out[0])
+    return softmax(best_mix(data, head_inputs_of(method.network), [way]).left_out[0])
 
 
 def divide(data: Dataset, kind: Kind) -> list[Fold]:

@@ -30,8 +30,8 @@ _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 
 @dataclass(frozen=True)
-class Hearing:
-    """What of a network heads take.
+class HeadInputs:
+    """What heads take of a network.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Hearing:
         return self.names[self.inputs[-1]]
 
 
-def hearing_of(network: str) -> Hearing:
+def head_inputs_of(network: str) -> HeadInputs:
     """Return what heads take of a network.
 
     Parameters
@@ -69,7 +69,7 @@ def hearing_of(network: str) -> Hearing:
     projection = read_projection(NETWORKS.get(network).projection)
     components = projection.components.shape[1]
     groups = projection.names.index("outside") + 1
-    return Hearing(
+    return HeadInputs(
         network,
         projection.sha256,
         projection.names,
@@ -78,7 +78,7 @@ def hearing_of(network: str) -> Hearing:
 
 
 def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
-    """Tell which of the windows for heads must not be learned from, as segments are left out.
+    """Return which of the windows for heads must not be learned from, as segments are left out.
 
     Parameters
     ----------
@@ -97,10 +97,10 @@ def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
     return lost
 
 
-def said_unseen(
+def cross_validated_heads(
     data: Dataset, mix: EmbeddingMix, inputs: Sequence[slice], folds: Sequence[Fold]
 ) -> Float64:
-    """Let heads hear segments that they have not learned from.
+    """Return what heads say of segments that they have not learned from.
 
     Parameters
     ----------
@@ -125,8 +125,8 @@ def said_unseen(
     return by_heads
 
 
-def has_lessons(data: Dataset) -> bool:
-    """Tell whether heads can be learned: from two classes of sound, of some sources each.
+def can_learn_heads(data: Dataset) -> bool:
+    """Return whether heads can be learned: from two classes of sound, of some sources each.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ class BestMix(NamedTuple):
     left_out: list[Float64]
 
 
-def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
+def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix:
     """Try heads and a classifier together, with and without the names of the network as they are.
 
     Names say what is of no class of the scenario. Where the recordings of a class are too few to
@@ -202,36 +202,38 @@ def best_mix(data: Dataset, hearing: Hearing, ways: Sequence[Tried]) -> BestMix:
     ----------
     data : Dataset
         With windows for heads.
-    hearing : Hearing
+    taken : HeadInputs
     ways : sequence of Tried
         At least one.
     """
-    single = _plain(hearing, hearing.inputs[:1])
+    single = _plain(taken, taken.inputs[:1])
     by_head = [
-        [said_unseen(data, single, [columns], way.folds) for way in ways]
-        for columns in hearing.inputs
+        [cross_validated_heads(data, single, [columns], way.folds) for way in ways]
+        for columns in taken.inputs
     ]
     tried = []
-    for inputs, names in _candidates(data, hearing):
-        mix = _plain(hearing, inputs)
+    for inputs, names in _candidates(data, taken):
+        mix = _plain(taken, inputs)
         by_heads = [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)]
         if names:
             mix = mix.model_copy(update={"names": names})
-            of_names = _said_by_names(data, mix)
+            of_names = _of_names_alone(data, mix)
             by_heads = [one + of_names for one in by_heads]
         tried.append(BestMix(mix, inputs, by_heads, _left_out(data, mix, ways, by_heads)))
     return max(tried, key=lambda one: _right(data, one.left_out))
 
 
-def _candidates(data: Dataset, hearing: Hearing) -> list[tuple[tuple[slice, ...], list[NamesHead]]]:
+def _candidates(
+    data: Dataset, taken: HeadInputs
+) -> list[tuple[tuple[slice, ...], list[NamesHead]]]:
     """Return linear heads and names that may be mixed; names where a class has hardly any source.
 
     That of such a class cannot be measured.
     """
-    every = hearing.inputs
+    every = taken.inputs
     rejecting, names = (
-        rejecting_head(hearing, data.classes),
-        names_head(hearing, data.classes),
+        rejecting_head(taken, data.classes),
+        names_head(taken, data.classes),
     )
     by_rejecting = [] if rejecting is None else [rejecting]
     if names is None:
@@ -252,7 +254,7 @@ def _sources(data: Dataset) -> Indices:
 
 
 def learn_mixture(
-    data: Dataset, hearing: Hearing, sources: Tried, collections: Tried | None
+    data: Dataset, taken: HeadInputs, sources: Tried, collections: Tried | None
 ) -> Mixture:
     """Learn heads, and how sure they and a classifier may be together.
 
@@ -260,13 +262,13 @@ def learn_mixture(
     ----------
     data : Dataset
         With windows for heads.
-    hearing : Hearing
+    taken : HeadInputs
     sources : Tried
     collections : Tried or None
         None if there are too few of them.
     """
     ways = [sources] if collections is None else [sources, collections]
-    best = best_mix(data, hearing, ways)
+    best = best_mix(data, taken, ways)
     everything = np.ones(len(data), bool)
     inverse = _inverse_temperature(data, best.mix, ways[-1], best.by_heads[-1], everything)
     mix = best.mix.model_copy(update={"inverse_temperature": inverse})
@@ -280,23 +282,23 @@ def _left_out(
     return [_nested(data, mix, way, one) for way, one in zip(ways, by_heads, strict=True)]
 
 
-def _plain(hearing: Hearing, inputs: Sequence[slice]) -> EmbeddingMix:
+def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
     return EmbeddingMix(
-        network=hearing.network,
-        projection_sha256=hearing.projection_sha256,
-        values=len(hearing.names),
+        network=taken.network,
+        projection_sha256=taken.projection_sha256,
+        values=len(taken.names),
         head_weights=[HEAD_WEIGHT] * len(inputs),
         machine_weight=MACHINE_WEIGHT,
         inverse_temperature=1.0,
     )
 
 
-def rejecting_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
+def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
     """Return what the names of a network say of whether a sound is of any known class.
 
     Parameters
     ----------
-    hearing : Hearing
+    taken : HeadInputs
     classes : sequence of str
 
     Returns
@@ -304,7 +306,7 @@ def rejecting_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None
     NamesHead or None
         None where there is no class `unknown`, or no known one has a name.
     """
-    first, groups = hearing.inputs[-1].start, hearing.groups
+    first, groups = taken.inputs[-1].start, taken.groups
     known = [name for name in classes if name not in {SILENCE, UNKNOWN}]
     named = {group for name in known for group in _groups_of(name)} & set(groups)
     others = set(groups) - named - {SILENCE}
@@ -320,15 +322,15 @@ def rejecting_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None
     )
 
 
-def names_head(hearing: Hearing, classes: Sequence[str]) -> NamesHead | None:
+def names_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
     """Return what the names of a network say of some classes; None if one of them has no name.
 
     Parameters
     ----------
-    hearing : Hearing
+    taken : HeadInputs
     classes : sequence of str
     """
-    first, groups = hearing.inputs[-1].start, hearing.groups
+    first, groups = taken.inputs[-1].start, taken.groups
     named = {name: _groups_of(name) for name in classes if name != SILENCE}
     if len(named) < 2 or not all(one in groups for same in named.values() for one in same):
         return None
@@ -341,7 +343,7 @@ def _groups_of(name: str) -> list[str]:
     return {UNKNOWN: ["outside"], OTHER: sorted(_OF_GENERAL)}.get(name, [name])
 
 
-def _said_by_names(data: Dataset, mix: EmbeddingMix) -> Float64:
+def _of_names_alone(data: Dataset, mix: EmbeddingMix) -> Float64:
     """Return what names alone say of all segments; they have not learned from any."""
     by_heads = np.zeros((len(data), len(data.classes)))
     nothing = np.zeros((0, mix.values, len(data.classes)), np.int32)

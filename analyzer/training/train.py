@@ -29,8 +29,8 @@ from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.mixture import (
     Mixture,
     Tried,
-    has_lessons,
-    hearing_of,
+    can_learn_heads,
+    head_inputs_of,
     learn_mixture,
 )
 from hearthlog.analyzer.training.scenario import Scenario
@@ -123,7 +123,7 @@ def train_model(  # noqa: PLR0913, PLR0917
         left_out = decide(collections, len(sources)) + bias
         inverse, elsewhere = calibrate_elsewhere(left_out, data, collections)
     mixture, measured, sure = None, decisions, inverse
-    if method.network and has_lessons(data):
+    if method.network and can_learn_heads(data):
         mixture = _mixture(data, method, inverse, (sources, decisions), (collections, left_out))
         measured, sure = mixture.of_sources, 1.0
         if mixture.of_collections is not None:
@@ -263,7 +263,7 @@ def _mixture(
     folds, left_out = collections
     if left_out is not None:
         of_collections = Tried(folds, inverse * left_out, taught_elsewhere(data, folds))
-    return learn_mixture(data, hearing_of(method.network), of_sources, of_collections)
+    return learn_mixture(data, head_inputs_of(method.network), of_sources, of_collections)
 
 
 def _smoothing(name: str, method: Method, inverse: float, mixture: Mixture | None) -> Smoothing:

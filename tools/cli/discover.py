@@ -127,7 +127,7 @@ def _group(
 ) -> tuple["HomeSummary", list[str]]:
     """Group what is heard, and keep the groups and their summary."""
     from hearthlog.analyzer.discover.discover import discover as find_groups
-    from hearthlog.analyzer.discover.discover import embedding_note
+    from hearthlog.analyzer.discover.discover import unembedded_note
     from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
     from hearthlog.analyzer.discover.read_sounds import read_sounds
     from hearthlog.analyzer.discover.summary import summarise
@@ -148,7 +148,7 @@ def _group(
         )
     save_groups(groups, file)
     save_summary(summary, summary_path(file))
-    if note := embedding_note(sounds, groups):
+    if note := unembedded_note(sounds, groups):
         tell(note)
     if sounds.without:
         tell(f"{number(sounds.without, 'log')} without features and labels")
