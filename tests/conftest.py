@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -96,7 +97,7 @@ def real_frames(household) -> np.ndarray:
 def hearthlog():
     """Run the command in a process of its own and return what came of it."""
 
-    def run(*arguments, env=None, timeout=120):
+    def run(*arguments, env=None, timeout=500):
         return subprocess.run(
             [*HEARTHLOG, *map(str, arguments)],
             capture_output=True,
@@ -192,6 +193,7 @@ def real_day(all_household, tmp_path_factory) -> Path:
     with (root / "real_day.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "done").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that did not finish it
             folder.mkdir()
             write_real_day(all_household, folder)
             (folder / "done").touch()

@@ -247,7 +247,7 @@ def test_recording_imports_nothing_of_the_analyzer_but_its_tables(day, model_fil
 
 def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
     folder = tmp_path / "demo"
-    result = hearthlog("demo", "--output", folder, "--minutes", "4", timeout=200)
+    result = hearthlog("demo", "--output", folder, "--minutes", "4")
     assert result.returncode == 0, result.stderr
     assert (folder / "day.rrd").stat().st_size > 100_000
     assert len(list(folder.rglob("*.mcap"))) == 1

@@ -226,7 +226,7 @@ def test_a_box_without_the_analyzer_names_what_another_one_has_grouped(grouped_h
         ([], 1, "scikit-learn is not installed; try: "),
     ):
         arguments = [sys.executable, "-c", _WITHOUT, "discover", grouped_home, *asked]
-        done = subprocess.run(arguments, capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == status, done.stderr
         assert says in done.stderr
 

@@ -177,7 +177,8 @@ def private_frames(said, logit, *, elsewhere=True):
         (0.11, PRIVATE_LOGIT - 0.25, True, True),
         (0.05, np.nan, True, True),  # no embedding: as without a network
         (0.03, np.nan, True, False),
-        (0.03, PRIVATE_LOGIT - 0.25, False, True),  # a model that is surer than it should be
+        (0.04, PRIVATE_LOGIT - 0.25, False, False),  # a model that is surer than it should be
+        (0.06, PRIVATE_LOGIT - 0.25, False, True),
     ],
 )
 def test_names_of_a_network_forbid_and_where_they_do_not_features_may_be_less_sure(

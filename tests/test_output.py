@@ -46,7 +46,7 @@ def run(tmp_path_factory, day, model_file):
             stdout=stdout,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=120,
+            timeout=500,
             check=False,
         )
         return result.returncode, result.stderr

@@ -11,7 +11,7 @@ from hearthlog.schemas.arrays import Bool
 # Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
 # probabilities hold for people whom they were not learned from.
 PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.04
-PRIVATE_LIMIT_NAMED = 0.1  # of the latter models, where a network's names are against it, too
+NAMED_LIMIT, NAMED_LIMIT_ELSEWHERE = 0.05, 0.1  # where the names of a network are against it, too
 PRIVATE_LOGIT = -2.0  # of the names of a class
 _BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
 
@@ -83,15 +83,15 @@ class PrivateFrames:
     def _judge(self, labels: FrameLabels) -> Bool:
         """Return whether each window may be of a private class."""
         columns = [labels.classes.index(name) for name in self._classes]
-        limit = PRIVATE_LIMIT_ELSEWHERE if labels.calibrated_elsewhere else PRIVATE_LIMIT
+        limit, named_limit = PRIVATE_LIMIT, NAMED_LIMIT
+        if labels.calibrated_elsewhere:
+            limit, named_limit = PRIVATE_LIMIT_ELSEWHERE, NAMED_LIMIT_ELSEWHERE
         by_features = labels.by_features[:, columns]
         if labels.by_names is None:
             return np.any(~(by_features < limit), axis=1)  # as NaN is
         # A network hears some speech not at all: whatever it says, features may forbid.
         by_names = labels.by_names[:, columns]
-        limits = np.full(by_names.shape, limit)
-        if labels.calibrated_elsewhere:
-            limits[np.isfinite(by_names)] = PRIVATE_LIMIT_NAMED
+        limits = np.where(np.isfinite(by_names), named_limit, limit)
         likely: Bool = np.any(~(by_features < limits) | (by_names >= PRIVATE_LOGIT), axis=1)
         return likely
 
