@@ -16,7 +16,7 @@ from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.recorder.stream.private_frames import PRIVATE_LOGIT, PrivateFrames
+from hearthlog.recorder.stream.private_frames import NAMED_FRAMES, PRIVATE_LOGIT, PrivateFrames
 from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.topics import EmbeddingSource
@@ -173,12 +173,12 @@ def private_frames(said, logit, *, elsewhere=True):
     [
         (0.0, PRIVATE_LOGIT, True, True),  # the network alone may forbid
         (0.0, PRIVATE_LOGIT - 0.25, True, False),
-        (0.09, PRIVATE_LOGIT - 0.25, True, False),  # both must be unsure
-        (0.11, PRIVATE_LOGIT - 0.25, True, True),
+        (0.05, PRIVATE_LOGIT - 0.25, True, False),  # both must be unsure
+        (0.07, PRIVATE_LOGIT - 0.25, True, True),
         (0.05, np.nan, True, True),  # no embedding: as without a network
         (0.03, np.nan, True, False),
-        (0.04, PRIVATE_LOGIT - 0.25, False, False),  # a model that is surer than it should be
-        (0.06, PRIVATE_LOGIT - 0.25, False, True),
+        (0.03, PRIVATE_LOGIT - 0.25, False, False),  # a model that is surer than it should be
+        (0.05, PRIVATE_LOGIT - 0.25, False, True),
     ],
 )
 def test_names_of_a_network_forbid_and_where_they_do_not_features_may_be_less_sure(
@@ -187,6 +187,22 @@ def test_names_of_a_network_forbid_and_where_they_do_not_features_may_be_less_su
     decided = private_frames(said, logit, elsewhere=elsewhere)
     assert len(decided)
     assert (decided == private).all()
+
+
+@pytest.mark.parametrize("step", [1, 7, 200])
+def test_names_of_speech_count_for_two_seconds_in_blocks_of_any_size(step):
+    from test_veil import labels_of  # noqa: PLC0415  its labels of speech
+
+    names = np.full((200, 2), -10.0)
+    names[80:85] = PRIVATE_LOGIT
+    guard, decided = PrivateFrames(["speech"], 20), []
+    for first in range(0, 200, step):
+        part = names[first : first + step]
+        labels = labels_of(np.zeros(len(part), np.float32))._replace(by_names=part)
+        decided.append(guard.push(len(part), labels))
+    # A label is known with the last frame of its window, 19 frames after the first.
+    private = np.flatnonzero(np.concatenate(decided)[20:]) + 20
+    assert private.tolist() == list(range(80 - 19, 84 + NAMED_FRAMES + 12 + 1))
 
 
 def test_embeddings_are_dropped_whose_windows_reach_into_what_is_private():

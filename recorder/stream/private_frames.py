@@ -11,8 +11,9 @@ from hearthlog.schemas.arrays import Bool
 # Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
 # probabilities hold for people whom they were not learned from.
 PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.04
-NAMED_LIMIT, NAMED_LIMIT_ELSEWHERE = 0.05, 0.1  # where the names of a network are against it, too
+NAMED_LIMIT, NAMED_LIMIT_ELSEWHERE = 0.04, 0.06  # where the names of a network are against it, too
 PRIVATE_LOGIT = -2.0  # of the names of a class
+NAMED_FRAMES = 20  # for which such names count on: a network misses the short words of a sentence
 _BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
 
 
@@ -46,6 +47,7 @@ class PrivateFrames:
 
     def _begin(self) -> None:
         self._likely: Bool = self._unlabelled(_BEHIND_FRAMES)
+        self._unnamed = NAMED_FRAMES + 1  # frames since names were of a private class
 
     def push(self, count: int, labels: FrameLabels | None) -> Bool:
         """Add frames, which follow the ones before.
@@ -92,8 +94,15 @@ class PrivateFrames:
         # A network hears some speech not at all: whatever it says, features may forbid.
         by_names = labels.by_names[:, columns]
         limits = np.where(np.isfinite(by_names), named_limit, limit)
-        likely: Bool = np.any(~(by_features < limits) | (by_names >= PRIVATE_LOGIT), axis=1)
-        return likely
+        likely: Bool = np.any(~(by_features < limits), axis=1)
+        return likely | self._is_named(np.any(by_names >= PRIVATE_LOGIT, axis=1))
+
+    def _is_named(self, named: Bool) -> Bool:
+        """Return which of the next frames are at most `NAMED_FRAMES` behind one that is named."""
+        frames = np.arange(1, len(named) + 1)
+        latest = np.maximum.accumulate(np.where(named, frames, 1 - self._unnamed))
+        self._unnamed = int(len(named) + 1 - latest[-1])
+        return np.asarray(frames - latest <= NAMED_FRAMES)
 
     def _unlabelled(self, count: int) -> Bool:
         """Return whether frames without a label may be private: unless nothing is."""
