@@ -8,12 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
 from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
 from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.starter import GENERAL, starter_file, with_network
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.recorder.stream.private_frames import NAMED_FRAMES, PRIVATE_LOGIT, PrivateFrames
@@ -265,3 +271,23 @@ def test_what_a_channel_says_of_its_embeddings_is_read_back_and_damage_is_nothin
         if key.startswith("values"):
             assert EmbeddingSource.from_metadata(damaged) is None
     assert EmbeddingSource.from_metadata({}) is None
+
+
+def test_the_logit_of_speech_reaches_the_guard_with_the_labels_of_a_starter(embedder, household):
+    """A second of each frame of speech is private by its name, whatever the features say."""
+    clips = read_manifest(household / "manifest.csv", LABELS, [])
+    spoken = [clip_frames(clip) for clip in clips if clip.label == "speech"][:4]
+    frames = np.concatenate([np.zeros((100, FRAME_SAMPLES), np.float32), *spoken])
+    classifier = Classifier(load_model(starter_file(with_network(GENERAL))))
+    pipeline = Pipeline("mic", classifier.feature_set, classifier, embedder=embedder)
+    pipeline.push(Frames(0, frames, stamps_of(0, len(frames))))
+    labels = pipeline.last_labels
+    speech = labels.by_names[:, labels.classes.index("speech")]
+    assert np.isnan(speech[:60]).all()
+    assert np.isnan(labels.by_names[:, labels.classes.index("unknown")]).all()
+    assert (speech[120:] >= PRIVATE_LOGIT).mean() > 0.9
+    silenced = labels._replace(by_features=np.zeros_like(labels.by_features))
+    guard = PrivateFrames(["speech"], 20)
+    private = guard.push(len(labels.frames), silenced)
+    assert private[120:].mean() > 0.9
+    assert not private[20:60].any()
