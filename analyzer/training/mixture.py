@@ -31,7 +31,7 @@ _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 @dataclass(frozen=True)
 class HeadInputs:
-    """What heads take of a network.
+    """The values of an embedding that the linear heads of a model are learned on.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class HeadInputs:
 
 
 def head_inputs_of(network: str) -> HeadInputs:
-    """Return what heads take of a network.
+    """Return the values of the embeddings of a network that linear heads are learned on.
 
     Parameters
     ----------

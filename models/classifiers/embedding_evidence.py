@@ -1,4 +1,4 @@
-"""What embeddings say of frames, by the windows around them."""
+"""Evidence of frames by embeddings: that of the two windows around, interpolated or the higher."""
 
 from collections.abc import Callable
 
@@ -84,8 +84,8 @@ class EmbeddingEvidence:
         earlier, later = self._around(first, count)
         earlier = np.where(np.isnan(earlier), later, earlier)
         later = np.where(np.isnan(later), earlier, later)
-        by_heads: Float64 = (1.0 - share[:, np.newaxis]) * earlier + share[:, np.newaxis] * later
-        return by_heads
+        evidence: Float64 = (1.0 - share[:, np.newaxis]) * earlier + share[:, np.newaxis] * later
+        return evidence
 
     def highest_at(self, first: int, count: int) -> Float64:
         """Return the higher evidence of the two windows, as `at` returns the interpolated one."""

@@ -124,7 +124,7 @@ class Labeller:
             logits = partial(_logits_of_names, source=embedding, classes=self.classes)
             self._embedded = EmbeddingEvidence(heads, len(self.classes))
             self._named = EmbeddingEvidence(logits, len(self.classes))
-        self._of_windows = [one for one in (self._embedded, self._named) if one is not None]
+        self._window_evidence = [one for one in (self._embedded, self._named) if one is not None]
         self._pending: LabelledFrames | None = None  # that embeddings to come say something of
         self._pending_evidence: Float64 | None = None  # of directions, for them
         self._inputs_converged = (
@@ -178,8 +178,8 @@ class Labeller:
         if self._evidence is not None:
             before = frame - len(features), len(features)
             self._evidence.push(auxiliary.directions, *before, 0)
-        for evidence_of_windows in self._of_windows:
-            evidence_of_windows.push(auxiliary.embeddings, frame - len(features))
+        for each in self._window_evidence:
+            each.push(auxiliary.embeddings, frame - len(features))
 
     def push(
         self,
@@ -230,8 +230,8 @@ class Labeller:
         )
         labelled, end = by_features, first + len(features) - self.timing.delay
         if ahead:
-            for evidence_of_windows in self._of_windows:
-                evidence_of_windows.push(auxiliary.embeddings, first)
+            for each in self._window_evidence:
+                each.push(auxiliary.embeddings, first)
             by_features, evidence = self._complete(by_features, evidence)
             labelled, novelty = self._mixed(by_features, end - len(by_features.stamps), evidence)
         count, first = len(labelled.stamps), end - len(labelled.stamps)
@@ -268,8 +268,8 @@ class Labeller:
         self._inputs.restart()
         if self._evidence is not None:
             self._evidence.restart()
-        for evidence_of_windows in self._of_windows:
-            evidence_of_windows.restart()
+        for each in self._window_evidence:
+            each.restart()
         self._pending = self._pending_evidence = None
         self._window, self._first_label, self._first_segment = None, 0, 0
         return self.segmenter.close(end)
