@@ -279,6 +279,33 @@ def test_hours_that_are_relabelled_apart_have_the_names_of_one_long_recording(
         assert relabelled == [m.data for m in LogReader(log).messages([topic])]
 
 
+def test_a_queue_of_hints_asks_for_what_the_network_names_and_no_event_is(
+    sound, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.setitem(TONES, 500, "door")
+    monkeypatch.setitem(TONES, 1000, "sneeze")
+    logs = tmp_path / "logs"
+    record(sound, logs, monkeypatch)
+    done = run(capfd, "review", logs, "--queue", "hint", "--save", tmp_path / "hints.txt")
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "hints.txt").read_text().splitlines()
+    assert [line.split("\t")[2] for line in lines] == ["door", "sneeze"]
+    imported = run(capfd, "annotate", "import", logs, tmp_path / "hints.txt")
+    assert imported.returncode == 0, imported.stderr
+    for number in (1, 2):  # the tone of ten seconds is two spans, of which one was asked for
+        again = run(capfd, "review", logs, "--queue", "hint", "--save", tmp_path / f"{number}.txt")
+        run(capfd, "annotate", "import", logs, tmp_path / f"{number}.txt")
+    assert "no span is left in which the network gives a hint" in again.stderr
+
+
+def test_a_queue_of_hints_needs_embeddings(sound, tmp_path, capfd):
+    settings = Settings(output=tmp_path / "logs", model=GENERAL)
+    record_files(settings, FileSource([sound], START), Flag())
+    done = run(capfd, "review", tmp_path / "logs", "--queue", "hint", "--save", tmp_path / "a.txt")
+    assert done.returncode == 1
+    assert "hearthlog models fetch yamnet" in done.stderr
+
+
 def test_where_somebody_may_be_talking_no_name_is_labelled_but_what_is_logged_says(
     sound, tmp_path, monkeypatch, capfd
 ):

@@ -4,18 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hearthlog.models.classes import CLASS_NAME, find_class
 from hearthlog.models.embedding.embeddings import Embeddings
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import Projection, read_projection
 from hearthlog.models.embedding.sound_names import (
-    NamedSounds,
     SoundName,
     audioset_names,
-    name_logits,
     named_sounds,
     read_names,
     write_names,
@@ -45,11 +41,9 @@ def spans(sounds):
     return [(sound.first, sound.end, sound.logit) for sound in sounds]
 
 
-def test_a_name_is_read_as_it_is_logged():
-    values = np.array([[1, 5, -3]], np.int8)
-    assert name_logits(values, PROJECTION, [COUGH, BELL]).tolist() == [[-1.5, 2.5]]
+def test_a_name_without_a_group_in_the_projection_is_refused():
     with pytest.raises(ValueError, match="siren"):
-        name_logits(values, PROJECTION, [BELL._replace(group="siren")])
+        named_sounds(windows([3]), PROJECTION, [BELL._replace(group="siren")])
 
 
 def test_a_sound_is_as_long_as_the_middles_of_its_windows():
@@ -82,31 +76,6 @@ def test_what_is_at_the_low_end_never_goes_on():
     values = windows([0, 0, 0, 0])
     values.values[0, 2] = -9
     assert spans(named_sounds(values, PROJECTION, [COUGH])) == [(5, 15, -4.5)]
-
-
-@given(
-    st.lists(st.sampled_from([-5.0, 0.0, 1.0, 1.5, 2.0, 4.0]), min_size=1, max_size=30),
-    st.integers(0, 30),
-    st.integers(1, 4),
-)
-def test_it_does_not_matter_how_many_windows_are_pushed_at_once(logits, cut, gap):
-    frames = np.cumsum(np.where(np.arange(len(logits)) == cut, 10 * gap, 10))
-    embeddings = windows(logits, frames)
-    finder, found = NamedSounds(PROJECTION, [BELL, RAIN]), []
-    for row in range(len(logits)):
-        begun = int(frames[row + 1]) if row + 1 < len(frames) else int(frames[row]) + 10
-        found += finder.push(embeddings.rows(slice(row, row + 1)), begun)
-    found += finder.close()
-    whole = named_sounds(embeddings, PROJECTION, [BELL, RAIN])
-    assert sorted(found, key=lambda sound: sound.first) == whole
-
-
-def test_a_sound_is_told_when_no_window_can_prolong_it():
-    finder = NamedSounds(PROJECTION, [BELL])
-    assert finder.push(windows([3]), 10) == []
-    assert finder.push(windows([]), 20) == []
-    assert spans(finder.push(windows([]), 30)) == [(5, 15, 3.0)]
-    assert finder.close() == []
 
 
 def test_the_table_names_groups_of_the_projection():

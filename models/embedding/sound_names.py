@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Embeddings, Int8
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.projection import Projection
-from hearthlog.schemas.arrays import Float64
+from hearthlog.schemas.arrays import Float64, Int64
 
 _FILE = Path(__file__).with_name("audioset_names.csv")
 RELEASE = 1.0  # logits below the threshold at which a sound still goes on
@@ -116,116 +116,18 @@ class NamedSound(NamedTuple):
     logit: float
 
 
-def name_logits(values: Int8, projection: Projection, names: Sequence[SoundName]) -> Float64:
-    """Return what is logged of some names.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(m, W)], int8
-        Of windows.
-    projection : Projection
-    names : sequence of SoundName
-
-    Returns
-    -------
-    np.ndarray [shape=(m, K)], float64
-
-    Raises
-    ------
-    ValueError
-        If the projection has not the group of a name.
-    """
-    return projection.values(values)[:, _columns(projection, names)]
-
-
-class NamedSounds:
-    """Finds the sounds that the network names in successive windows.
-
-    A sound begins with a window above the threshold, and goes on while windows no more than a
-    second apart are above it or a little below. Between sounds there is no window, so nothing
-    depends on how many are pushed at once.
-
-    Parameters
-    ----------
-    projection : Projection
-        With which the windows were logged.
-    names : sequence of SoundName, optional
-        Those to look for; `audioset_names` by default.
-    """
-
-    def __init__(self, projection: Projection, names: Sequence[SoundName] | None = None) -> None:
-        self._projection = projection
-        self._names = audioset_names() if names is None else tuple(names)
-        self._thresholds = np.array([name.threshold for name in self._names])
-        self._columns = columns = _columns(projection, self._names)
-        above_low = (projection.lows + projection.steps)[columns]  # the low itself is nothing heard
-        self._release = np.maximum(self._thresholds - RELEASE, above_low)
-        self._least = np.array([name.windows for name in self._names])
-        count = len(self._names)
-        self._first = np.full(count, -1, np.int64)  # where a sound goes on
-        self._last, self._above = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        self._highest = np.zeros(count)
-
-    def push(self, embeddings: Embeddings, begun: int) -> list[NamedSound]:
-        """Add successive windows.
-
-        Parameters
-        ----------
-        embeddings : Embeddings
-        begun : int
-            Number of a frame; windows that are still to come begin with it or later ones.
-
-        Returns
-        -------
-        list of NamedSound
-            The sounds that have ended, in the order in which they did.
-        """
-        ended: list[NamedSound] = []
-        if len(embeddings.frames):
-            logits = self._projection.values(embeddings.values)[:, self._columns]
-            for frame, row in zip(embeddings.frames.tolist(), logits, strict=True):
-                ended += self._ended(frame)
-                self._add(frame, row)
-        return ended + self._ended(begun)
-
-    def close(self) -> list[NamedSound]:
-        """End the sounds that go on; windows that follow are of another time."""
-        return self._ended(np.iinfo(np.int64).max)
-
-    def _add(self, frame: int, logits: Float64) -> None:
-        above = logits >= self._thresholds
-        begins, goes_on = above & (self._first < 0), logits >= self._release
-        self._first[begins], self._above[begins], self._highest[begins] = frame, 0, -np.inf
-        goes_on &= self._first >= 0
-        self._last[goes_on] = frame
-        self._above[above] += 1
-        self._highest[above] = np.maximum(self._highest, logits)[above]
-
-    def _ended(self, frame: int) -> list[NamedSound]:
-        """End the sounds that no window from a frame on belongs to."""
-        over = (self._first >= 0) & (frame - self._last > _PAUSE_FRAMES)
-        told = np.flatnonzero(over & (self._above >= self._least))
-        ended = [
-            NamedSound(
-                self._names[place],
-                int(self._first[place]) + _MARGIN,
-                int(self._last[place]) + WINDOW_FRAMES - _MARGIN,
-                float(self._highest[place]),
-            )
-            for place in told[np.argsort(self._last[told], kind="stable")]
-        ]
-        self._first[over] = -1
-        return ended
-
-
 def named_sounds(
     embeddings: Embeddings, projection: Projection, names: Sequence[SoundName] | None = None
 ) -> list[NamedSound]:
     """Find the sounds that the network names in windows of one stream.
 
+    A sound begins with a window above the threshold, and goes on while windows no more than a
+    second apart are above it or a little below.
+
     Parameters
     ----------
     embeddings : Embeddings
+        In the order of their frames.
     projection : Projection
         With which they were logged.
     names : sequence of SoundName, optional
@@ -235,10 +137,43 @@ def named_sounds(
     -------
     list of NamedSound
         In the order of their first frames.
+
+    Raises
+    ------
+    ValueError
+        If the projection has not the group of a name.
     """
-    finder = NamedSounds(projection, names)
-    sounds = [*finder.push(embeddings, 0), *finder.close()]
+    names = audioset_names() if names is None else names
+    columns, sounds = _columns(projection, names), list[NamedSound]()
+    logits = projection.values(embeddings.values)[:, columns] if len(embeddings.frames) else None
+    above_low = (projection.lows + projection.steps)[columns]  # the low itself is nothing heard
+    for place, name in enumerate(names if logits is not None else ()):
+        sounds += _named(name, logits[:, place], embeddings.frames, float(above_low[place]))
     return sorted(sounds, key=lambda sound: sound.first)
+
+
+def _named(name: SoundName, logits: Float64, frames: Int64, above_low: float) -> list[NamedSound]:
+    """Return the sounds of one name."""
+    above = logits >= name.threshold
+    rows = np.flatnonzero(above | (logits >= max(name.threshold - RELEASE, above_low)))
+    if not len(rows):
+        return []
+    begins = np.flatnonzero(np.diff(frames[rows], prepend=-_PAUSE_FRAMES - 1) > _PAUSE_FRAMES)
+    counts = np.add.reduceat(above[rows].astype(np.int64), begins)
+    highest = np.maximum.reduceat(logits[rows], begins)
+    never = len(frames)
+    first = np.minimum.reduceat(np.where(above[rows], rows, never), begins)
+    last = rows[np.append(begins[1:], len(rows)) - 1]
+    found = np.flatnonzero((counts > 0) & (counts >= name.windows))
+    return [
+        NamedSound(
+            name,
+            int(frames[first[run]]) + _MARGIN,
+            int(frames[last[run]]) + WINDOW_FRAMES - _MARGIN,
+            float(highest[run]),
+        )
+        for run in found.tolist()
+    ]
 
 
 def _columns(projection: Projection, names: Sequence[SoundName]) -> list[int]:

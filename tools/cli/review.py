@@ -70,8 +70,9 @@ def review(
         str | None,
         typer.Option(
             help="Go through spans that are useful to learn from and minutes drawn at random (as "
-            "without a value), or uncertain, novel, disagreeing or random ones, a list of "
-            "`hearthlog diff --list`, or what a model, as home-1, would change."
+            "without a value), or uncertain, novel, disagreeing or random ones, sounds that the "
+            "network has a name for (hint), a list of `hearthlog diff --list`, or what a model, as "
+            "home-1, would change."
         ),
     ] = None,
     spans: Annotated[

@@ -298,7 +298,7 @@ def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
         The one that is reviewed.
     """
     if span.reason != RANDOM:
-        return [Mark(span.microphone, span.start, span.end, span.label_a)]
+        return [Mark(span.microphone, span.start, span.end, span.proposed_label)]
     parts, rows, _ = pieces(labelling, one(span.start, span.end))
     times = zip(parts.starts.tolist(), parts.ends.tolist(), strict=True)
     return [

@@ -23,7 +23,8 @@ from hearthlog.schemas.times import read_time, time_text
 MOST_SPANS = 100_000
 _PARTS = ("uncertainty", "disagreement", "novelty")
 CHANGE = "change"  # which another model would make
-REASONS = (*_PARTS, USEFUL, RANDOM, CHANGE)
+HINT = "hint"  # of a network, which has a name for the sound
+REASONS = (*_PARTS, USEFUL, RANDOM, CHANGE, HINT)
 _SIZE_LIMIT = 64 << 20
 _LATEST = 1 << 62  # nanoseconds
 _NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,20})?")
@@ -42,7 +43,8 @@ class ReviewSpan(NamedTuple):
     b, label_b : str
         Another one; both are empty if there is none, the label where it has none.
     score : float or None
-        None where spans are not ranked by one; of a change the minutes a day that change so.
+        None where spans are not ranked by one; of a change the minutes a day that change so, of a
+        hint the logits above the threshold of the name.
     reason : str
         One of `REASONS`; `random` is a whole minute that was drawn at random.
     """
@@ -56,6 +58,11 @@ class ReviewSpan(NamedTuple):
     label_b: str
     score: float | None
     reason: str
+
+    @property
+    def proposed_label(self) -> str:
+        """The label that a reviewer may leave as it is."""
+        return self.label_b if self.reason == HINT else self.label_a
 
     def as_text(self) -> dict[str, str | float | None]:
         """Return the fields by name, with the times as texts."""

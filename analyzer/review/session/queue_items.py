@@ -7,21 +7,23 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.gate.changes import A_DAY, class_words, time_words
-from hearthlog.analyzer.logs.labellings import Labellings
-from hearthlog.analyzer.logs.spans import Spans, joined
+from hearthlog.analyzer.logs.labellings import Labellings, NamedLabelling
+from hearthlog.analyzer.logs.spans import NONE, Spans, joined
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.queue.asked import check_scenario, chosen_as
 from hearthlog.analyzer.review.queue.changed_spans import changed_by
+from hearthlog.analyzer.review.queue.hinted_spans import hinted_spans
 from hearthlog.analyzer.review.queue.random_minutes import MINUTE, draw_minutes, whole_minutes
 from hearthlog.analyzer.review.queue.ranking import DISAGREEING, RANKINGS, USEFUL, make_queue
 from hearthlog.analyzer.review.queue.review_list import (
     CHANGE,
+    HINT,
     ReviewSpan,
     queued,
     random_minutes,
     read_list,
 )
-from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
+from hearthlog.analyzer.review.queue.reviewed_time import ReviewedTime, reviewed_time
 from hearthlog.analyzer.review.session.session import ReviewItem
 from hearthlog.analyzer.review.timeline.lanes import labelling_in_words
 from hearthlog.models.classes import in_words
@@ -31,7 +33,7 @@ from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
 from hearthlog.schemas.messages.topics import is_review, scenario_name
 from hearthlog.schemas.progress import Progress, ignore_progress
 
-QUEUES = (*RANKINGS, RANDOM)
+QUEUES = (*RANKINGS, RANDOM, HINT)
 _TEN = 10  # which takes a person ten minutes
 _MINUTE_EVERY = 5  # of the items of a queue of useful spans
 _MINUTES_LEFT = 10  # for each that is drawn, or a short log would have no useful span
@@ -46,7 +48,7 @@ def review_items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
     spans : iterable of ReviewSpan
     """
     return [
-        ReviewItem(span.start, span.end, span.label_a, _text(span), chosen_as(span))
+        ReviewItem(span.start, span.end, span.proposed_label, _text(span), chosen_as(span))
         for span in spans
     ]
 
@@ -110,17 +112,14 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     side = sources.read(microphone, labelling, *limits)
     if model is not None:
         return changed_by(model, side, sources, microphone, count or _TEN, progress)
+    done, wanted = reviewed_time(sources, microphone, scenario), count or _TEN
+    if queue == HINT:
+        return hinted_spans(side, sources, microphone, done.spans, wanted)
     others = [name for name in sources.names(microphone) if _is_comparable(name, labelling)]
     if queue == DISAGREEING and not others:
         raise DataError("no other labelling to disagree with: `hearthlog relabel` makes one")
     other = sources.read(microphone, others[0], *limits) if others else None
-    done, wanted = reviewed_time(sources, microphone, scenario), count or _TEN
-    minutes = Spans(*(np.empty(0, np.int64),) * 2)
-    if queue in {USEFUL, RANDOM} and not scenario:
-        there = whole_minutes(side.labelling)
-        few = min(wanted // _MINUTE_EVERY, len(there.starts) // _MINUTES_LEFT)
-        drawn = draw_minutes(there, wanted if queue == RANDOM else few, done.random, done.spans)
-        minutes = Spans(drawn, drawn + MINUTE)
+    minutes = NONE if scenario else _drawn(queue, side, done, wanted)
     drawn_at_random = random_minutes(minutes, side, microphone)
     if queue == RANDOM:
         if not drawn_at_random:
@@ -145,6 +144,16 @@ def queue_spans(  # noqa: PLR0913, PLR0917
         return drawn_at_random
     spans = queued(chosen, microphone, labelling, other.name if other else "")
     return _mixed(spans, drawn_at_random)
+
+
+def _drawn(queue: str, side: NamedLabelling, done: ReviewedTime, wanted: int) -> Spans:
+    """Draw minutes at random: all of a random queue, some of a useful one."""
+    if queue not in {USEFUL, RANDOM}:
+        return NONE
+    there = whole_minutes(side.labelling)
+    few = min(wanted // _MINUTE_EVERY, len(there.starts) // _MINUTES_LEFT)
+    drawn = draw_minutes(there, wanted if queue == RANDOM else few, done.random, done.spans)
+    return Spans(drawn, drawn + MINUTE)
 
 
 def _is_comparable(name: str, labelling: str) -> bool:
@@ -197,6 +206,8 @@ def _text(span: ReviewSpan) -> str:
     if span.reason == CHANGE:
         much = "" if span.score is None else f": {time_words(span.score)}{A_DAY}"
         return f"{new} says {class_words(span.label_b)}, {old} {class_words(span.label_a)}{much}"
+    if span.reason == HINT:
+        return f"the network: {class_words(span.label_b)}? {old}: {class_words(span.label_a)}"
     label, other = (in_words(name).lower() for name in (span.label_a, span.label_b))
     if span.reason == RANDOM:
         return f"{old}: mostly {label} (a minute at random: mark what is wrong in it)"
