@@ -16,6 +16,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
 from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
+from hearthlog.models.embedding.steady_noise import SteadyNoise
 from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
@@ -98,6 +99,58 @@ def test_only_windows_with_sound_within_half_a_second_of_their_middle_are_embedd
     windows = pushed(EmbeddingStream(Doubling()), frames, sound, 0, (200,))
     assert windows.frames.tolist() == [90, 100]  # 80 ends before it, 110 is half a second later
     assert not len(pushed(EmbeddingStream(Doubling()), frames, sound & False, 0, (200,)).frames)
+
+
+def noise(count, level, seed=0):
+    """White noise of a level in dBFS, in frames."""
+    samples = np.random.default_rng(seed).standard_normal((count, FRAME_SAMPLES))
+    return (10 ** (level / 20) * samples).astype(np.float32)
+
+
+def level_of(frames):
+    return 10 * np.log10(np.mean(np.square(frames, dtype=np.float64)))
+
+
+def test_noise_of_a_room_is_fainter_by_some_decibels_and_faint_noise_is_left_alone():
+    room = SteadyNoise()
+    for window in noise(200, -50).reshape(10, WINDOW_FRAMES, FRAME_SAMPLES):
+        room.learn(window)
+    assert level_of(room.reduced(noise(WINDOW_FRAMES, -50, 1))) < -56
+    room.restart()
+    room.learn(noise(WINDOW_FRAMES, -74))
+    assert level_of(room.reduced(noise(WINDOW_FRAMES, -74, 1))) > -75.5
+
+
+def test_a_sound_far_above_the_noise_stays_what_it_is():
+    room, times = SteadyNoise(), np.arange(WINDOW_FRAMES * FRAME_SAMPLES) / 16_000
+    room.learn(noise(WINDOW_FRAMES, -50))
+    tone = (0.3 * np.sin(2 * np.pi * 440 * times)).reshape(WINDOW_FRAMES, FRAME_SAMPLES)
+    left = room.reduced(tone.astype(np.float32) + noise(WINDOW_FRAMES, -50, 1))
+    assert level_of(left - tone) < level_of(tone) - 30
+
+
+@pytest.mark.parametrize("room", [[], [-80], [-120]])
+def test_next_to_no_noise_changes_no_sample(room):
+    steady, window = SteadyNoise(), noise(WINDOW_FRAMES, -30)
+    for level in room:
+        steady.learn(noise(WINDOW_FRAMES, level, 1))
+    assert steady.reduced(window) is window or np.array_equal(steady.reduced(window), window)
+
+
+def test_the_noise_of_windows_without_sound_is_taken_out_of_those_with_sound_until_a_restart():
+    frames = noise(100, -30)
+    frames[80:90] += 0.3
+    sound = np.zeros(100, bool)
+    sound[80:95] = True
+    stream = EmbeddingStream(Doubling())
+    cleaned = pushed(stream, frames, sound, 0, [7])
+    stream.restart()
+    loud = np.ones(100, bool)  # nothing is known of the room
+    as_it_is = pushed(stream, frames, loud, 0, [100])
+    shared = np.isin(as_it_is.frames, cleaned.frames)
+    assert cleaned.frames.tolist() == [70, 80]
+    assert not np.array_equal(as_it_is.values[shared], cleaned.values)
+    assert same(pushed(EmbeddingStream(Doubling()), frames, sound, 0, [100]), cleaned)
 
 
 def test_a_restart_embeds_no_window_from_both_sides():

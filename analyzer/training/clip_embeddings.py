@@ -15,6 +15,7 @@ from hearthlog.analyzer.training.rooms import other_room, steady_noise
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Int8
 from hearthlog.models.embedding.networks import find_network, load_embedder
+from hearthlog.models.embedding.steady_noise import SteadyNoise
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 from hearthlog.schemas.errors import HearthlogWarning
@@ -150,10 +151,15 @@ def clip_embeddings(
     )
     if not silence:
         echoing, level = other_room(frames, rng, silence=False)
-        padded = _padded(echoing, steady_noise(_room(sound), level, rng))
+        noise = steady_noise(_room(sound), level, rng)
+        of_room = _noise_of(noise)
+        padded = _padded(echoing, noise)
         padded = np.clip(np.rint(padded * 32767.0), -32768, 32767) / 32768.0
         middles = _taught(padded, len(sound), _HOP_IN_ROOM)
-        parts.append(_embedded(padded, middles, embed, IN_A_ROOM))
+        in_room = _embedded(
+            padded, middles, lambda window: embed(of_room.reduced(window)), IN_A_ROOM
+        )
+        parts.append(in_room)
         shorts = [embed(window) for window in _short_parts(sound, rng)]
         count = len(shorts)
         parts.append(
@@ -222,10 +228,19 @@ def _short_parts(sound: Float64, rng: np.random.Generator) -> Iterator[Float32]:
             part *= 10.0 ** (rng.uniform(*_FAINTER_DB) / 20.0)
         level = rng.uniform(*_SHORT_NOISE_DBFS)
         window = 10.0 ** (level / 20.0) * rng.standard_normal(_WINDOW)
+        of_room = _noise_of(window)
         first, last = _SHORT_PLACE[0] * _WINDOW, _SHORT_PLACE[1] * _WINDOW - length
         place = int(rng.uniform(first, last))
         window[place : place + length] += part
-        yield _window(window)
+        yield of_room.reduced(_window(window))
+
+
+def _noise_of(samples: Float64) -> SteadyNoise:
+    """Return the noise of a room in which there is nothing else, as it is learned there."""
+    noise = SteadyNoise()
+    for first in range(0, len(samples) - _WINDOW + 1, _WINDOW):
+        noise.learn(_window(samples[first : first + _WINDOW]))
+    return noise
 
 
 def model_embedder(model: Model) -> ClipEmbedder | None:

@@ -23,6 +23,7 @@ HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
 _SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tried
 CLASS_EXPONENT = 0.2
+_SILENCE_BIAS = -1.0  # classifiers take faint sound in noise for silence
 _NAMES_BESIDE = 0.5  # weight of names beside both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
 _REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
@@ -290,6 +291,7 @@ def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
         head_weights=[HEAD_WEIGHT] * len(inputs),
         machine_weight=MACHINE_WEIGHT,
         inverse_temperature=1.0,
+        silence_bias=_SILENCE_BIAS,
     )
 
 

@@ -231,6 +231,8 @@ class EmbeddingMix(_Record):
         That of the model before it was adapted to a home; None if it never was.
     bias : dict of str to float
         What is added to the mean, by class.
+    silence_bias : float
+        What is added to the logarithm of the odds of silence.
     of_home : bool
         Whether there is one linear head more, of a home: its decision values are no logarithms of
         probabilities, but added to the sum of those of the other heads.
@@ -248,6 +250,7 @@ class EmbeddingMix(_Record):
     inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)]
     base_inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)] | None = None
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
+    silence_bias: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
     of_home: bool = False
 
     @property

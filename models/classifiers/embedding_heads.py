@@ -144,7 +144,8 @@ def mixed(
 ) -> Float64:
     """Mix what a classifier and heads say.
 
-    Silence has the probability that the classifier gives it; the classes of sound share the rest.
+    Silence has the probability that the classifier gives it, but for a bias; the classes of sound
+    share the rest.
 
     Parameters
     ----------
@@ -158,7 +159,7 @@ def mixed(
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
-        Logarithms of probabilities.
+        Logarithms of probabilities, plus any constant for each row.
     """
     sounds = sounds_of(classes)
     of_sounds = decisions[:, sounds]
@@ -170,7 +171,7 @@ def mixed(
     result[:, sounds] = total - _log_sum(total) + _log_sum(of_sounds) - _log_sum(decisions)
     if len(sounds) < len(classes):
         silence = list(classes).index(SILENCE)
-        result[:, silence] = decisions[:, silence] - _log_sum(decisions)[:, 0]
+        result[:, silence] = decisions[:, silence] - _log_sum(decisions)[:, 0] + mix.silence_bias
     return result
 
 

@@ -9,6 +9,7 @@ from hearthlog.models.embedding.embeddings import (
     Embeddings,
 )
 from hearthlog.models.embedding.networks import Embedder
+from hearthlog.models.embedding.steady_noise import SteadyNoise
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES
 
@@ -19,7 +20,7 @@ class EmbeddingStream:
     """Embeds the windows of one stream of frames in which there is sound.
 
     Windows begin at frames whose number is a multiple of ten. One is embedded if there is sound
-    within half a second of its middle.
+    within half a second of its middle, without the noise of windows in which there is none.
 
     Parameters
     ----------
@@ -28,10 +29,12 @@ class EmbeddingStream:
 
     def __init__(self, embedder: Embedder) -> None:
         self._embedder = embedder
+        self._noise = SteadyNoise()
         self.restart()
 
     def restart(self) -> None:
         """Forget the past: the next frame does not follow the last one."""
+        self._noise.restart()
         self._frames = np.empty((0, FRAME_SAMPLES), np.float32)
         self._sound = np.empty(0, bool)
         self._stamps = np.empty(0, np.int64)
@@ -60,16 +63,17 @@ class EmbeddingStream:
         stamps = np.concatenate([self._stamps, stamps])
         first -= len(self._frames)
         begins = np.arange(-first % HOP_FRAMES, len(samples) - WINDOW_FRAMES + 1, HOP_FRAMES)
-        lasts = begins + WINDOW_FRAMES
-        chosen = [
-            begin
-            for begin, last in zip(begins.tolist(), lasts.tolist(), strict=True)
-            if sound[begin + _SOUND_FROM : last].any()
-        ]
+        chosen, values = [], []
+        for begin in begins.tolist():
+            window, above = samples[begin : begin + WINDOW_FRAMES], sound[begin:][:WINDOW_FRAMES]
+            if above[_SOUND_FROM:].any():
+                chosen.append(begin)
+                values.append(self._embedder(self._noise.reduced(window)))
+            elif not above.any():
+                self._noise.learn(window)
         self._frames = samples[1 - WINDOW_FRAMES :].copy()
         self._sound, self._stamps = sound[1 - WINDOW_FRAMES :], stamps[1 - WINDOW_FRAMES :]
         if not chosen:
             return NO_EMBEDDINGS
-        values = [self._embedder(samples[begin : begin + WINDOW_FRAMES]) for begin in chosen]
         places = np.array(chosen, np.int64)
         return Embeddings(first + places, stamps[places], np.stack(values))
