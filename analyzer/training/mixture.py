@@ -23,10 +23,10 @@ HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
 _SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tried
 CLASS_EXPONENT = 0.2
-_SILENCE_BIAS = -1.0  # classifiers take faint sound in noise for silence
 _NAMES_BESIDE = 0.5  # weight of names beside both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
-_REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
+_REJECTING_WEIGHT, _REJECTING_SLOPE, _REJECTING_BIAS = 2.25, 0.15, -1.2
+_LOG_SUM = 0.1  # names of a kind together, as the highest of many is high by chance
 _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 
@@ -244,7 +244,7 @@ def _candidates(
     if (_sources(data)[known] < FEWEST_SOURCES).any():
         beside = names.model_copy(update={"weight": _NAMES_BESIDE})
         return [(every, [*by_rejecting, beside]), (every[:1], [names])]
-    return [(every, []), *([(every, by_rejecting)] if by_rejecting else []), (every[:1], [names])]
+    return [(every, []), *([(every, by_rejecting)] if by_rejecting else [])]
 
 
 def _sources(data: Dataset) -> Indices:
@@ -291,7 +291,6 @@ def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
         head_weights=[HEAD_WEIGHT] * len(inputs),
         machine_weight=MACHINE_WEIGHT,
         inverse_temperature=1.0,
-        silence_bias=_SILENCE_BIAS,
     )
 
 
@@ -318,8 +317,9 @@ def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | Non
     outside = [first + number for number, group in enumerate(groups) if group in others]
     return NamesHead(
         weight=_REJECTING_WEIGHT,
-        slope=_NAMES_SLOPE,
+        slope=_REJECTING_SLOPE,
         classes={**dict.fromkeys(known, inside), UNKNOWN: outside},
+        log_sum=_LOG_SUM,
         bias={UNKNOWN: _REJECTING_BIAS},
     )
 

@@ -189,7 +189,10 @@ class NamesHead(_Record):
     slope : float
         Decision value of a step of a logged value.
     classes : dict of str to list of int
-        Numbers of the logged values of each class, of which the highest counts.
+        Numbers of the logged values of each class.
+    log_sum : float
+        Where a class has some values, the logarithm of the sum of exponentials of so much a step
+        counts, in steps; 0 where the highest value counts.
     bias : dict of str to float
         What is added to the decision values of classes.
     """
@@ -206,6 +209,7 @@ class NamesHead(_Record):
         ],
         Field(min_length=2, max_length=MOST_CLASSES),
     ]
+    log_sum: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
 
 
@@ -231,8 +235,6 @@ class EmbeddingMix(_Record):
         That of the model before it was adapted to a home; None if it never was.
     bias : dict of str to float
         What is added to the mean, by class.
-    silence_bias : float
-        What is added to the logarithm of the odds of silence.
     of_home : bool
         Whether there is one linear head more, of a home: its decision values are no logarithms of
         probabilities, but added to the sum of those of the other heads.
@@ -250,7 +252,6 @@ class EmbeddingMix(_Record):
     inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)]
     base_inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)] | None = None
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
-    silence_bias: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
     of_home: bool = False
 
     @property

@@ -145,9 +145,11 @@ def named_sounds(
     """
     names = audioset_names() if names is None else names
     columns, sounds = _columns(projection, names), list[NamedSound]()
-    logits = projection.values(embeddings.values)[:, columns] if len(embeddings.frames) else None
+    if not len(embeddings.frames):
+        return sounds
+    logits = projection.values(embeddings.values)[:, columns]
     above_low = (projection.lows + projection.steps)[columns]  # the low itself is nothing heard
-    for place, name in enumerate(names if logits is not None else ()):
+    for place, name in enumerate(names):
         sounds += _named(name, logits[:, place], embeddings.frames, float(above_low[place]))
     return sorted(sounds, key=lambda sound: sound.first)
 

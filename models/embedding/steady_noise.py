@@ -1,9 +1,9 @@
 """The steady noise of a room, which is taken out of windows before a network hears them.
 
 The mean power of the noise is subtracted from each bin, as in Boll, "Suppression of acoustic noise
-in speech using spectral subtraction" (1979), down to the noise that heads have learned with: on
-average the noise falls by 7 dB. Subtracting more took away more of what the network knows sounds by.
-The noise is what there is while nothing is above the floor of the room.
+in speech using spectral subtraction" (1979), down to the noise that heads have learned with: the
+noise falls by 7 dB. Subtracting more took away more of what the network knows sounds by. The noise
+is what there is while nothing is above the floor of the room.
 """
 
 from functools import cache
