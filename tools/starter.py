@@ -24,6 +24,8 @@ from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import Dataset, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.installed import clip_embedder
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
+from hearthlog.analyzer.training.method import prepare
+from hearthlog.analyzer.training.mixture import head_inputs_of
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import EMBEDDING, ROOM, SvmMethod
 from hearthlog.analyzer.training.train import train_model
@@ -158,10 +160,13 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMe
     few = {one for one in scenario.classes if len(sources.get(one, ())) < _FEWEST_SOURCES}
     before = load_model(starter_file(name)) if method.network else None
     kept = few & set(before.classes) if before is not None else set()
+    named = set[str]()
+    if method.network:  # whose names say what is of a class, if there is any recording at all
+        named = (few - kept) & sources.keys() & set(head_inputs_of(method.network).groups)
     misleading = () if method.network else _MISLEADING.get(name, ())
     classes = dict(scenario.classes)
     for one in scenario.classes:
-        if one in few - kept or one in misleading:
+        if one in few - kept - named or one in misleading:
             print(f"{name}: no class {one}, of which there are {len(sources.get(one, ()))} sources")
             del classes[one]
     chosen = Scenario(scenario.name, classes).with_unknown(
@@ -174,9 +179,17 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMe
         chosen,
         method.features,
     )
-    others = None if before is None or not kept else _remembered(before, method, data, kept)
-    model = train_model(data, chosen, ignore_progress, method, others=others)
-    if before is not None and others is not None:
+    others = [_own_windows(method, data, named)] if named else []
+    if before is not None and kept:
+        others.append(_remembered(before, method, data, kept))
+    joined = None
+    if others:
+        joined = (
+            np.concatenate([one[0] for one in others]),
+            np.concatenate([one[1] for one in others]),
+        )
+    model = train_model(data, chosen, ignore_progress, method, others=joined)
+    if before is not None and kept:
         model = _crediting(model, before)
     path.unlink(missing_ok=True)
     save_model(model, path)
@@ -187,6 +200,13 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMe
     if changed:
         print(f"{path}: write its sha256 {model.sha256} into {path.with_name('__init__.py')}")
     return model
+
+
+def _own_windows(method: SvmMethod, data: Dataset, classes: set[str]) -> tuple[Float32, Indices]:
+    """Return the windows of classes of which folds may leave nothing to learn from."""
+    numbers = [data.classes.index(name) for name in classes]
+    rows = np.flatnonzero(np.isin(data.target, numbers))
+    return prepare(method, data).windows(rows)[:2]
 
 
 def _remembered(

@@ -1,6 +1,7 @@
 """Calibration: how sure a classifier may be, by segments that it has not learned from."""
 
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -19,18 +20,20 @@ _BASE_SEGMENTS = 30
 _FEWEST_SEGMENTS = 20  # of a collection with a fold of its own
 
 
-def collection_folds(data: Dataset) -> list[Fold]:
+def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
     """Leave out one collection after the other; small ones together.
 
     Parameters
     ----------
     data : Dataset
+    taught : set of int
+        Numbers of classes that are always learned from something else, too.
 
     Returns
     -------
     list of Fold
         Empty if there are fewer than three folds, if one leaves a single class to learn from, or if
-        fewer than half of the classes are told by other collections.
+        fewer than half of all other classes are told by other collections.
     """
     counts = np.bincount(data.collection)
     fold = np.where(counts < _FEWEST_SEGMENTS, len(counts), np.arange(len(counts)))[data.collection]
@@ -40,7 +43,8 @@ def collection_folds(data: Dataset) -> list[Fold]:
     ]
     several = all(len(np.unique(data.target[seen])) > 1 for seen, _ in folds)
     tried = np.unique(data.target[taught_elsewhere(data, folds)])
-    enough = 2 * len(tried) >= sum(name != UNKNOWN for name in data.classes)
+    others = [n for n, name in enumerate(data.classes) if name != UNKNOWN and n not in taught]
+    enough = 2 * len(np.setdiff1d(tried, list(taught))) >= len(others)
     return folds if len(folds) >= _FEWEST_COLLECTIONS and several and enough else []
 
 

@@ -98,8 +98,8 @@ def train_model(  # noqa: PLR0913, PLR0917
         If the feature set of the method is not installed.
     """
     check_varied(data)
-    sources = group_folds(data, frozenset() if others is None else frozenset(others[1].tolist()))
-    collections = collection_folds(data)
+    taught = frozenset() if others is None else frozenset(others[1].tolist())
+    sources, collections = group_folds(data, taught), collection_folds(data, taught)
     examples, fits = prepare(method, data), len(sources) + len(collections) + 1
     if others is not None:
         inputs, target = others
@@ -128,8 +128,8 @@ def train_model(  # noqa: PLR0913, PLR0917
         measured, sure = mixture.of_sources, 1.0
         if mixture.of_collections is not None:
             probabilities = softmax(mixture.of_collections)
-            taught = taught_elsewhere(data, collections)
-            elsewhere = scores_elsewhere(probabilities, data, taught)
+            tried = taught_elsewhere(data, collections)
+            elsewhere = scores_elsewhere(probabilities, data, tried)
     learned = method.fit(examples)
     progress(1.0)
     model = Model(
