@@ -112,22 +112,6 @@ def test_no_head_has_a_veto():
     assert said.max() <= 2.5 * 1e-3
 
 
-@pytest.mark.parametrize("log_sum", [0.0, 0.1, 1.0])
-def test_names_of_a_class_count_together_as_their_highest_or_as_the_sum_of_all(log_sum):
-    names = {"speech": [0, 1, 2], "unknown": [3]}
-    head = NamesHead(weight=1.0, slope=0.2, classes=names, log_sum=log_sum)
-    model = with_heads(head_weights=[1e-6], names=[head])
-    values = np.full((3, WIDTH), -127, np.int8)
-    values[:, :4] = [[10, 10, 10, 20], [10, -120, -120, 20], [40, 10, 10, 20]]
-    said = Classifier(model).embedding_heads.log_probabilities(values)
-    speech, unknown = (said[:, model.classes.index(name)] for name in names)
-    together = [np.log(3) / log_sum if log_sum else 0.0, 0.0, 0.0]
-    wanted = 0.2 * (np.array([10, 10, 40]) + together - 20)
-    if log_sum == 0.1:
-        wanted[2] += 0.2 * np.log(1 + 2 * np.exp(-3)) / 0.1
-    np.testing.assert_allclose(speech - unknown, wanted, atol=0.02)
-
-
 def test_heads_share_what_silence_leaves_and_leave_silence_as_it_is():
     model, count = with_heads(), 400
     classifier, alone = Classifier(model), Classifier(plain())

@@ -25,8 +25,7 @@ _SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tr
 CLASS_EXPONENT = 0.2
 _NAMES_BESIDE = 0.5  # weight of names beside both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.0, 0.2  # of a step of a quarter of a logit
-_REJECTING_WEIGHT, _REJECTING_SLOPE, _REJECTING_BIAS = 2.25, 0.15, -1.2
-_LOG_SUM = 0.1  # names of a kind together, as the highest of many is high by chance
+_REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
 _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 
@@ -317,9 +316,8 @@ def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | Non
     outside = [first + number for number, group in enumerate(groups) if group in others]
     return NamesHead(
         weight=_REJECTING_WEIGHT,
-        slope=_REJECTING_SLOPE,
+        slope=_NAMES_SLOPE,
         classes={**dict.fromkeys(known, inside), UNKNOWN: outside},
-        log_sum=_LOG_SUM,
         bias={UNKNOWN: _REJECTING_BIAS},
     )
 

@@ -189,10 +189,7 @@ class NamesHead(_Record):
     slope : float
         Decision value of a step of a logged value.
     classes : dict of str to list of int
-        Numbers of the logged values of each class.
-    log_sum : float
-        Where a class has some values, the logarithm of the sum of exponentials of so much a step
-        counts, in steps; 0 where the highest value counts.
+        Numbers of the logged values of each class, of which the highest counts.
     bias : dict of str to float
         What is added to the decision values of classes.
     """
@@ -209,7 +206,6 @@ class NamesHead(_Record):
         ],
         Field(min_length=2, max_length=MOST_CLASSES),
     ]
-    log_sum: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
 
 

@@ -101,7 +101,6 @@ class _Names:
         self.weight, self._slope = head.weight, head.slope
         named = [number for number, name in enumerate(classes) if name in head.classes]
         lists = [head.classes[classes[number]] for number in named]
-        self._log_sum, self._counts = head.log_sum, [len(one) for one in lists]
         self._values = np.array([value for one in lists for value in one], np.intp)
         self._starts = np.cumsum([0, *map(len, lists)])[:-1].astype(np.intp)
         self._named = np.array(named, np.intp)
@@ -111,13 +110,8 @@ class _Names:
     def decide(self, values: Int8) -> Float64:
         """Return decision values; -inf for classes without names."""
         decisions = np.full((len(values), self._count), -np.inf)
-        steps = values[:, self._values].astype(np.float64)
-        highest = np.maximum.reduceat(steps, self._starts, axis=1)
-        if self._log_sum:
-            below = self._log_sum * (steps - np.repeat(highest, self._counts, axis=1))
-            sums = np.add.reduceat(np.exp(below), self._starts, axis=1)
-            highest += np.log(sums) / self._log_sum
-        decisions[:, self._named] = self._slope * highest + self._bias
+        highest = np.maximum.reduceat(values[:, self._values], self._starts, axis=1)
+        decisions[:, self._named] = self._slope * highest.astype(np.float64) + self._bias
         return decisions
 
 
