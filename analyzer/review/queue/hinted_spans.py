@@ -22,13 +22,12 @@ from hearthlog.models.embedding.embeddings import Embeddings
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import Projection, read_projection
 from hearthlog.models.embedding.sound_names import SoundName, audioset_names, named_sounds
+from hearthlog.models.modelfile.audioset import AUDIOSET
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import EmbeddingSource, scenario_labelling, topic
-
-AUDIOSET = "audioset"  # the scenario that labels by the names that are no hints
 
 
 def hinted_spans(
