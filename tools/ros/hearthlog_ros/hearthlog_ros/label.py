@@ -140,8 +140,9 @@ class Label(Node):
         width = self._features.width
         if any(len(message.values) != width for message in messages):
             raise NodeError(
-                f"model {self._model.name} wants {width} features of {self._features.name}; "
-                f"{topic(self._microphone, 'features')} has {len(messages[0].values)}"
+                f"model {self._model.name} is for feature set {self._features.name}; "
+                f"{topic(self._microphone, 'features')} has {len(messages[0].values)} features "
+                f"rather than {width}: choose another model"
             )
         values = np.array([message.values for message in messages], np.float32)
         stamps = np.array([nanoseconds(message.header.stamp) for message in messages], np.int64)
