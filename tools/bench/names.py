@@ -24,7 +24,7 @@ import typer
 from hearthlog.analyzer.evaluation.scenes import background
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, Embeddings
+from hearthlog.models.embedding.embeddings import HOP_FRAMES, NO_EMBEDDINGS, Embeddings
 from hearthlog.models.embedding.networks import YAMNET, Embedder
 from hearthlog.models.embedding.projection import Projection
 from hearthlog.models.embedding.sound_names import (
@@ -34,8 +34,10 @@ from hearthlog.models.embedding.sound_names import (
     named_sounds,
     write_names,
 )
-from hearthlog.models.embedding.stream import EmbeddingStream
-from hearthlog.schemas.arrays import Bool, Float64
+from hearthlog.models.features.floor import FloorTracker
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.stream.embedding_messages import MicrophoneEmbeddings
+from hearthlog.schemas.arrays import Bool, Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 
 # Kinds as `label/detail`, or a label alone, and the names that are right for them.
@@ -153,6 +155,7 @@ LIKE: Mapping[str, tuple[str, ...]] = {
 _LONGEST = round(10 / FRAME_SECONDS)
 _PAUSES = (10, 40, 120)  # frames
 _FLOOR = -70.0  # dBFS
+_BLOCK = 12_000  # frames
 _FAINTEST = -12.0  # dB, by which a clip is laid fainter
 _THRESHOLDS = np.arange(-3.5, 12.1, 0.5)
 _PRECISION, _FALSE_AN_HOUR = 0.8, 1.0  # of an event
@@ -298,9 +301,22 @@ def compose(clips: Sequence[Kind], embedder: Embedder, seed: int) -> Scene:
     sound = noise[: place * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
     for first, frames in parts:
         sound[first : first + len(frames)] += frames
-    stamps = np.arange(len(sound), dtype=np.int64)
-    embeddings = EmbeddingStream(embedder).push(sound, np.ones(len(sound), bool), 0, stamps)
-    return Scene(embeddings, laid, len(sound) * FRAME_SECONDS / 3600)
+    return Scene(_embedded(sound, embedder), laid, len(sound) * FRAME_SECONDS / 3600)
+
+
+def _embedded(sound: Float32, embedder: Embedder) -> Embeddings:
+    """Embed what is above the floor, as a recorder does, shape (n, FRAME_SAMPLES)."""
+    stream, extractor = MicrophoneEmbeddings(embedder, DEFAULT), DEFAULT.extractor()
+    tracker, embeddings = FloorTracker(), NO_EMBEDDINGS
+    assert DEFAULT.band_powers is not None
+    for first in range(0, len(sound), _BLOCK):
+        frames = sound[first : first + _BLOCK]
+        features = extractor(frames)
+        floors = tracker(DEFAULT.band_powers(features), first)
+        stamps = np.arange(first, first + len(frames), dtype=np.int64)
+        found = stream.push(frames, features, floors, first, stamps)
+        embeddings = embeddings.followed_by(found)
+    return embeddings
 
 
 def count(
