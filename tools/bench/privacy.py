@@ -40,6 +40,7 @@ from hearthlog.tools.bench.vocoder import Logged, logged, sound_of
 _RATES = (10, 50, 100, 250, 500, 1000)  # ms from frame to frame; the first is the control
 _LONGEST, _SHORTEST = 8.0, 3.0  # seconds of a sentence
 _PAUSE_SECONDS, _PAUSE_DBFS = 1.0, -60.0  # around a digit
+_GATE_FRAMES = 8  # behind a sound, in which a recorder still finds it above the floor
 _PARTS = 8  # of a digit
 _TINY = 1e-7
 
@@ -208,7 +209,9 @@ def _windows(sound: Float64, rng: np.random.Generator, embedder: Embedder) -> Fl
     count = len(room) // FRAME_SAMPLES
     frames = room[: count * FRAME_SAMPLES].reshape(count, FRAME_SAMPLES).astype(np.float32)
     stream, stamps = EmbeddingStream(embedder), np.arange(count) * FRAME_NANOSECONDS
-    windows = stream.push(frames, np.ones(count, bool), 0, stamps)
+    loud = np.zeros(count, bool)
+    loud[before // FRAME_SAMPLES : (before + len(sound)) // FRAME_SAMPLES + _GATE_FRAMES] = True
+    windows = stream.push(frames, loud, 0, stamps)
     middle = (before + len(sound) / 2) / FRAME_SAMPLES
     first = int(np.searchsorted(windows.frames + WINDOW_FRAMES / 2, middle)) - 1
     first = min(max(first, 0), len(windows.frames) - 2)
