@@ -12,7 +12,7 @@ from hearthlog.tools.home.clips import SHIPPED
 
 
 def test_a_home_is_composed_of_halves_that_share_no_source_and_that_no_starter_has_heard(tmp_path):
-    home = compose([SHIPPED], GENERAL, 1, tmp_path, minutes=2.0)
+    home = compose([SHIPPED], None, 1, tmp_path, minutes=2.0)
     assert len(home.logs) == 3
     assert len({log.start // 86_400_000_000_000 for log in home.logs}) == 3
     assert {"silence", "speech", "crying"} <= {*home.truth.labels} <= {"silence", *PLAYED[GENERAL]}

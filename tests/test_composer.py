@@ -16,9 +16,11 @@ import pytest
 import soundfile
 from mcap.reader import make_reader
 
+from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.licences import may_be_shipped
+from hearthlog.models.starter import starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -30,6 +32,7 @@ from hearthlog.tools.home.plan import Plan, PlannedSound, SteadyNoise
 from hearthlog.tools.home.record import record_composition, write_sound
 from hearthlog.tools.home.rooms import PERIOD_FRAMES, Rooms
 from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
+from hearthlog.tools.home.short_day import plan_short_day
 from hearthlog.tools.home.truth import truth_of
 
 HOUR = DAY_FRAMES // 24
@@ -209,22 +212,57 @@ def test_steady_noise_repeats_itself_and_its_features_do_too(library, rooms):
     assert quiet.busy(0, quiet.plan.frames).sum() == 40
 
 
-def test_the_logs_are_those_that_the_recorder_leaves_of_the_sound(evening, model_file, tmp_path):
-    write_sound(evening, tmp_path / "evening.flac", 0, evening.plan.frames)
+def recorded_and_composed(composition, model, folder):
+    """The messages of a recorder that hears a composition, and those that are composed."""
+    write_sound(composition, folder / "evening.flac", 0, composition.plan.frames)
     found = []
     for name in ("recorded", "composed"):
-        settings = Settings(output=tmp_path / name, model=model_file)
+        settings = Settings(output=folder / name, model=model)
         if name == "recorded":
-            source = FileSource([tmp_path / "evening.flac"], START)
+            source = FileSource([folder / "evening.flac"], START)
             logs = record_files(settings, source, Flag()).logs
         else:
-            logs = record_composition(evening, settings, START, "evening.flac")
+            logs = record_composition(composition, settings, START, "evening.flac")
         assert [log.name for log in logs] == ["home_20260301T000000Z.mcap"]
         with logs[0].open("rb") as stream:
             messages = make_reader(stream).iter_messages()
             found.append([(channel.topic, one.log_time, one.data) for _, channel, one in messages])
-    assert found[0] == found[1]
-    assert {topic for topic, *_ in found[0]} >= {"/mic/features", "/mic/label", "/mic/segment"}
+    return found
+
+
+def test_the_logs_are_those_that_the_recorder_leaves_of_the_sound(evening, model_file, tmp_path):
+    recorded, composed = recorded_and_composed(evening, model_file, tmp_path)
+    assert recorded == composed
+    assert {topic for topic, *_ in recorded} >= {"/mic/features", "/mic/label", "/mic/segment"}
+
+
+def test_a_model_that_takes_embeddings_gets_those_of_the_composed_sound(
+    library, rooms, tmp_path, monkeypatch
+):
+    pytest.importorskip("ai_edge_litert")
+    network = Path(__file__).parents[2] / "shared" / "data" / "networks" / "yamnet.tflite"
+    if not network.exists():
+        pytest.skip("needs the network, in ../shared/data/networks")
+    monkeypatch.delenv("HEARTHLOG_EMBEDDING", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    place = tmp_path / "hearthlog" / "networks" / "yamnet.tflite"
+    place.parent.mkdir(parents=True)
+    place.symlink_to(network)
+    composition = Composition(plan_short_day(2, library, 1), library, rooms)
+    model = starter_file("general-embedding")
+    recorded, composed = recorded_and_composed(composition, model, tmp_path)
+    assert recorded == composed
+    assert sum(topic == "/mic/embedding" for topic, *_ in composed) > 20
+
+
+def test_a_model_that_takes_embeddings_labels_no_composition_without_its_network(
+    evening, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    settings = Settings(output=tmp_path / "logs", model=starter_file("general-embedding"))
+    with pytest.raises(ModelError, match="the network yamnet is not there; hearthlog models fetch"):
+        record_composition(evening, settings, START)
+    assert not (tmp_path / "logs").exists()
 
 
 def test_a_clip_is_cut_or_repeated_to_a_length_as_loud_as_every_other(library):

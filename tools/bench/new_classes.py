@@ -1,4 +1,4 @@
-"""`python -m hearthlog.tools.bench.new_classes MANIFEST …`: marks of classes that a starter lacks.
+"""`python -m hearthlog.tools.bench.new_classes MANIFEST …`: marks, and classes that a model lacks.
 
 A home is composed of recordings that no starter has learned from. A person corrects the first
 minutes of its first two days, in the true class or, of what has none, as `unknown`. The model that
@@ -10,7 +10,7 @@ import csv
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -28,7 +28,6 @@ from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS, scenario_of
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN
-from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder.config import Settings
@@ -96,31 +95,44 @@ class Outcome(NamedTuple):
     notes: list[str]
 
 
-def compose(
-    manifests: Sequence[Path], starter: str, seed: int, folder: Path, minutes: float = 25.0
+def compose(  # noqa: PLR0913, PLR0917
+    manifests: Sequence[Path],
+    model: Path | None,
+    seed: int,
+    folder: Path,
+    scenario: str = GENERAL,
+    minutes: float = 25.0,
 ) -> Home:
-    """Compose three short days, labelled by a starter.
+    """Compose three short days, labelled by a model, of the labels that two sources have or more.
 
     Parameters
     ----------
     manifests : sequence of Path
-    starter : str
+        Of recordings that the model has not heard.
+    model : Path or None
+        None for the starter of the scenario: then recordings of its sources are left out.
     seed : int
         Another one makes another home, and other halves of the sources.
     folder : Path
         For the logs.
+    scenario : str, optional
+        What is played: `general` or `bathroom`.
     minutes : float, optional
         Of a day.
 
     Raises
     ------
     HearthlogError
-        If a manifest or a clip of it cannot be used.
+        If a manifest or a clip of it cannot be used, or the network of the model is not there.
     """
-    rng, labels = np.random.default_rng(seed), PLAYED[starter]
-    halves = _halves(manifests, labels, rng, folder)
-    room = LIVING_ROOM if starter == GENERAL else BATHROOM
-    settings = Settings(output=folder / "logs", model=starter_file(starter), timezone="UTC")
+    rng = np.random.default_rng(seed)
+    halves = _halves(manifests, PLAYED[scenario], rng, folder, _learned() if model is None else {})
+    lacking = {label for half in halves for label in half.made_up}
+    labels = [label for label in PLAYED[scenario] if label not in lacking]
+    room = LIVING_ROOM if scenario == GENERAL else BATHROOM
+    settings = Settings(
+        output=folder / "logs", model=model or starter_file(scenario), timezone="UTC"
+    )
     truth = []
     for day, library in enumerate((halves[0], halves[0], halves[1])):
         plan = _plan(library, labels, room, rng, minutes)
@@ -134,17 +146,28 @@ def compose(
     return Home(recent_logs([folder / "logs"]), joined)
 
 
+def _learned() -> set[str]:
+    """Name the source groups that the starters have learned from."""
+    groups: set[str] = set()
+    for name in ("sources.csv", "sources-embedding.csv"):
+        with starter_file(GENERAL).with_name(name).open(encoding="utf-8") as file:
+            groups |= {row["source_group"] for row in csv.DictReader(file)}
+    return groups
+
+
 def _halves(
-    manifests: Sequence[Path], labels: Sequence[str], rng: np.random.Generator, folder: Path
+    manifests: Sequence[Path],
+    labels: Sequence[str],
+    rng: np.random.Generator,
+    folder: Path,
+    learned: Collection[str],
 ) -> list[ClipLibrary]:
-    """Divide the sources that no starter has heard, the same number of each label at most."""
-    with starter_file(GENERAL).with_name("sources.csv").open(encoding="utf-8") as file:
-        heard = {row["source_group"] for row in csv.DictReader(file)}
+    """Divide the sources that were not learned from, the same number of each label at most."""
     clips = [
         clip
         for manifest in manifests
         for clip in read_manifest(manifest, LABELS, [])
-        if clip.label in labels and clip.source_group not in heard
+        if clip.label in labels and clip.source_group not in learned
     ]
     half_of: dict[str, int] = {}
     for label in labels:
@@ -183,13 +206,13 @@ def _plan(
     return Plan(frames, sounds, [])
 
 
-def taught(home: Home, base: Model, marks: Sequence[int]) -> Iterator[Outcome]:
+def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:
     """Correct the first two days of a home, learn, judge, and score its third day.
 
     Parameters
     ----------
     home : Home
-    base : Model
+    model : Path
         That labelled it.
     marks : sequence of int
         How many sounds are marked, one half of them on each day.
@@ -203,10 +226,15 @@ def taught(home: Home, base: Model, marks: Sequence[int]) -> Iterator[Outcome]:
     HearthlogError
         If there is nothing to learn.
     """
-    *days, last = home.logs
+    base, (*days, last) = load_model(model), home.logs
     wrong = [wrong_sounds([log], home.truth, log.end, unsure=True) for log in days]
     scenario = scenario_of(base)
-    new = sorted({*home.truth.labels} & {*scenario.classes.get(UNKNOWN, ())} - {OTHER_NEGATIVE})
+    known = {*base.classes} - {UNKNOWN}
+    new = sorted(
+        label
+        for label in {*home.truth.labels} - {OTHER_NEGATIVE}
+        if scenario.find(label) not in known
+    )
     scale = [name for name in base.classes if name != UNKNOWN] + new
     true = [name if name in scale else scenario.find(name) for name in home.truth.labels]
     truth = replace(home.truth, labels=np.array(true, object))
@@ -219,6 +247,7 @@ def taught(home: Home, base: Model, marks: Sequence[int]) -> Iterator[Outcome]:
                 shutil.copy(log.path, logs)
             _write(logs, home.logs, own)
             lessons = home_lessons([logs], base)
+            shutil.copy(model, place)  # for the gate, which looks for it there
             path = Path(place) / "home-1.safetensors"
             save_model(adapt_model(base, lessons.segments), path)
             adapted = load_model(path)
@@ -262,18 +291,21 @@ def lines_of(outcome: Outcome) -> Iterator[str]:
 def main(
     manifests: Annotated[list[Path], typer.Argument(help="Of labelled recordings.")],
     starter: Annotated[str, typer.Option(help="That labels: general or bathroom.")] = GENERAL,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="In its place; it has learned from none of the recordings."),
+    ] = None,
     seed: Annotated[list[int] | None, typer.Option(help="Of a home; may be given again.")] = None,
     marks: Annotated[list[int] | None, typer.Option(help="How many; may be given again.")] = None,
 ) -> None:
     """Print macro F1 before and after marks, F1 of new classes, the largest loss, the verdict."""
-    base = load_model(starter_file(starter))
     for each in seed or range(3):
         print(
             f"home {each}\nmarks  macro F1     new classes; the class that loses most", flush=True
         )
         with tempfile.TemporaryDirectory(prefix="hearthlog-new-classes-") as place:
-            home = compose(manifests, starter, each, Path(place))
-            for outcome in taught(home, base, marks or MARKS):
+            home = compose(manifests, model, each, Path(place), starter)
+            for outcome in taught(home, model or starter_file(starter), marks or MARKS):
                 print("\n".join(lines_of(outcome)), flush=True)
 
 

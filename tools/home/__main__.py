@@ -15,7 +15,7 @@ from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.plan import LIVING_ROOM, ROOMS
-from hearthlog.tools.home.record import record_composition, write_sound
+from hearthlog.tools.home.record import embedder_of, record_composition, write_sound
 from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.routine import Habits, plan_days
 from hearthlog.tools.home.simulate import reported
@@ -54,7 +54,7 @@ def home(
     if audio and model is not None:
         raise SimulationError("--audio writes no logs that --model could label; leave one out")
     if model is not None:
-        load_model(model)  # before hours of a home are planned and written
+        embedder_of(load_model(model))  # before hours of a home are planned and written
     library = ClipLibrary(manifest)
     if library.made_up:
         print(f"hearthlog: made up without clips: {', '.join(library.made_up)}", file=sys.stderr)

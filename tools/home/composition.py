@@ -266,13 +266,13 @@ class FeatureStream:
         before = 1 if begin else 0
         for start in range(begin - before, end, _FRAMES_AT_ONCE):
             count = min(_FRAMES_AT_ONCE, end - start)
-            blocks.append(self._extractor(_full_scale(self._composition.samples(start, count))))
+            blocks.append(self._extractor(full_scale(self._composition.samples(start, count))))
         return np.concatenate(blocks)[before:]
 
     def _table(self, state: tuple[str, ...]) -> Float32:
         """Return the features of steady noise, each frame behind the one before in its period."""
         if state not in self._tables:
-            noise = _full_scale(self._composition.steady(state))
+            noise = full_scale(self._composition.steady(state))
             extractor = self._features.extractor()
             extractor(noise[-1:])
             self._tables[state] = extractor(noise)
@@ -287,8 +287,13 @@ def _quantised(mix: Float32) -> Int16:
     return np.clip(np.rint(mix * 32768.0), -32768, 32767).astype(np.int16)
 
 
-def _full_scale(samples: Int16) -> Float32:
-    """Return samples as those of an audio file are read."""
+def full_scale(samples: Int16) -> Float32:
+    """Return samples as those of an audio file are read.
+
+    Parameters
+    ----------
+    samples : np.ndarray, int16
+    """
     return samples.astype(np.float32) / np.float32(32768.0)
 
 

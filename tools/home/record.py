@@ -7,10 +7,13 @@ import numpy as np
 import soundfile
 
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding.networks import Embedder, load_embedder
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.events import OK, SourceHealth
+from hearthlog.recorder.embedder_probe import network_path
+from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
@@ -18,7 +21,7 @@ from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Int16
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.tools.home.composition import Composition
+from hearthlog.tools.home.composition import Composition, full_scale
 
 _PUSHED_FRAMES = 200  # as `FileSource` yields them, with a report of health before
 _COMPUTED_FRAMES = 12_000  # 10 minutes
@@ -31,13 +34,17 @@ def record_composition(
     device: str = "simulated home",
     progress: Progress = ignore_progress,
 ) -> list[Path]:
-    """Write the logs that a recorder would leave of a home, without composing most of its sound.
+    """Write the logs that a recorder would leave of a home.
+
+    Only for a model that takes embeddings all of the sound is composed; for others, most of it is
+    not.
 
     Parameters
     ----------
     composition : Composition
     settings : Settings
-        Its model labels the sound; clips are not kept.
+        Its model labels the sound, by embeddings of its network if it takes any; clips are not
+        kept.
     start : int
         Time of the first sample, in nanoseconds of UTC.
     device : str
@@ -53,7 +60,7 @@ def record_composition(
     Raises
     ------
     ModelError
-        If the model cannot be used.
+        If the model cannot be used, or the network of its embeddings is not there.
     LogError
         If a log exists, or cannot be written.
     """
@@ -61,10 +68,13 @@ def record_composition(
     classifier = None if model is None else Classifier(model)
     features = DEFAULT if classifier is None else classifier.feature_set
     microphone = settings.microphone[0].name
-    pipeline = Pipeline(microphone, features, classifier, settings.statistics_every)
+    embedder = embedder_of(model)
+    pipeline = Pipeline(
+        microphone, features, classifier, settings.statistics_every, embedder=embedder
+    )
     info = stream_info(microphone, device, features, model)
     log = RollingLog(
-        describe_log(settings, info, features, model),
+        describe_log(settings, info, features, model, embedding=pipeline.embedding),
         settings.max_bag_duration,
         settings.flush_seconds,
         settings.sync_seconds,
@@ -73,6 +83,22 @@ def record_composition(
         log.write(messages)
     log.finish(pipeline.finish())
     return log.finished
+
+
+def embedder_of(model: Model | None) -> Embedder | None:
+    """Load the network of the embeddings that a model takes, if it takes any.
+
+    Parameters
+    ----------
+    model : Model or None
+
+    Raises
+    ------
+    ModelError
+        If it is not there, or cannot be used.
+    """
+    space = None if model is None else model.description.embedding_space
+    return None if space is None else load_embedder(space.network, network_path(space.network))
 
 
 def write_sound(
@@ -118,8 +144,16 @@ def _blocks(composition: Composition, first: int, frames: int) -> Iterator[tuple
 def _messages(
     composition: Composition, pipeline: Pipeline, start: int, device: str, progress: Progress
 ) -> Iterator[list[EncodedMessage]]:
-    """Yield what the pipeline makes of the features, and of the health of a source of sound."""
-    stream, frames = composition.features(pipeline.feature_set), composition.plan.frames
+    """Yield what the pipeline makes of the sound, and of the health of its source."""
+    frames = composition.plan.frames
+    if pipeline.embedding is not None:
+        for first, samples in _blocks(composition, 0, frames):
+            stamps = start + np.arange(first, first + len(samples)) * FRAME_NANOSECONDS
+            yield pipeline.push(SourceHealth(int(stamps[0]), OK, "reading", {"device": device}))
+            yield pipeline.push(Frames(first, full_scale(samples), stamps))
+            progress((first + len(samples)) / frames)
+        return
+    stream = composition.features(pipeline.feature_set)
     for block in range(0, frames, _COMPUTED_FRAMES):
         values = stream(block, min(_COMPUTED_FRAMES, frames - block))
         for offset in range(0, len(values), _PUSHED_FRAMES):
