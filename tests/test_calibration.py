@@ -13,6 +13,7 @@ from hearthlog.analyzer.training.calibration import (
     home_temperature,
     inverse_temperature,
     nested_probabilities,
+    scores_elsewhere,
     unknown_bias,
 )
 from hearthlog.analyzer.training.cross_validation import softmax
@@ -125,3 +126,15 @@ def test_sounds_of_no_class_do_not_tell_how_sure_the_classes_are():
     assert right.expected_calibration_error == other.expected_calibration_error
     assert right.segments == (~unknown).sum()
     assert other.macro_f1 < right.macro_f1 - 0.2
+
+
+def test_each_class_has_a_calibration_error_of_its_own():
+    data = of_collections(60, [60, 60, 60])
+    target, taught = data.target, np.ones(len(data), bool)
+    right = np.eye(3)[target]
+    wrong = np.where((target == 1)[:, np.newaxis], np.roll(right, 1, axis=1), right)
+    probabilities = 0.7 * wrong + 0.1  # sure by 0.8
+    elsewhere = scores_elsewhere(probabilities, data, taught)
+    errors = list(elsewhere.calibration_errors.values())
+    half = (target == 2).sum() / np.isin(target, (1, 2)).sum()
+    assert errors == pytest.approx([0.2, 0.8 - half])  # nothing is labelled as the second class

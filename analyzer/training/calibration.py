@@ -17,6 +17,7 @@ KNOWN_LOST = 0.05  # share of known segments that may be labelled `unknown`
 _FEWEST_COLLECTIONS = 3
 _FEWEST_SOURCES = 5  # in other collections, of a class that they teach
 _BASE_SEGMENTS = 30
+_FEWEST_LABELLED = 10  # segments of a class, for a calibration error of it
 _FEWEST_SEGMENTS = 20  # of a collection with a fold of its own
 
 
@@ -124,7 +125,21 @@ def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Els
         macro_f1=scores.macro_f1,
         macro_f1_interval=scores.macro_f1_interval and list(scores.macro_f1_interval),
         classes={name: one.f1 for name, one in scores.per_class.items() if one.f1 is not None},
+        calibration_errors=_of_classes(probabilities[taught], data.target[taught], data.classes),
     )
+
+
+def _of_classes(
+    probabilities: Float64, target: Indices, classes: Sequence[str]
+) -> dict[str, float]:
+    """Return how far the probability of each class is from the share that is right of it."""
+    predicted, sure = probabilities.argmax(axis=1), probabilities.max(axis=1)
+    errors = {}
+    for number, name in enumerate(classes):
+        so = predicted == number
+        if so.sum() >= _FEWEST_LABELLED:
+            errors[name] = float(abs(sure[so].mean() - (target[so] == number).mean()))
+    return errors
 
 
 def home_temperature(decisions: Float64, target: Indices, base: float) -> float:

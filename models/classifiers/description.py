@@ -140,6 +140,9 @@ class Elsewhere(_Record):
         95 %, bootstrap over source groups.
     classes : dict of str to float
         F1 of each of the classes.
+    calibration_errors : dict of str to float
+        Of the segments that were labelled as a class, ten or more: how far the mean probability is
+        from the share that is right.
     """
 
     collections: _Count
@@ -149,6 +152,7 @@ class Elsewhere(_Record):
     macro_f1: _Share | None = None
     macro_f1_interval: Annotated[list[_Share], Field(min_length=2, max_length=2)] | None = None
     classes: dict[_ClassName, _Share] = {}
+    calibration_errors: dict[_ClassName, _Share] = {}
 
 
 class Smoothing(_Record):

@@ -156,7 +156,13 @@ def _elsewhere(description: Description) -> list[str]:
     interval = elsewhere.macro_f1_interval
     between = f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""
     lines += [f"- macro F1: {elsewhere.macro_f1:.3f}{between}"]
-    lines += [f"- F1 of {name}: {f1:.3f}" for name, f1 in elsewhere.classes.items()]
+    errors = {
+        name: f", calibration error {error:.3f}"
+        for name, error in elsewhere.calibration_errors.items()
+    }
+    lines += [
+        f"- F1 of {name}: {f1:.3f}{errors.get(name, '')}" for name, f1 in elsewhere.classes.items()
+    ]
     untried = [name for name in description.classes if name not in {*elsewhere.classes, UNKNOWN}]
     if untried:
         lines += [f"- not tried, for the other collections have too little: {', '.join(untried)}"]
