@@ -27,6 +27,7 @@ from hearthlog.analyzer.training.dataset import (
     cut_recordings,
 )
 from hearthlog.analyzer.training.heads import learn_heads
+from hearthlog.analyzer.training.home_heads import base_heads, learn_home
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.mixture import (
     HeadInputs,
@@ -84,6 +85,7 @@ def made_up(classes=4, count=48):
             data.group[rows],
             collection[rows],
             np.arange(len(rows)) % several > 0,
+            rows,
         ),
     )
 
@@ -226,7 +228,12 @@ def home_of(model, count, new="", seed=11):
         embedded=embedded,
         is_embedded=np.ones(len(target), bool),
         embedding_windows=EmbeddingWindows(
-            embedded, target, np.arange(len(target)) % 5, collection, target >= 0
+            embedded,
+            target,
+            np.arange(len(target)) % 5,
+            collection,
+            target >= 0,
+            np.arange(len(target)),
         ),
     )
 
@@ -257,6 +264,29 @@ def test_adapted_again_it_is_as_adapted_once():
     np.testing.assert_array_equal(both.embedding_weights, again.embedding_weights)
     np.testing.assert_array_equal(both.embedding_bias, again.embedding_bias)
     assert both.description.embedding == again.description.embedding
+
+
+WITH_UNKNOWN = ("silence", "speech", "music", "unknown")
+
+
+def test_what_is_unknown_stays_so_until_somebody_marks_a_sound_of_no_class():
+    base = learned()
+    windows = home_of(base, 8).embedding_windows
+    heads = base_heads(base, base.classes)
+    for marked, moved in ((1, False), (3, True)):
+        taught = learn_home(heads, windows, windows.target == marked, WITH_UNKNOWN)
+        assert taught.weights[-1][:, 1].any()
+        assert taught.weights[-1][:, 3].any() == moved
+
+
+def test_a_mark_of_many_windows_teaches_as_much_as_one_of_a_single_one():
+    base = learned()
+    windows = home_of(base, 8).embedding_windows
+    heads, speech = base_heads(base, base.classes), windows.target == 1
+    once = learn_home(heads, windows, speech, base.classes)
+    often = windows.rows(np.repeat(np.arange(len(speech)), np.where(speech, 5, 1)))
+    again = learn_home(heads, often, often.target == 1, base.classes)
+    np.testing.assert_allclose(again.weights, once.weights, atol=2)
 
 
 def test_a_new_class_is_learned_from_a_few_marks():

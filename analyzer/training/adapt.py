@@ -195,6 +195,7 @@ def _learned_without(heads: Heads, home: Dataset, seen: Indices) -> Heads:
         home.group[own],
         home.collection[own],
         np.ones(len(own), bool),
+        np.arange(len(own)),
     )
     return learn_home(heads, windows, windows.collection != _confirmed_number(home), home.classes)
 

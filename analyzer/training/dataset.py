@@ -101,6 +101,8 @@ class EmbeddingWindows(NamedTuple):
         As those of segments.
     tried : np.ndarray [shape=(m,)], bool
         Whether it is a window as it is, by which it is found how sure a head may be.
+    recording : np.ndarray [shape=(m,)], intp
+        Number of the recording that it is of: in a home, of a mark.
     """
 
     values: Int8
@@ -108,6 +110,7 @@ class EmbeddingWindows(NamedTuple):
     group: Indices
     collection: Indices
     tried: Bool
+    recording: Indices
 
     def rows(self, chosen: Indices | Bool) -> "EmbeddingWindows":
         """Return some of the windows."""
@@ -117,12 +120,18 @@ class EmbeddingWindows(NamedTuple):
             self.group[chosen],
             self.collection[chosen],
             self.tried[chosen],
+            self.recording[chosen],
         )
 
 
 _NO_NUMBERS = np.empty(0, np.intp)
 NO_WINDOWS = EmbeddingWindows(
-    np.empty((0, 0), np.int8), _NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, np.empty(0, bool)
+    np.empty((0, 0), np.int8),
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    _NO_NUMBERS,
+    np.empty(0, bool),
+    _NO_NUMBERS,
 )
 
 
@@ -456,7 +465,8 @@ def _joined(embedded: Sequence[tuple[Recording, Indices]]) -> EmbeddingWindows:
     key = np.unique(columns, axis=0, return_inverse=True)[1].ravel()
     kept = _thinned(key, np.where(version == SHORT, SHORT_PARTS, 1.0) * most)
     target, group, collection = keys.T
-    return EmbeddingWindows(values, target, group, collection, version == AS_IT_IS).rows(kept)
+    tried, recording = version == AS_IT_IS, np.repeat(np.arange(len(counts)), counts)
+    return EmbeddingWindows(values, target, group, collection, tried, recording).rows(kept)
 
 
 def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:

@@ -27,6 +27,9 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _DAY = 86_400 * NANOSECONDS
 HOME_WEIGHT = 3.0  # of a segment of the home; others have 1
+# With embeddings heads learn from it, too, and with more weight in the machine than others a home
+# loses what was right in it.
+HOME_WEIGHT_WITH_EMBEDDINGS = 1.0
 MOST_OF_MARK = 6  # segments, so that a mark of minutes is not more than a few of seconds
 HOME = "this home"
 
@@ -226,18 +229,19 @@ def recording_of(
     """
     stamps = sound.stamps[frames]
     span = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
+    embedded = _embedded(sound, frames)
     return Recording(
         label,
         _group(sound, span[0]),
         HOME,
         "",
         sound.values[frames],
-        HOME_WEIGHT,
+        HOME_WEIGHT if embedded is None else HOME_WEIGHT_WITH_EMBEDDINGS,
         None if sound.floors is None or not floored else sound.floors[frames],
         most=MOST_OF_MARK,
         span=span,
         sighting=sighting_of(sound.microphone, sound.directions.begun_in(*span)),
-        embedded=_embedded(sound, frames),
+        embedded=embedded,
     )
 
 

@@ -26,7 +26,7 @@ from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
 _PULL = 10.0  # to zero, of weights of inputs of one standard deviation
 _PULL_OF_NEW = 1.0  # of those of a class that the base has not: all of it is to be learned
-_CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a marked one has 1
+_CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a mark has 1
 _BELOW = 2.0  # the others on average, is a new class before anything is learned
 _STEPS = 150
 
@@ -96,6 +96,10 @@ def learn_home(
 ) -> Heads:
     """Add what a home teaches.
 
+    Where nobody has marked a sound of no class, and there is no new class, how likely that is
+    against the others is not learned: by marks of what was wrongly called unknown alone nearly
+    nothing would be unknown any more.
+
     Parameters
     ----------
     heads : Heads
@@ -112,6 +116,10 @@ def learn_home(
         The same where there is no window of a sound.
     """
     sounds = sounds_of(classes)
+    if UNKNOWN in classes and not heads.new:
+        unknown = classes.index(UNKNOWN)
+        if not (windows.target[marked] == unknown).any():
+            sounds = sounds[sounds != unknown]
     own = np.isin(windows.target, sounds)
     if not own.any():
         return heads
@@ -122,7 +130,9 @@ def learn_home(
     used = np.flatnonzero(heads.weights.any(axis=(0, 2)))
     mean, scale = heads.scaler[:, used]
     inputs = (values[:, used] - mean) / scale
-    weight = np.where(marked[own], 1.0, _CONFIRMED_WEIGHT)
+    # The windows of a mark are of one sound: many of them say no more than one.
+    windows_of = np.bincount(windows.recording[own])[windows.recording[own]]
+    weight = np.where(marked[own], 1.0 / windows_of, _CONFIRMED_WEIGHT)
     target = np.searchsorted(sounds, windows.target[own])
     pull = np.full(len(sounds), _PULL)
     pull[len(sounds) - heads.new :] = _PULL_OF_NEW
