@@ -159,7 +159,7 @@ def test_marks_teach_only_by_the_embeddings_that_a_model_takes(home):
         assert [one.embedding for one in found] == [e and e.source.space for e in EARS]
         heard = [len(one.embeddings.frames) > 0 for one in found]
         assert heard == [each is ear for each in EARS]
-        lessons = lesson_recordings(home, space=ear.source.space)
+        lessons = list(lesson_recordings(home, space=ear.source.space))
         assert [one.embedded is not None for one in lessons] == heard
         assert [one.weight for one in lessons] == [1.0 if each else 3.0 for each in heard]
     wider = EmbeddingSpace("one", "a" * 64, WIDTH)
