@@ -1,9 +1,10 @@
 """`python -m hearthlog.tools.bench.new_classes MANIFEST …`: marks, and classes that a model lacks.
 
-A home is composed of recordings that no starter has learned from. A person corrects the first
-minutes of its first two days, in the true class or, of what has none, as `unknown`. The model that
-learns from these days as `train --home` does is judged by the gate a day later, and scored on that
-third day, of which no source was heard on the other two.
+A home is composed of recordings that the model has not learned from. A person corrects the first
+minutes of its first two days, in the true class or, of what has none, as `unknown`, which is not
+counted, for it teaches nothing. The model that learns from these days as `train --home` does is
+judged by the gate a day later, and scored on that third day, of which no source was heard on the
+other two.
 """
 
 import csv
@@ -215,7 +216,7 @@ def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:
     model : Path
         That labelled it.
     marks : sequence of int
-        How many sounds are marked, one half of them on each day.
+        How many sounds are marked as a class, one half of them on each day.
 
     Yields
     ------
@@ -239,7 +240,7 @@ def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:
     true = [name if name in scale else scenario.find(name) for name in home.truth.labels]
     truth = replace(home.truth, labels=np.array(true, object))
     for count in marks:
-        own = [one[: count // 2] for one in wrong]
+        own = [_first(one, count // 2) for one in wrong]
         with tempfile.TemporaryDirectory(prefix="hearthlog-new-classes-") as place:
             logs = Path(place) / "logs"
             logs.mkdir()
@@ -256,7 +257,14 @@ def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:
         before, after = (
             scored(truth, one).f1(scale) for one in label_logs([base, adapted], [last.path])
         )
-        yield Outcome(sum(map(len, own)), new, before, after, reasons, lessons.notes)
+        marked = sum(mark.label != UNKNOWN for one in own for mark in one)
+        yield Outcome(marked, new, before, after, reasons, lessons.notes)
+
+
+def _first(marks: Sequence[Mark], count: int) -> list[Mark]:
+    """Return the first marks of a class, so many, and the unknown ones before the last of them."""
+    known = np.flatnonzero([mark.label != UNKNOWN for mark in marks])
+    return list(marks[: known[count - 1] + 1] if count and len(known) >= count else marks)
 
 
 def _write(folder: Path, logs: Sequence[RecentLog], marks: Sequence[Sequence[Mark]]) -> None:
