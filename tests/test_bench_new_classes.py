@@ -27,6 +27,20 @@ def test_a_home_is_composed_of_halves_that_share_no_source_and_that_no_starter_h
     assert not (halves[0] | halves[1]) & heard
 
 
+def test_nothing_is_played_of_which_there_are_no_recordings(tmp_path):
+    with SHIPPED.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["label"] != "music"]
+    manifest = tmp_path / "no-music.csv"
+    with manifest.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("path", "label", "source_group"))
+        for row in rows:
+            writer.writerow((SHIPPED.parent / row["path"], row["label"], row["source_group"]))
+    home = compose([manifest], None, 1, tmp_path, minutes=2.0)
+    assert "music" not in home.truth.labels
+    assert {"speech", "crying"} <= {*home.truth.labels}
+
+
 def test_what_marks_taught_is_a_row_with_the_words_of_train_and_of_the_gate():
     before, after = {"silence": 0.9, "speech": 0.5, "crying": 0.0}, {"silence": 0.9, "speech": 0.4}
     reasons = "silence falls from 9 min to 2 min", "music rises from 1 min to 9 min"
