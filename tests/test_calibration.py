@@ -125,6 +125,7 @@ def test_sounds_of_no_class_do_not_tell_how_sure_the_classes_are():
     assert (inverse, right.right) == (other_inverse, other.right)
     assert right.expected_calibration_error == other.expected_calibration_error
     assert right.segments == (~unknown).sum()
+    assert right.calibration_errors.keys() == {"speech", "music"}
     assert other.macro_f1 < right.macro_f1 - 0.2
 
 

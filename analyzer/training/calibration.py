@@ -132,12 +132,12 @@ def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Els
 def _of_classes(
     probabilities: Float64, target: Indices, classes: Sequence[str]
 ) -> dict[str, float]:
-    """Return how far the probability of each class is from the share that is right of it."""
+    """Return how far the probability of each known class is from the share that is right of it."""
     predicted, sure = probabilities.argmax(axis=1), probabilities.max(axis=1)
     errors = {}
     for number, name in enumerate(classes):
         so = predicted == number
-        if so.sum() >= _FEWEST_LABELLED:
+        if name != UNKNOWN and so.sum() >= _FEWEST_LABELLED:
             errors[name] = float(abs(sure[so].mean() - (target[so] == number).mean()))
     return errors
 

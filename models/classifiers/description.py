@@ -141,8 +141,8 @@ class Elsewhere(_Record):
     classes : dict of str to float
         F1 of each of the classes.
     calibration_errors : dict of str to float
-        Of the segments that were labelled as a class, ten or more: how far the mean probability is
-        from the share that is right.
+        Of these segments, where ten or more were labelled as a class: how far the mean probability
+        of it is from the share that is right.
     """
 
     collections: _Count
