@@ -82,7 +82,7 @@ def judged(model, rows):
 def of_scikit_learn(name, inputs, target, rows):
     """Decisions of scikit-learn itself."""
     method, weight = method_of(name), balanced(target, np.ones(len(target)))
-    seed, single, many = {"random_state": method.seed}, inputs, rows
+    seed, single, many = {"random_state": method.random_state}, inputs, rows
     inputs, rows = inputs.astype(np.float64), rows.astype(np.float64)
     if name in {"forest", "extra-trees"}:
         kind = RandomForestClassifier if name == "forest" else ExtraTreesClassifier

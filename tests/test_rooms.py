@@ -242,4 +242,4 @@ def test_of_more_windows_than_can_be_learned_from_small_classes_are_kept_whole(t
 
 def chosen_classes(examples, most):
     _, target, weight = examples.windows(slice(None))
-    return target[spread_over_classes(target, weight, most)]
+    return target[spread_over_classes(target, weight, most, 0)]

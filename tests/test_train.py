@@ -371,6 +371,18 @@ def test_the_same_clips_give_the_same_bytes(home):
     assert a["training_data"]["collections"] == [{"name": "made up", "licence": "CC0", "clips": 36}]
 
 
+def test_another_seed_draws_other_rooms_and_the_model_says_which(home):
+    options = ("--data", home / "manifest.csv", "--scenario", home / "home.toml", "--json")
+    files = [home / f"{name}.safetensors" for name in ("none", "first", "again", "other")]
+    seeds = [(), ("--seed", 0), ("--seed", 1), ("--seed", 1)]
+    results = [
+        run(*options, *seed, "--output", file) for file, seed in zip(files, seeds, strict=True)
+    ]
+    none, first, other, again = (file.read_bytes() for file in files)
+    assert none == first != other == again
+    assert [json.loads(result.stdout).get("seed") for result in results] == [None, None, 1, 1]
+
+
 @pytest.mark.parametrize(
     ("scenario", "names"),
     [

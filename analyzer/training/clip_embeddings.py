@@ -99,6 +99,8 @@ class ClipEmbedder:
     ----------
     embed : callable
         Turns a window into integers.
+    seed : int
+        Of the rooms that are drawn for clips.
 
     Attributes
     ----------
@@ -106,8 +108,8 @@ class ClipEmbedder:
         The network and the projection, if it is one.
     """
 
-    def __init__(self, embed: Embeds) -> None:
-        self._embed = embed
+    def __init__(self, embed: Embeds, seed: int = 0) -> None:
+        self._embed, self._seed = embed, seed
         self.source: EmbeddingSource | None = getattr(embed, "source", None)
         self._done: dict[bytes, ClipEmbeddings] = {}
 
@@ -117,14 +119,16 @@ class ClipEmbedder:
         digest.update(segments.astype("<i8").tobytes() + bytes([silence]))
         key = digest.digest()
         if key not in self._done:
-            self._done[key] = clip_embeddings(frames, self._embed, segments, silence=silence)
+            self._done[key] = clip_embeddings(
+                frames, self._embed, segments, silence=silence, seed=self._seed
+            )
         return self._done[key]
 
 
 def clip_embeddings(
-    frames: Float32, embed: Embeds, segments: Indices, *, silence: bool
+    frames: Float32, embed: Embeds, segments: Indices, *, silence: bool, seed: int = 0
 ) -> ClipEmbeddings:
-    """Embed the windows of a clip; the same clip gives the same ones.
+    """Embed the windows of a clip; the same clip and seed give the same ones.
 
     Parameters
     ----------
@@ -139,7 +143,7 @@ def clip_embeddings(
         Whether nothing happens in the clip: then only its segments are embedded.
     """
     digest = hashlib.blake2b(np.ascontiguousarray(frames).tobytes(), digest_size=8).digest()
-    rng = np.random.default_rng([_SEED, int.from_bytes(digest, "little")])
+    rng = np.random.default_rng([_SEED + seed, int.from_bytes(digest, "little")])
     sound, parts = frames.ravel().astype(np.float64), []
     padded = _padded(sound, 10.0 ** (_NOISE_DBFS / 20.0) * rng.standard_normal(_room(sound)))
     taught = np.empty(0, np.intp) if silence else _taught(padded, len(sound), _HOP)
@@ -271,13 +275,15 @@ def model_embedder(model: Model) -> ClipEmbedder | None:
 
 
 @lru_cache(maxsize=2)
-def network_embedder(network: str) -> ClipEmbedder:
+def network_embedder(network: str, seed: int = 0) -> ClipEmbedder:
     """Return what hears clips by a network.
 
     Parameters
     ----------
     network : str
         Its name.
+    seed : int
+        As of `ClipEmbedder`.
 
     Raises
     ------
@@ -289,4 +295,4 @@ def network_embedder(network: str) -> ClipEmbedder:
         raise ModelError(
             f"the network {network} is not here; fetch it: hearthlog models fetch {network}"
         )
-    return ClipEmbedder(load_embedder(network, path))
+    return ClipEmbedder(load_embedder(network, path), seed)

@@ -234,6 +234,7 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     features: FeatureSet = DEFAULT,
     rooms: int = 0,
     embedder: ClipEmbedder | None = None,
+    seed: int = 0,
 ) -> Dataset:
     """Cut clips, and recordings of a home, into the segments of a scenario.
 
@@ -251,6 +252,8 @@ def build_dataset(  # noqa: PLR0913, PLR0917
         Number of copies of each clip in other rooms.
     embedder : ClipEmbedder, optional
         Hears the windows of clips, for methods with heads.
+    seed : int
+        Of the rooms.
 
     Returns
     -------
@@ -262,8 +265,8 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     DataError
         If a class is left without segments.
     """
-    recordings = chain(clip_recordings(clips, scenario, progress, features, rooms, embedder), home)
-    data = cut_recordings(recordings, scenario, features)
+    of_clips = clip_recordings(clips, scenario, progress, features, rooms, embedder, seed)
+    data = cut_recordings(chain(of_clips, home), scenario, features)
     for name, amount in data.amounts.items():
         if not amount.segments:
             labels = ", ".join(scenario.classes[name])
@@ -281,6 +284,7 @@ def clip_recordings(  # noqa: PLR0913, PLR0917
     features: FeatureSet = DEFAULT,
     rooms: int = 0,
     embedder: ClipEmbedder | None = None,
+    seed: int = 0,
 ) -> Iterator[Recording]:
     """Read clips and compute their features.
 
@@ -295,9 +299,11 @@ def clip_recordings(  # noqa: PLR0913, PLR0917
     features : FeatureSet, optional
         The features to compute.
     rooms : int
-        Number of copies in other rooms; the same clips get the same ones.
+        Number of copies in other rooms; the same clips and seed get the same ones.
     embedder : ClipEmbedder, optional
         Hears the windows of clips, for methods with heads.
+    seed : int
+        Of the rooms.
 
     Yields
     ------
@@ -312,7 +318,7 @@ def clip_recordings(  # noqa: PLR0913, PLR0917
                 sound = read_clip(clip)
             except SourceError as error:
                 fault = str(error)
-        rng = np.random.default_rng([_SEED, number])
+        rng = np.random.default_rng([_SEED + seed, number])
         recording = _recording(clip, sound, features, rooms, rng)._replace(fault=fault)
         if embedder is not None and len(sound.frames):
             segments = _segments(recording, features)[1]

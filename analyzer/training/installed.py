@@ -52,7 +52,7 @@ def clip_embedder(method: Method) -> ClipEmbedder | None:
     ModelError
         If its network is not known, not there, another file, or cannot be used.
     """
-    return network_embedder(method.network) if method.network else None
+    return network_embedder(method.network, method.seed) if method.network else None
 
 
 def method_named(name: str) -> Method:

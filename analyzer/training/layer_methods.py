@@ -73,7 +73,7 @@ class PerceptronMethod(WindowMethod):
             alpha=self.decay,
             tol=self.improvement,
             max_iter=self.passes,
-            random_state=self.seed,
+            random_state=self.random_state,
         ).fit(scaler.transform(inputs.astype(np.float64)), target, balanced(target, weight))
         arrays = layer_arrays(scaler, network.coefs_, network.intercepts_)
         return LayersMachine(arrays), arrays | kept_windows(inputs, target), {}

@@ -14,7 +14,7 @@ _SEED = 20_261_122
 _ROUNDING = 0.01  # of the standard deviation
 
 
-def spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
+def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) -> Indices:
     """Choose windows at random, those of most weight first, but fewer of the large classes.
 
     Parameters
@@ -24,13 +24,14 @@ def spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
     weight : np.ndarray [shape=(n,)], float64
     most : int
         How many.
+    seed : int
 
     Returns
     -------
     np.ndarray [shape=(most,)], intp
         Their places.
     """
-    shuffled = np.random.default_rng(_SEED).permutation(len(target))
+    shuffled = np.random.default_rng(_SEED + seed).permutation(len(target))
     shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
     order = np.argsort(target[shuffled], kind="stable")
     counts = np.bincount(target)

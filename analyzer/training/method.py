@@ -137,6 +137,8 @@ class Method(ABC):
         The one whose embeddings heads beside the classifier take, by its name; empty for none.
     class_exponent : float or None
         As in `Smoothing`.
+    seed : int
+        Of what is drawn at random: rooms, changed copies, windows of many.
     """
 
     name: str
@@ -149,6 +151,7 @@ class Method(ABC):
     observation_weight: float = 1.5
     network: str = ""
     class_exponent: float | None = None
+    seed: int = 0
 
     @property
     def features(self) -> FeatureSet:
@@ -283,7 +286,7 @@ def prepare(method: Method, data: Dataset) -> Examples:
     ModelError
         If the feature set is not installed.
     """
-    features, rng = method.features, np.random.default_rng(_SEED)
+    features, rng = method.features, np.random.default_rng(_SEED + method.seed)
     if method.copies and features.augmented is None:
         raise DataError(f"method {method.name}: {features.name} cannot be augmented")
     if method.rooms and features.band_powers is None:

@@ -95,7 +95,7 @@ class SvmMethod(Method):
         inputs, target, weight = examples.windows(seen)
         remembered = np.arange(-len(inputs), 0) + len(examples.more_target)
         if len(inputs) > self.most_windows:
-            kept = spread_over_classes(target, weight, self.most_windows)
+            kept = spread_over_classes(target, weight, self.most_windows, self.seed)
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
             remembered = remembered[kept]
         inputs = rounded(inputs)

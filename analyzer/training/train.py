@@ -299,6 +299,7 @@ def _method_fields(
         "label_frame": window // 2,
         "gate": method.gate if SILENCE in classes else 0.0,
         "copies": method.copies,
+        "seed": method.seed,
         "versions": {name: version(name) for name in ("hearthlog", "numpy", *method.libraries)},
     }
 

@@ -47,7 +47,7 @@ class ForestMethod(WindowMethod):
             self.trees,
             max_depth=self.levels,
             min_samples_leaf=self.leaf_windows,
-            random_state=self.seed,
+            random_state=self.random_state,
         ).fit(inputs, target, balanced(target, weight))
         arrays = forest_arrays(forest)
         return TreesMachine(arrays), arrays | kept_windows(inputs, target), {}
@@ -85,7 +85,7 @@ class BoostingMethod(WindowMethod):
             subsample=self.share,
             max_features="sqrt",
             init="zero",  # the classes weigh alike
-            random_state=self.seed,
+            random_state=self.random_state,
         ).fit(inputs, target, balanced(target, weight))
         arrays = boosted_arrays(boosted)
         return TreesMachine(arrays), arrays | kept_windows(inputs, target), {}

@@ -16,6 +16,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _ROWS_AT_ONCE = 256
+_SEED = 20_261_122
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,14 @@ class WindowMethod(Method):
     ----------
     most_windows : int
         That are learned from, those that method `room` would learn from.
-    seed : int
-        Of what is drawn at random.
     """
 
     most_windows: int = 12_000
-    seed: int = 20_261_122
+
+    @property
+    def random_state(self) -> int:
+        """That of the classifier of scikit-learn."""
+        return _SEED + self.seed
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -49,7 +52,7 @@ class WindowMethod(Method):
         """
         inputs, target, weight = examples.windows(seen)
         if len(inputs) > self.most_windows:
-            kept = spread_over_classes(target, weight, self.most_windows)
+            kept = spread_over_classes(target, weight, self.most_windows, self.seed)
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
         classes, number = np.unique(target, return_inverse=True)
         machine, arrays, parameters = self.learn(rounded(inputs), number, weight)

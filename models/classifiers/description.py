@@ -298,6 +298,8 @@ class Description(_Record):
         The arrays of a home whose directions the model takes, by name; with any, the format is 6.
     embedding : EmbeddingMix or None
         What it takes of a network's embeddings; with any, the format is 7.
+    seed : int
+        Of what was drawn at random when it was learned.
     """
 
     format: Literal[5, 6, 7]
@@ -327,6 +329,7 @@ class Description(_Record):
     metrics: Metrics
     direction_microphones: Annotated[list[_Text], Field(max_length=MOST_ARRAYS)] = []
     embedding: EmbeddingMix | None = None
+    seed: _Count = 0
     versions: dict[_Text, _Text]
 
     @property
@@ -336,10 +339,12 @@ class Description(_Record):
 
     @model_serializer(mode="wrap")
     def _as_older_versions_read_it(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what models without heads have not; older versions refuse fields they lack."""
+        """Leave out what most models have not; older versions refuse fields they lack."""
         content: dict[str, Any] = handler(self)
         if self.embedding is None:
             content.pop("embedding", None)
+        if not self.seed:
+            content.pop("seed", None)
         if self.smoothing.class_exponent is None and "smoothing" in content:
             content["smoothing"].pop("class_exponent", None)
         return content

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,6 +79,9 @@ def train(
     smoothing: Annotated[
         str, typer.Option(help="How labels become segments: hmm, or merge (the paper's).")
     ] = "hmm",
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31, help="Another one draws other rooms for the clips.")
+    ] = 0,
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
@@ -96,11 +100,11 @@ def train(
     speakers = scenario == _SPEAKERS
     if speakers or data:
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
-    elif not home or scheduler or (cost, gamma) != (None, None):
+    elif not home or scheduler or (cost, gamma, seed) != (None, None, 0):
         wrong_use(
             "say what to learn from: `hearthlog train --home logs` for a model of this home, or "
             "`hearthlog train --data MANIFEST.csv --scenario general -o general.safetensors`; "
-            "--scheduler, --cost and --gamma go with --data"
+            "--scheduler, --cost, --gamma and --seed go with --data"
         )
     else:
         named = check_scenario_name(scenario) if scenario else ""
@@ -118,7 +122,7 @@ def train(
 
         if speakers and method is None:
             method = DEFAULT.name  # who speaks is told by the features
-        chosen = chosen_method(method, cost=cost, gamma=gamma)
+        chosen = replace(chosen_method(method, cost=cost, gamma=gamma), seed=seed)
         with fits_on(scheduler):
             words = scenario, home or [], chosen, smoothing
             model, segments = _learned(data or [], *words, left_out)
@@ -268,7 +272,7 @@ def _learned(
         )
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         segments = build_dataset(
-            clips, chosen, report, recordings, method.features, method.rooms, embedder
+            clips, chosen, report, recordings, method.features, method.rooms, embedder, method.seed
         )
     _tell_left_out(segments.left_out)
     left_out += segments.left_out
@@ -333,7 +337,11 @@ def _learned_voices(
     _tell_left_out(left_out)
     others = others_of(load_model(starter_file(GENERAL)), method, scenario)
     with share_done(f"listening to {len(clips)} clips", announce=bool(clips)) as report:
-        more = list(clip_recordings(clips, scenario, report, method.features, method.rooms))
+        more = list(
+            clip_recordings(
+                clips, scenario, report, method.features, method.rooms, seed=method.seed
+            )
+        )
     segments = cut_recordings([*enrolled, *more], scenario, method.features)
     _tell_left_out(segments.left_out)
     left_out += segments.left_out
