@@ -241,13 +241,13 @@ def home_of(model, count, new="", seed=11):
 def test_marks_of_a_home_move_the_heads_and_what_is_not_marked_stays(tmp_path):
     base = learned()
     tried = home_of(base, 30, seed=12)
-    adapted = adapt_model(base, home_of(base, 8))
+    adapted = adapt_model(base, home_of(base, 30))
     speech = tried.target == 1
     before, after = (sounds_of(one, tried)[speech] == 1 for one in (base, adapted))
     assert after.mean() > before.mean() + 0.2
     others = made_up()
     as_before = sounds_of(base, others) == sounds_of(adapted, others)
-    assert as_before.mean() > 0.85
+    assert as_before.mean() > 0.88
     mix = adapted.description.embedding
     assert mix.of_home
     assert mix.base_inverse_temperature == base.description.embedding.inverse_temperature

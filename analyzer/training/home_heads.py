@@ -27,6 +27,7 @@ from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 _PULL = 10.0  # to zero, of weights of inputs of one standard deviation
 _PULL_OF_NEW = 1.0  # of those of a class that the base has not: all of it is to be learned
 _CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a mark has 1
+_SHARE = 0.5  # that counts of what is learned: marks are of few sources, and others lie between
 _BELOW = 2.0  # the others on average, is a new class before anything is learned
 _STEPS = 150
 
@@ -137,6 +138,8 @@ def learn_home(
     pull = np.full(len(sounds), _PULL)
     pull[len(sounds) - heads.new :] = _PULL_OF_NEW
     slopes, constants = _regressed(inputs, target, weight, before, pull)
+    share = np.where(np.arange(len(sounds)) < len(sounds) - heads.new, _SHARE, 1.0)
+    slopes, constants = share * slopes, share * constants
     weights = np.zeros((1, *heads.weights.shape[1:]))
     bias = np.zeros((1, heads.bias.shape[1]))
     factor = shares / mix.inverse_temperature
