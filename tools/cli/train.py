@@ -104,7 +104,7 @@ def train(
         wrong_use(
             "say what to learn from: `hearthlog train --home logs` for a model of this home, or "
             "`hearthlog train --data MANIFEST.csv --scenario general -o general.safetensors`; "
-            "--scheduler, --cost, --gamma and --seed go with --data"
+            "--scheduler, --seed, --cost and --gamma go with --data"
         )
     else:
         named = check_scenario_name(scenario) if scenario else ""
