@@ -154,7 +154,7 @@ def tried(method: Method, data: Dataset, examples: Examples, seeds: int) -> tupl
         )
     of_sources, of_collections = [], []
     for seed in range(seeds):
-        drawn = _seeded(method, seed)
+        drawn = replace(method, seed=seed)
         of_sources.append(_probabilities(drawn, data, examples, _source_folds(data, seed)))
         of_collections.append(_probabilities(drawn, data, examples, collections))
     return _tried(data, of_sources), _tried(data, of_collections)
@@ -215,10 +215,6 @@ def _segments(manifest: Path, name: str) -> Dataset:
 def _amounts(data: Dataset) -> str:
     groups, collections = len(np.unique(data.group)), len(data.collection_names)
     return f"{groups} sources, {collections} collections in {len(collection_folds(data))} folds"
-
-
-def _seeded(method: Method, seed: int) -> Method:
-    return replace(method, seed=seed) if method is not ROOM and hasattr(method, "seed") else method  # type: ignore[call-arg]
 
 
 def _source_folds(data: Dataset, seed: int) -> list[Fold]:
