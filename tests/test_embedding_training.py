@@ -375,6 +375,15 @@ def test_a_clip_is_heard_once_in_a_run():
     assert len(network.windows) > count
 
 
+def test_another_seed_hears_a_clip_in_another_room():
+    first, again, other = Levels(), Levels(), Levels()
+    for network, seed in ((first, 0), (again, 0), (other, 1)):
+        ClipEmbedder(network, seed)(tone(2.0), np.array([0]), silence=False)
+    heard = [np.concatenate(one.windows) for one in (first, again, other)]
+    np.testing.assert_array_equal(heard[0], heard[1])
+    assert not np.array_equal(heard[0], heard[2])
+
+
 def test_segments_take_the_window_that_is_nearest():
     heard = clip_embeddings(tone(3.0), Levels(), np.array([0, 10, 20]), silence=False)
     assert len(heard.at(10)) == 1

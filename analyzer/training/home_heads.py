@@ -95,7 +95,7 @@ def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
 def learn_home(
     heads: Heads, windows: EmbeddingWindows, marked: Bool, classes: Sequence[str]
 ) -> Heads:
-    """Add what a home teaches.
+    """Add what a home teaches: one half of what is learned, for a class of the base.
 
     Where nobody has marked a sound of no class, and there is no new class, how likely that is
     against the others is not learned: by marks of what was wrongly called unknown alone nearly
@@ -138,8 +138,8 @@ def learn_home(
     pull = np.full(len(sounds), _PULL)
     pull[len(sounds) - heads.new :] = _PULL_OF_NEW
     slopes, constants = _regressed(inputs, target, weight, before, pull)
-    share = np.where(np.arange(len(sounds)) < len(sounds) - heads.new, _SHARE, 1.0)
-    slopes, constants = share * slopes, share * constants
+    taken = np.where(np.arange(len(sounds)) < len(sounds) - heads.new, _SHARE, 1.0)
+    slopes, constants = taken * slopes, taken * constants
     weights = np.zeros((1, *heads.weights.shape[1:]))
     bias = np.zeros((1, heads.bias.shape[1]))
     factor = shares / mix.inverse_temperature

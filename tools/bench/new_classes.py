@@ -263,8 +263,10 @@ def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:
 
 def _first(marks: Sequence[Mark], count: int) -> list[Mark]:
     """Return the first marks of a class, so many, and the unknown ones before the last of them."""
+    if not count:
+        return []
     known = np.flatnonzero([mark.label != UNKNOWN for mark in marks])
-    return list(marks[: known[count - 1] + 1] if count and len(known) >= count else marks)
+    return list(marks[: known[count - 1] + 1] if len(known) >= count else marks)
 
 
 def _write(folder: Path, logs: Sequence[RecentLog], marks: Sequence[Sequence[Mark]]) -> None:
