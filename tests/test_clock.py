@@ -48,6 +48,19 @@ def test_late_observations_do_not_pull_the_clock():
 
 
 @settings(deadline=None, max_examples=30)
+@given(st.floats(-100, 100), st.floats(8, 60), st.floats(2, 4), st.floats(1e-3, 0.1))
+def test_seconds_in_which_the_machine_is_late_throughout_do_not_move_the_clock(
+    ppm, start, length, lateness
+):
+    clock, errors = SampleClock(RATE), []
+    for index in range(0, 90 * RATE, BLOCK):
+        late = lateness if start <= index / RATE < start + length else 0.0
+        clock.observe(index, float(true_time(index, ppm)) + late)
+        errors.append(float(clock.time(index) - true_time(index, ppm)))
+    assert np.abs(errors).max() < 1e-3
+
+
+@settings(deadline=None, max_examples=30)
 @given(st.floats(-30, 30), st.integers(0, 2**32))
 def test_behind_a_sound_server_stamps_stay_within_20_milliseconds_after_ten_seconds(ppm, seed):
     """Blocks arrive at once or up to half a second late, some minutes only late."""

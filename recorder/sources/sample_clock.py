@@ -11,6 +11,8 @@ _WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow th
 _PRIOR_PPM = 50.0  # expected error of a sound card's crystal, before it has been measured
 _STEEPEST = 0.1  # seconds of steering a second: frames stay in order, whatever arrives
 _PRIOR_NOISE = 100e-6  # seconds: expected lateness of the earliest observation of a window
+_LATE = _PRIOR_NOISE  # what is later pulls the line no further: the machine was busy
+_ROUNDS = 10  # of weighing the windows anew
 
 
 class SampleClock:
@@ -18,9 +20,10 @@ class SampleClock:
 
     Observations are late, never early, by the delays of the sound card and the scheduler. So each
     window of two seconds counts by its earliest observation, and a line is fitted through these.
-    Behind a sound server the delays are a hundred times as long, and no line can be fitted: there
-    the earliest observation of all windows counts. The time is steered towards each new line, never
-    set to it: time does not jump.
+    A busy machine can be late all through a window: what lies above the line counts linearly (as in
+    Huber's loss), what lies below it by its square. Behind a sound server the delays are a hundred
+    times as long, and no line can be fitted: there the earliest observation of all windows counts.
+    The time is steered towards each new line, never set to it: time does not jump.
 
     Parameters
     ----------
@@ -109,7 +112,12 @@ class SampleClock:
         at, late = np.array(self._windows).T
         if not self._is_exact:
             return 0.0, float(late.min())
-        center = at.mean()
-        spread = ((at - center) ** 2).sum() + (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
-        slope = float(((at - center) * (late - late.mean())).sum() / spread)
-        return slope, float(late.mean() + slope * (nominal - center))
+        weight = np.ones(len(at))
+        for _ in range(_ROUNDS):
+            center, mean = np.average([at, late], axis=1, weights=weight)
+            spread = (weight * (at - center) ** 2).sum()
+            spread += (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
+            slope = float((weight * (at - center) * (late - mean)).sum() / spread)
+            above = late - mean - slope * (at - center)
+            weight = _LATE / np.maximum(above, _LATE)
+        return slope, float(mean + slope * (nominal - center))
