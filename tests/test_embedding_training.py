@@ -184,15 +184,55 @@ def test_names_are_mixed_in_where_a_class_has_hardly_any_source():
     assert [HEARING.names[one] for one in mix.names[-1].classes["coughing"]] == ["coughing"]
 
 
+def bathroom(noise):
+    """A bathroom that a network hears well, with the names of its sounds."""
+    data = made_up()
+    groups, first = HEARING.groups, HEARING.inputs[-1].start
+    names = ("outside", "flushing_water", "tap_water", "coughing")
+    own = np.array([first + groups.index(name) for name in names])
+    rng = np.random.default_rng(17)
+
+    def with_names(target):
+        values = heard_as(target, len(names), rng, noise=3)
+        values[:, first:] = -40
+        values[np.arange(len(values)), own[target]] = 40
+        drawn = values[:, first:] + rng.normal(0, noise, values[:, first:].shape)
+        values[:, first:] = np.clip(np.rint(drawn), -127, 127)
+        return values
+
+    windows = data.embedding_windows
+    return replace(
+        data,
+        classes=("silence", "flushing_water", "tap_water", "other"),
+        embedded=with_names(data.target),
+        embedding_windows=windows._replace(values=with_names(windows.target)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("noise", "fourth", "heads"), [(0, "other", 1), (60, "other", 2), (0, "coughing", 2)]
+)
+def test_names_of_a_few_sounds_among_others_take_the_place_of_a_head_that_is_hardly_better(
+    noise, fourth, heads
+):
+    data = bathroom(noise)
+    data = replace(data, classes=(*data.classes[:3], fourth))
+    known = np.ones(len(data), bool)
+    way = Tried(group_folds(data), np.zeros((len(data), len(data.classes))), known)
+    mix = best_mix(data, HEARING, [way]).mix
+    assert len(mix.head_weights) == heads
+    assert len(mix.names) == 2 - heads
+
+
 def test_names_are_those_of_the_scenario_and_what_is_outside_it():
     general = (*BUILTIN["general"].classes, "unknown")
     head = rejecting_head(HEARING, general)
     assert len({tuple(values) for values in head.classes.values()}) == 2
     names = [HEARING.names[value] for value in head.classes["unknown"]]
     assert names == ["flushing_water", "shower", "tap_water", "outside"]
-    bathroom = (*BUILTIN["bathroom"].classes, "unknown")
-    head = names_head(HEARING, bathroom)
+    head = names_head(HEARING, (*BUILTIN["bathroom"].classes, "unknown"))
     assert [HEARING.names[value] for value in head.classes["shower"]] == ["shower"]
+    assert head.bias["flushing_water"] > 0
     assert "speech" in [HEARING.names[value] for value in head.classes["other"]]
     assert names_head(HEARING, ("silence", "speech", "doorbell_of_mine")) is None
     assert rejecting_head(HEARING, BUILTIN["general"].classes) is None

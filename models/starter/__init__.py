@@ -22,7 +22,7 @@ SHA256 = {  # of their files, as `sha256sum` prints it
     GENERAL: "d5f6f6cb0736ba4ab933943ebbef25d1d53f99de02f49ffa509d621747f2587f",
     BATHROOM: "0344b38fa1cf06a446ee491bbad6fe8b6dd73ec89296849baf7e7adae6cb6d75",
     with_network(GENERAL): "40f4e88a375706f1891633b97e0e1128a59710e21f19e11923896d1e0b62afda",
-    with_network(BATHROOM): "0f83e04c972d1071efa777c5394a568266070b463e0393443d59259a7d75ca94",
+    with_network(BATHROOM): "39e77fcdf0a020fc2d1137a66f81928ae10b331a4ee62086a17dc9d95b7e92ed",
 }
 
 
