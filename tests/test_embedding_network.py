@@ -225,6 +225,13 @@ def test_a_network_that_is_not_what_is_said_of_it_is_refused(folder, data, chang
         Embedder(network, folder / "own.onnx")
 
 
+def test_a_network_without_an_address_is_brought_from_a_file(folder):
+    network = network_of(folder, constant(_ROWS))
+    (folder / "own.onnx").write_bytes(b"another")
+    with pytest.raises(ModelError, match=r"fetch it: hearthlog models fetch own --from FILE$"):
+        Embedder(network, folder / "own.onnx")
+
+
 def test_sound_that_a_network_fails_at_is_silence_to_it(folder, monkeypatch):
     embedder = Embedder(network_of(folder, constant(_ROWS)), folder / "own.onnx")
 

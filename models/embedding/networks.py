@@ -279,7 +279,8 @@ def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str
         If it is missing, cannot be read, or is none of those that are known.
     """
     sizes = {each.size for each in network.files}
-    remedy = f"fetch it: hearthlog models fetch {network.name}"
+    source = "" if network.files[0].url else " --from FILE"
+    remedy = f"fetch it: hearthlog models fetch {network.name}{source}"
     with suppress(OSError):  # which is told when it is read
         size = path.stat().st_size
         if path.is_file() and size not in sizes:
