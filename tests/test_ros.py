@@ -124,6 +124,7 @@ def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_p
         ("live", {}, {"ROS_DOMAIN_ID": "home"}, "ROS_DOMAIN_ID is not an integral number"),
         ("label", {}, {}, "name a model: --ros-args -p model:=general, or a model file"),
         ("label", {"model": "no.safetensors"}, {}, "no.safetensors: no such model file"),
+        ("label", {"model": "audioset"}, {}, "model audioset is for embeddings, which this node"),
         ("label", {"model": "general", "microphone": "Küche"}, {}, "microphone name 'Küche'"),
     ],
 )
@@ -134,6 +135,12 @@ def test_what_is_wrong_is_said_in_one_line(ros, executable, parameters, environm
     assert line in said
     assert said.count("\n") == 1
     assert node.returncode == 1
+
+
+def test_a_model_for_embeddings_labels_by_features_alone_and_says_so(ros):
+    with ros.node("label", model="general-embedding") as node:
+        assert "this node takes no embeddings: labels by features alone" in node.stdout.readline()
+        assert end(node) == ""
 
 
 def test_features_of_another_set_are_not_labelled(ros, labmic, tmp_path):

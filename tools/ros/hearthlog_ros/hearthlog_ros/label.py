@@ -53,6 +53,7 @@ class Label(Node):
             self._classifier = Classifier(self._model)
         except HearthlogError as error:
             raise NodeError(str(error)) from error
+        self._check_embeddings()
         self._features = self._classifier.feature_set
         self._pipeline = Pipeline(self._microphone, self._features, self._classifier)
         self._waiting: list[Any] = []
@@ -63,6 +64,19 @@ class Label(Node):
         self._begin_publishing()
         self._subscribe()
         self.create_timer(_CHECK_SECONDS, self._check_alone)
+
+    def _check_embeddings(self) -> None:
+        """Say that a model gets no embeddings: no message says of which network they are."""
+        if self._classifier.names is not None:
+            raise NodeError(
+                f"model {self._model.name} is for embeddings, which this node does not take; "
+                "give it to the recorder: hearthlog record --model"
+            )
+        if self._model.description.embedding is not None:
+            self.get_logger().warning(
+                f"model {self._model.name} is for features and embeddings, and this node takes no "
+                "embeddings: labels by features alone, which are less true"
+            )
 
     def _begin_publishing(self) -> None:
         kinds = {"label": message_types.LABEL, "segment": message_types.SEGMENT}
