@@ -22,7 +22,7 @@ SHA256 = {  # of their files, as `sha256sum` prints it
     GENERAL: "d5f6f6cb0736ba4ab933943ebbef25d1d53f99de02f49ffa509d621747f2587f",
     BATHROOM: "0344b38fa1cf06a446ee491bbad6fe8b6dd73ec89296849baf7e7adae6cb6d75",
     with_network(GENERAL): "40f4e88a375706f1891633b97e0e1128a59710e21f19e11923896d1e0b62afda",
-    with_network(BATHROOM): "39e77fcdf0a020fc2d1137a66f81928ae10b331a4ee62086a17dc9d95b7e92ed",
+    with_network(BATHROOM): "7196f934d21562bdbef8bbfd12f262309cbbc5711150271c92bcb7ae63bcea3c",
 }
 
 
