@@ -175,7 +175,7 @@ def verbs(command, words=()):
 
 def test_the_traps_work(folder):
     for name in (*PACKAGES, *MODULES):
-        result = subprocess.run([sys.executable, "-c", f"import {name}"], cwd=folder, check=False)
+        result = subprocess.run([sys.executable, "-Bc", f"import {name}"], cwd=folder, check=False)
         assert result.returncode == 1
     assert len(sprung(folder)) == len(PACKAGES) + len(MODULES)
 
