@@ -188,7 +188,15 @@ def _wait_for_children() -> None:
 
 def _working_children() -> list[str]:
     children = Path("/proc/thread-self/children").read_text().split()
-    return [child for child in children if Path(f"/proc/{child}/cmdline").read_bytes()]
+    return [child for child in children if _command_line(child)]
+
+
+def _command_line(child: str) -> bytes:
+    """Read the command line of a process; empty when it has ended."""
+    try:
+        return Path(f"/proc/{child}/cmdline").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):  # it ended since it was listed
+        return b""
 
 
 _sleep = time.sleep
