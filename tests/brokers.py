@@ -62,6 +62,48 @@ class Broker:
         self._process.wait(timeout=5)
 
 
+class SlowLink:
+    """A way to a broker on which each mebibyte that the broker sends takes a while.
+
+    Attributes
+    ----------
+    port : int
+        Where it takes one client.
+    """
+
+    def __init__(self, port: int, seconds: float):
+        self._broker, self._seconds = port, seconds
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port = self._server.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve)
+
+    def _serve(self):
+        client, _ = self._server.accept()
+        with client, socket.create_connection(("127.0.0.1", self._broker)) as broker:
+            back = threading.Thread(target=_forward, args=(client, broker))
+            back.start()
+            _forward(broker, client, self._seconds)
+            back.join()
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._thread.join(_SECONDS)
+        self._server.close()
+
+
+def _forward(source: socket.socket, target: socket.socket, seconds: float = 0.0):
+    count = 0
+    while data := source.recv(1 << 14):
+        target.sendall(data)
+        if (count + len(data)) >> 20 > count >> 20:
+            time.sleep(seconds)
+        count += len(data)
+    target.shutdown(socket.SHUT_WR)
+
+
 class Listener:
     """A client of a broker that notes all that it is told.
 

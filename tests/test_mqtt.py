@@ -9,7 +9,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from brokers import Broker, Listener, settled_values, start_bridge
+from brokers import Broker, Listener, SlowLink, settled_values, start_bridge
 from homelife import GENERAL
 from killed_bridge import ZONE, kill_at_random, start_recorder
 from livehome import LiveHome, following, midday_zone
@@ -541,6 +541,22 @@ def test_what_is_left_at_a_broker_is_taken_over_up_to_a_bound(home, broker, kind
     assert (len(taken) == 0) == (kind == "large")
     assert len(taken) <= 5000
     assert len(memory) < 4 << 20
+
+
+def test_what_is_left_at_a_broker_far_away_is_taken_over(home, broker):
+    home.hears("coughing")
+    topics = Topics("hearthlog", "home")
+    with Listener(broker.port) as listener, SlowLink(broker.port, 0.8) as link:
+        for number in range(3):
+            found = discovery(topics, f"old{number}", ["coughing"]) | {"padding": "x" * 1_000_000}
+            text = json.dumps(found)
+            listener.publish(f"homeassistant/device/{number}/config", text, retain=True)
+        with Bridged(home.folder, link):
+            listener.wait_for(f"{COUGHING}/on", "ON")
+    memory = json.loads((home.folder.parent / "bridge" / "mqtt-home.json").read_bytes())
+    assert {f"old{number}" for number in range(3)} <= {
+        part for topic in memory["topics"] for part in topic.split("/")
+    }
 
 
 def test_what_comes_to_a_broker_later_is_not_taken_for_what_a_bridge_left(home, broker):

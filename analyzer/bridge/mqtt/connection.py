@@ -22,8 +22,8 @@ from hearthlog.schemas.storage.small_file import read_whole
 
 _KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
 _QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection
-_KEPT_SECONDS = 0.5  # without a message that a broker kept: it has sent all of them
-_MOST_KEPT_SECONDS = 10.0  # for a broker that keeps very much, or does not confirm subscriptions
+_KEPT_SECONDS = 0.5  # for a broker that sends what it kept behind what comes later
+_MOST_KEPT_SECONDS = 10.0  # for a broker that keeps very much, or lets a bridge read no `online`
 _ANSWER_SECONDS = 2.0  # in which a broker has taken an event
 _TIMELY_SECONDS = 60.0  # after which an event is no news
 _FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
@@ -90,6 +90,7 @@ class Connection:
         self._last_kept: mqtt.MQTTMessageInfo | None = None  # the last value that was published
         self._delivering: dict[tuple[str, str], mqtt.MQTTMessageInfo] = {}
         self._ready_at = math.inf  # by CLOCK_MONOTONIC: when the broker has sent what it kept
+        self._has_mark = False  # the broker has sent `online` back, behind what it kept
         self._is_new = False  # a connection to which nothing was said yet
         self._client = self._make_client(settings)
 
@@ -227,7 +228,9 @@ class Connection:
         self._connected = time.monotonic()
         self._sent = None
         if self._subscriptions:
-            client.subscribe([(topic, _QOS) for topic in self._subscriptions])
+            topics = *self._subscriptions, self._alive
+            client.subscribe([(topic, _QOS) for topic in topics])
+        self._has_mark = False
         client.publish(self._alive, "online", _QOS, retain=True)
         self._is_new = True
         self._ready_at = self._connected
@@ -278,20 +281,25 @@ class Connection:
     def _on_subscribe(
         self, _client: mqtt.Client, _data: Any, _number: int, reasons: list[ReasonCode], _more: Any
     ) -> None:
-        self._wait_for_kept()
+        if reasons[-1].is_failure:  # it will send no `online` back
+            self._has_mark = True
+            self._wait_for_kept()
         for topic, reason in zip(self._subscriptions, reasons, strict=False):
             if reason.is_failure:
                 self._say(f"{self._place}: may not read {topic}: {reason}")
 
     def _on_message(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
-        if message.retain:
+        if message.topic == self._alive:
+            self._has_mark = self._has_mark or not message.retain
+        else:
+            self._received(message)
+        if message.retain or message.topic == self._alive:
             self._wait_for_kept()
-        self._received(message)
 
     def _wait_for_kept(self) -> None:
-        """Be ready a while from now, for more of what the broker kept may come."""
+        """Be ready a while from now, if the broker has sent what it kept before `online`."""
         since = self._connected
-        if since is not None:
+        if since is not None and self._has_mark:
             self._ready_at = min(time.monotonic() + _KEPT_SECONDS, since + _MOST_KEPT_SECONDS)
 
 
