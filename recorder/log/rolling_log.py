@@ -100,11 +100,11 @@ class RollingLog:
             there is a file already with the name of one that begins, unless live.
         """
         with self._keeping_what_was_written():
-            for message in messages:
-                if not self._last - self._late <= message.log_time < self._until:
-                    self._roll(message.log_time)
-                self._append(message)
-                self._given += 1
+            for part in self._parts(messages):
+                if not self._last - self._late <= part[0].log_time < self._until:
+                    self._roll(part[0].log_time)
+                self._append(part)
+                self._given += len(part)
             if self._is_flush_due():
                 self.flush()
             if time.monotonic() - self._synced >= self._sync_seconds:
@@ -161,9 +161,8 @@ class RollingLog:
         """
         with self._keeping_what_was_written():
             if self._writer is not None:
-                for message in messages:
-                    self._append(message)
-                    self._given += 1
+                self._append(messages)
+                self._given += len(messages)
             self._finish_file()
 
     def may_begin(self, stamp: int) -> bool:
@@ -279,12 +278,23 @@ class RollingLog:
             self._writer = None
         self.safe = self._given
 
-    def _append(self, message: EncodedMessage) -> None:
+    def _parts(self, messages: Sequence[EncodedMessage]) -> Iterator[Sequence[EncodedMessage]]:
+        """Divide messages where one may begin a file: nowhere, as long as all are in order."""
+        times = [message.log_time for message in messages]
+        if times and times[-1] < self._until and times == sorted(times):
+            yield messages
+        else:
+            for place in range(len(messages)):
+                yield messages[place : place + 1]
+
+    def _append(self, messages: Sequence[EncodedMessage]) -> None:
+        if not messages:
+            return
         assert self._writer is not None
-        self._writer.write(message.topic, message.log_time, message.data)
-        self._last = max(self._last, message.log_time)
+        self._writer.write_messages(messages)
+        self._last = max(self._last, *(message.log_time for message in messages))
         if self._flush_at is None:
-            self._flush_at = message.log_time + self._flush_nanoseconds
+            self._flush_at = messages[0].log_time + self._flush_nanoseconds
 
     def _roll(self, stamp: int) -> None:
         self._finish_file()
@@ -298,7 +308,7 @@ class RollingLog:
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
         for info in description.infos:
             info.header = header(stamp, info.header.frame_id)
-            for message in opening_messages(info, description.lines.get(info.header.frame_id, ())):
-                self._append(message)
+            lines = description.lines.get(info.header.frame_id, ())
+            self._append(opening_messages(info, lines))
         self._writer.flush()  # the file now says what it is, whatever happens next
         self._flush_at = None

@@ -1,7 +1,7 @@
 """What is in a log, written to a stream: MCAP of profile `ros2`."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple
 
@@ -99,19 +99,17 @@ class LogStreamWriter:
         item = attachment
         self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
 
-    def write(self, topic: str, log_time: int, data: bytes) -> None:
-        """Append one encoded message.
+    def write_messages(self, messages: Iterable[tuple[int, str, bytes]]) -> None:
+        """Append encoded messages.
 
         Parameters
         ----------
-        topic : str
-            Name of one of the writer's topics.
-        log_time : int
-            In nanoseconds of UTC; it is also the publish time.
-        data : bytes
-            CDR.
+        messages : iterable of (int, str, bytes)
+            Log time in nanoseconds of UTC, which is also the publish time; name of one of the
+            writer's topics; CDR.
         """
-        self._writer.add_message(self._channels[topic], log_time, data, log_time)
+        channels = self._channels
+        self._writer.add_messages((channels[topic], time, data) for time, topic, data in messages)
 
     def write_columns(
         self, batch: Sequence[TopicBatch], encoded: Sequence[RawMessages] = ()

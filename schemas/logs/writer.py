@@ -3,7 +3,7 @@
 import errno
 import fcntl
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -75,23 +75,18 @@ class LogWriter:
         return self._stream.tell()
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
-        """Append one encoded message.
+        """Append one encoded message, as `write_messages` does."""
+        self._content.write_messages([(log_time, topic, data)])
 
-        Parameters
-        ----------
-        topic : str
-            Name of one of the log's topics.
-        log_time : int
-            In nanoseconds of UTC; it is also the publish time.
-        data : bytes
-            CDR.
+    def write_messages(self, messages: Iterable[tuple[int, str, bytes]]) -> None:
+        """Append encoded messages, as `LogStreamWriter.write_messages` does.
 
         Raises
         ------
         OSError
             If the file cannot be written.
         """
-        self._content.write(topic, log_time, data)
+        self._content.write_messages(messages)
 
     def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, as `LogStreamWriter.write_columns` does.

@@ -222,11 +222,37 @@ class ChunkWriter:
         sequence : int
             0 to 2**32 - 1.
         """
-        fields = channel_id, sequence, log_time, publish_time
-        head = formats.MESSAGE.pack(Opcode.MESSAGE, formats.MESSAGE_FIXED + len(data), *fields)
-        self._chunk.add_message(channel_id, log_time, head, data)
-        if len(self._chunk.content) > self._chunk_size:
-            self.flush()
+        self._add([(channel_id, sequence, log_time, publish_time, data)])
+
+    def add_messages(self, messages: Iterable[tuple[int, int, bytes]]) -> None:
+        """Append messages: for each the number of its channel, log time and payload.
+
+        The publish time of a message is its log time.
+        """
+        self._add((channel, 0, time, time, data) for channel, time, data in messages)
+
+    def _add(self, messages: Iterable[tuple[int, int, int, int, bytes]]) -> None:
+        # A log has 40 messages a second: a call for each part of each takes longer than the parts.
+        pack, pack_entry = formats.MESSAGE.pack, formats.INDEX_ENTRY.pack
+        opcode, fixed, most = Opcode.MESSAGE, formats.MESSAGE_FIXED, self._chunk_size
+        waiting, chunk = iter(messages), None
+        while chunk is not self._chunk:
+            chunk = self._chunk
+            content, entries, start, end = chunk.content, chunk.entries, chunk.start, chunk.end
+            for channel, sequence, time, published, data in waiting:
+                entries[channel] += pack_entry(time, len(content))
+                content += pack(opcode, fixed + len(data), channel, sequence, time, published)
+                content += data
+                # min and max would take as long as all the rest
+                if time < start:  # noqa: PLR1730
+                    start = time
+                if time > end:  # noqa: PLR1730
+                    end = time
+                if len(content) > most:
+                    chunk.start, chunk.end = start, end
+                    self.flush()
+                    break
+            chunk.start, chunk.end = start, end
 
     def write(self, blocks: Sequence[Block]) -> None:
         """Append blocks of messages, merged in the order of their log times.

@@ -79,28 +79,6 @@ class ChunkBuilder:
         self.entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         self.start, self.end = LATEST, 0
 
-    def add_message(self, channel: int, log_time: int, head: bytes, payload: bytes) -> None:
-        """Append one message.
-
-        Parameters
-        ----------
-        channel : int
-            Number of its channel.
-        log_time : int
-            Nanoseconds.
-        head : bytes
-            Beginning of its record, up to the payload (`MESSAGE`).
-        payload : bytes
-        """
-        self.entries[channel] += INDEX_ENTRY.pack(log_time, len(self.content))
-        self.content += head
-        self.content += payload
-        # min and max would take as long as all the rest
-        if log_time < self.start:  # noqa: PLR1730
-            self.start = log_time
-        if log_time > self.end:  # noqa: PLR1730
-            self.end = log_time
-
     def add_messages(self, data: Bytes, channels: Int64, entries: NDArray[np.void]) -> None:
         """Append message records.
 
