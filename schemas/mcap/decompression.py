@@ -11,6 +11,7 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.mcap.formats import HEAD, ZSTD_CHUNK_HEAD
 from hearthlog.schemas.mcap.records import LIMIT, zstd_decompressor
 
+_LARGE = 16 << 10  # bytes, uncompressed: for chunks of so many, a call of Python is nothing
 _IS_POSSIBLE = "multi_decompress_to_buffer" in zstandard.backend_features
 
 
@@ -55,18 +56,39 @@ def decompress_together(
     )
     if not simple.all() or sizes.sum() > limit:
         return None
-    frames = np.stack([starts + fixed, stored], axis=1).astype(np.uint64)
+    ends = np.cumsum(sizes).astype(np.int64)
+    first, last = starts + fixed, starts + fixed + stored.astype(np.int64)
     try:
-        chunks = zstd_decompressor().multi_decompress_to_buffer(
-            zstandard.BufferWithSegments(raw.data, frames.tobytes()),
-            decompressed_sizes=sizes.astype(np.uint64).tobytes(),
-            threads=1,  # whoever reads has threads of its own
-        )
+        if ends[-1] >= _LARGE * len(sizes):
+            buffer = _one_by_one(raw, first.tolist(), last.tolist(), ends.tolist())
+        else:
+            buffer = _all_at_once(raw, first, stored, sizes)
     except zstandard.ZstdError:
         return None
-    buffer = np.frombuffer(b"".join(chunks), np.uint8)  # type: ignore[arg-type]  # of buffers
-    ends = [0, *np.cumsum(sizes).tolist()]
-    sums = [zlib.crc32(buffer[start:end].data) for start, end in pairwise(ends)]
+    sums = [zlib.crc32(buffer[start:end].data) for start, end in pairwise([0, *ends.tolist()])]
     if ((heads["crc"] != sums) & (heads["crc"] != 0)).any():
         return None
     return buffer, sizes.astype(np.int64)
+
+
+def _one_by_one(raw: Bytes, first: list[int], last: list[int], ends: list[int]) -> Bytes:
+    """Decompress chunks to where they are to lie."""
+    buffer, decompressor, start = np.empty(ends[-1], np.uint8), zstd_decompressor(), 0
+    content, out = raw.data, buffer.data
+    for begin, end, stop in zip(first, last, ends, strict=True):
+        reader = decompressor.stream_reader(content[begin:end])
+        if reader.readinto(out[start:stop]) != stop - start or reader.read(1):
+            raise zstandard.ZstdError("of another size")
+        start = stop
+    return buffer
+
+
+def _all_at_once(raw: Bytes, first: Int64, stored: Int64, sizes: Int64) -> Bytes:
+    """Decompress chunks without Python between them, and put them together."""
+    frames = np.stack([first, stored], axis=1).astype(np.uint64)
+    chunks = zstd_decompressor().multi_decompress_to_buffer(
+        zstandard.BufferWithSegments(raw.data, frames.tobytes()),
+        decompressed_sizes=sizes.astype(np.uint64).tobytes(),
+        threads=1,  # whoever reads has threads of its own
+    )
+    return np.frombuffer(b"".join(chunks), np.uint8)  # type: ignore[arg-type]  # of buffers
