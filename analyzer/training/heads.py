@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from hearthlog.analyzer.training.calibration import inverse_temperature
 from hearthlog.analyzer.training.dataset import EmbeddingWindows
@@ -21,6 +22,7 @@ _FEWEST_COLLECTIONS = 3
 _PARTS = 5  # of the sources, where there are fewer collections
 FEWEST_SOURCES = 3  # of a class; one of fewer is left to the other heads, and to names
 _LARGEST = 2**31 - 1
+_STEPS = 200  # of a regression
 
 
 class LinearHeads(NamedTuple):
@@ -69,6 +71,54 @@ def learn_heads(
             slopes, constants, learned = _calibrated(values, rows, count)
             weights[number, columns], bias[number, learned] = slopes, in_units(constants)
     return LinearHeads(in_units(weights), bias)
+
+
+def regressed(  # noqa: PLR0913
+    inputs: Float64, truth: Float64, weight: Float64, before: Float64, pull: Float64, *, free: bool
+) -> tuple[Float64, Float64]:
+    """Return the weights and biases that, added to decision values, tell windows best.
+
+    This is multinomial logistic regression.
+
+    Parameters
+    ----------
+    inputs : np.ndarray [shape=(n, d)], float64
+    truth : np.ndarray [shape=(n, C)], float64
+        Probabilities of the classes.
+    weight : np.ndarray [shape=(n,)], float64
+    before : np.ndarray [shape=(n, C)], float64
+        Logarithms of probabilities, up to a constant.
+    pull : np.ndarray [shape=(C,)], float64
+        Of weights and biases to zero.
+    free : bool
+        Whether biases are not pulled.
+
+    Returns
+    -------
+    weights : np.ndarray [shape=(d, C)], float64
+    biases : np.ndarray [shape=(C,)], float64
+    """
+    width, count = inputs.shape[1], before.shape[1]
+    pulls = np.tile(pull, (width + 1, 1))
+    if free:
+        pulls[-1] = 0.0
+
+    def loss(flat: Float64) -> tuple[float, Float64]:
+        both = flat.reshape(width + 1, count)
+        decisions = before + inputs @ both[:-1] + both[-1]
+        decisions -= decisions.max(axis=1, keepdims=True)
+        grown = np.exp(decisions)
+        total = grown.sum(axis=1, keepdims=True)
+        lost = -(weight @ (truth * (decisions - np.log(total)))).sum()
+        wrong = weight[:, np.newaxis] * (grown / total - truth)
+        slope = np.concatenate([inputs.T @ wrong, wrong.sum(axis=0, keepdims=True)])
+        value = lost + (pulls * np.square(both)).sum() / 2
+        return float(value), (slope + pulls * both).ravel()
+
+    start = np.zeros((width + 1) * count)
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": _STEPS})
+    both = found.x.reshape(width + 1, count)
+    return both[:-1], both[-1]
 
 
 def scaler_of(windows: EmbeddingWindows, classes: Sequence[str]) -> Float64:

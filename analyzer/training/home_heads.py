@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from hearthlog.analyzer.training.dataset import EmbeddingWindows
-from hearthlog.analyzer.training.heads import in_units
+from hearthlog.analyzer.training.heads import in_units, regressed
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
 from hearthlog.models.classifiers.embedding_heads import (
@@ -22,14 +21,13 @@ from hearthlog.models.classifiers.embedding_heads import (
     sounds_of,
 )
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
+from hearthlog.schemas.arrays import Bool, Float64, Int32
 
 _PULL = 10.0  # to zero, of weights of inputs of one standard deviation
 _PULL_OF_NEW = 1.0  # of those of a class that the base has not: all of it is to be learned
 _CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a mark has 1
 _SHARE = 0.5  # that counts of what is learned: marks are of few sources, and others lie between
 _BELOW = 2.0  # the others on average, is a new class before anything is learned
-_STEPS = 150
 
 
 class Heads(NamedTuple):
@@ -137,7 +135,8 @@ def learn_home(
     target = np.searchsorted(sounds, windows.target[own])
     pull = np.full(len(sounds), _PULL)
     pull[len(sounds) - heads.new :] = _PULL_OF_NEW
-    slopes, constants = _regressed(inputs, target, weight, before, pull)
+    truth = np.eye(len(sounds))[target]
+    slopes, constants = regressed(inputs, truth, weight, before, pull, free=False)
     taken = np.where(np.arange(len(sounds)) < len(sounds) - heads.new, _SHARE, 1.0)
     slopes, constants = taken * slopes, taken * constants
     weights = np.zeros((1, *heads.weights.shape[1:]))
@@ -150,29 +149,3 @@ def learn_home(
         weights=np.concatenate([heads.weights, in_units(weights)]),
         bias=np.concatenate([heads.bias, in_units(bias)]),
     )
-
-
-def _regressed(
-    inputs: Float64, target: Indices, weight: Float64, before: Float64, pull: Float64
-) -> tuple[Float64, Float64]:
-    """Return the weights and biases that, added to decision values, tell windows best."""
-    width, count = inputs.shape[1], before.shape[1]
-    truth = np.eye(count)[target]
-    rows = np.arange(len(target))
-
-    def loss(flat: Float64) -> tuple[float, Float64]:
-        both = flat.reshape(width + 1, count)
-        decisions = before + inputs @ both[:-1] + both[-1]
-        decisions -= decisions.max(axis=1, keepdims=True)
-        grown = np.exp(decisions)
-        total = grown.sum(axis=1, keepdims=True)
-        lost = -(weight * (decisions[rows, target] - np.log(total[:, 0]))).sum()
-        wrong = weight[:, np.newaxis] * (grown / total - truth)
-        slope = np.concatenate([inputs.T @ wrong, wrong.sum(axis=0, keepdims=True)])
-        value = lost + (pull * np.square(both)).sum() / 2
-        return float(value), (slope + pull * both).ravel()
-
-    start = np.zeros((width + 1) * count)
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": _STEPS})
-    both = found.x.reshape(width + 1, count)
-    return both[:-1], both[-1]

@@ -1,6 +1,7 @@
 """The kinds of classifiers that are installed."""
 
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.layers import LAYERS
 from hearthlog.models.classifiers.names import NAMES
 from hearthlog.models.classifiers.neighbours import NEIGHBOURS
@@ -13,7 +14,7 @@ CLASSIFIERS = Extensions(
     "hearthlog.classifiers",
     ClassifierKind,  # type: ignore[type-abstract]
     "classifier kind",
-    [SVM_RBF, LAYERS, NAMES, NEIGHBOURS, ONE_CLASS, TREES],
+    [RBF_LANDMARKS, SVM_RBF, LAYERS, NAMES, NEIGHBOURS, ONE_CLASS, TREES],
 )
 
 

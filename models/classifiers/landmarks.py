@@ -1,0 +1,152 @@
+"""Kernel logistic regression on landmarks: a linear head on a map of the inputs.
+
+The map is that of Williams and Seeger, "Using the Nyström method to speed up kernel machines",
+2001: kernels of a window to some hundreds of points that were chosen among those learned from.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from hearthlog.models.batch_invariant import aligned, rowwise_matmul
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.models.classifiers.rbf_distances import RoundedDistances
+from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
+from hearthlog.schemas.arrays import Float32, Float64
+
+_LANDMARKS_AT_ONCE = 256  # a product this small no BLAS divides among threads
+
+
+class LandmarkParameters(BaseModel):
+    """Parameters of the kernel.
+
+    Attributes
+    ----------
+    gamma : float
+        Of the kernel exp(-gamma |x - l|^2).
+    steps : int
+        Of a standard deviation, to which inputs are rounded.
+    """
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+    gamma: Annotated[float, Field(gt=0.0, le=1e6)]
+    steps: Annotated[int, Field(ge=1, le=1024)]
+
+
+class LandmarksKind(ClassifierKind):
+    """Linear decisions on the kernels of landmarks; the arrays for C classes.
+
+    scaler_mean, scaler_scale : [shape=(width,)], float64
+        Mean and standard deviation of the inputs.
+    landmarks : [shape=(m, width)], float32
+        Inputs, not scaled, class after class.
+    landmark_counts : [shape=(C,)], int64
+        Number of landmarks of each class; 0 for one that a home has taught.
+    weights : [shape=(m, C)], float64
+        Of the kernels.
+    bias : [shape=(C,)], float64
+    base_weights : [shape=(m, B)], float64, optional
+        Weights before the model was ever adapted to a home, of the B classes that it had.
+    base_bias : [shape=(B,)], float64, optional
+    """
+
+    name = "rbf-landmarks"
+    parameters = LandmarkParameters
+    arrays: Mapping[str, np.dtype[Any]] = {
+        **SCALER,
+        "landmarks": np.dtype(np.float32),
+        "landmark_counts": np.dtype(np.int64),
+        "weights": np.dtype(np.float64),
+        "bias": np.dtype(np.float64),
+    }
+    optional: Mapping[str, np.dtype[Any]] = {
+        "base_weights": np.dtype(np.float64),
+        "base_bias": np.dtype(np.float64),
+    }
+
+    def shapes(
+        self, classes: int, width: int, arrays: Mapping[str, Array]
+    ) -> dict[str, tuple[int, ...]]:
+        """Return shapes, as of `ClassifierKind.shapes`."""
+        count, before = (
+            len(arrays[name]) if name in arrays and arrays[name].ndim else 0
+            for name in ("landmarks", "base_bias")
+        )
+        shapes: dict[str, tuple[int, ...]] = {
+            **scaler_shapes(width),
+            "landmarks": (count, width),
+            "landmark_counts": (classes,),
+            "weights": (count, classes),
+            "bias": (classes,),
+        }
+        if before:
+            shapes["base_weights"], shapes["base_bias"] = (count, before), (before,)
+        return shapes
+
+    def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
+        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
+        counts, total = arrays["landmark_counts"], len(arrays["landmarks"])
+        if (counts < 0).any() or counts.sum() != total or not total:
+            return f"landmark_counts do not add up to the {total} landmarks"
+        before = len(arrays.get("base_bias", counts))
+        if before > classes or not counts[:before].all() or counts[before:].any():
+            return "landmark_counts has classes of the base without landmarks, or others with some"
+        return scaler_problem(arrays)
+
+    def machine(self, model: Model) -> "LandmarksMachine":
+        """Prepare a model for inference."""
+        parameters = LandmarkParameters.model_validate(model.description.parameters)
+        return LandmarksMachine(model.arrays, parameters)
+
+    def summary(self, model: Model) -> str:
+        """Return the number of landmarks, in words."""
+        return f"{len(model.arrays['landmarks'])} landmarks"
+
+
+RBF_LANDMARKS = LandmarksKind()
+
+
+class LandmarksMachine:
+    """Inference of one model.
+
+    Parameters
+    ----------
+    arrays : mapping of str to np.ndarray
+        As of `LandmarksKind`.
+    parameters : LandmarkParameters
+    """
+
+    def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
+        self._scaled = Scaler(arrays)
+        self._distances = RoundedDistances(parameters.gamma, parameters.steps)
+        landmarks, weights = self._scaled(arrays["landmarks"]), arrays["weights"]
+        self._bias = arrays["bias"]
+        self._blocks = []
+        for start in range(0, len(landmarks), _LANDMARKS_AT_ONCE):
+            rows = slice(start, start + _LANDMARKS_AT_ONCE)
+            block = self._distances.vectors(landmarks[rows])
+            self._blocks.append((block, aligned(weights[rows])))
+
+    def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
+        """Return logarithms of probabilities, up to a constant and a temperature; NaN as novelty.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+
+        Returns
+        -------
+        decisions : np.ndarray [shape=(n, C)], float64
+        novelty : np.ndarray [shape=(n,)], float64
+        """
+        rows = self._distances.rows(self._scaled(inputs))
+        decisions = np.tile(self._bias, (len(inputs), 1))
+        for landmarks, weights in self._blocks:
+            exponents = self._distances.between(rows, landmarks)
+            decisions += rowwise_matmul(np.exp(exponents, out=exponents), weights)
+        return decisions, np.full(len(inputs), np.nan)
