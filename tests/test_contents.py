@@ -265,6 +265,6 @@ def test_a_long_log_is_counted_without_being_kept(monkeypatch):
     monkeypatch.setattr(Contents, "add", lambda _, batch: batches.append(len(batch[0].buffer)))
     writer = LogStreamWriter(BytesIO(), [Topic("/mic/audio", message_types.RAW_AUDIO)])
     for number in range(1000):
-        writer.write("/mic/audio", START + number, bytes(20_000))
+        writer.write_messages([(START + number, "/mic/audio", bytes(20_000))])
     writer.finish("long.mcap")
     assert max(batches) < 5 << 20 < 19 << 20 < sum(batches)

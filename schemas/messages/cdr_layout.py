@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages.message_types import number_type, typestore
+from hearthlog.schemas.messages.message_types import number_type, store_of
 from hearthlog.schemas.messages.versions import APPENDED
 
 START = 4  # of the fields: alignment counts from here
@@ -131,7 +131,7 @@ def default_rows(name: str, fields: Sequence[tuple[str, Any]], prefix: str = "")
 
 def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -> Iterator[Default]:
     if node is Nodetype.NAME and kind not in _STAMPS:
-        yield from default_rows(kind, typestore().fielddefs[kind][1], f"{path}.")
+        yield from default_rows(kind, store_of(kind).fielddefs[kind][1], f"{path}.")
         return
     row: NDArray[Any]
     if node is Nodetype.NAME:

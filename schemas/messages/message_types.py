@@ -42,15 +42,74 @@ _DEFINED_HERE = (
 )
 
 
+# As ROS 2 Jazzy has them: all that it has takes longer to import than all else.
+_OF_ROS = {
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
+    "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "diagnostic_msgs/msg/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/msg/DiagnosticStatus": """\
+byte OK=0
+byte WARN=1
+byte ERROR=2
+byte STALE=3
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values""",
+    DIAGNOSTICS: "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
+    LOG: """\
+uint8 DEBUG=10
+uint8 INFO=20
+uint8 WARN=30
+uint8 ERROR=40
+uint8 FATAL=50
+builtin_interfaces/Time stamp
+uint8 level
+string name
+string msg
+string file
+string function
+uint32 line""",
+}
+
+
 @cache
 def typestore() -> Typestore:
     """Return the types of ROS 2 and those of the folder `msg`."""
     store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(_types_here())
+    return store
+
+
+@cache
+def _recorded_types() -> Typestore:
+    store = get_typestore(Stores.EMPTY)
+    of_ros = (get_types_from_msg(text, name) for name, text in _OF_ROS.items())
+    store.register({name: types for same in of_ros for name, types in same.items()} | _types_here())
+    return store
+
+
+def _types_here() -> dict[str, Any]:
     folder = files("hearthlog.schemas.messages") / "msg"
+    types: dict[str, Any] = {}
     for name in _DEFINED_HERE:
         text = (folder / f"{name.rpartition('/')[2]}.msg").read_text()
-        store.register(get_types_from_msg(text, name))
-    return store
+        types |= get_types_from_msg(text, name)
+    return types
+
+
+def store_of(typename: str) -> Typestore:
+    """Return a typestore that has a type, if any has: of what a recorder writes, a small one.
+
+    Parameters
+    ----------
+    typename : str
+        ROS 2 name of the type.
+    """
+    recorded = _recorded_types()
+    return recorded if typename in recorded.fielddefs else typestore()
 
 
 def message(typename: str, **fields: Any) -> Any:
@@ -71,10 +130,10 @@ def message(typename: str, **fields: Any) -> Any:
     """
     absent = APPENDED.get(typename, {}).keys() - fields.keys()
     if absent:
-        descriptions = dict(typestore().fielddefs[typename][1])
+        descriptions = dict(store_of(typename).fielddefs[typename][1])
         for name in absent:
             fields[name] = _default(descriptions[name], APPENDED[typename][name].default)
-    return typestore().types[typename](**fields)
+    return store_of(typename).types[typename](**fields)
 
 
 def _default(description: tuple[Nodetype, Any], value: float | str | None = None) -> Any:
@@ -83,7 +142,9 @@ def _default(description: tuple[Nodetype, Any], value: float | str | None = None
     if node is Nodetype.BASE:
         return ("" if kind[0] == "string" else 0) if value is None else value
     if node is Nodetype.NAME:
-        fields = [f for f in typestore().fielddefs[kind][1] if f[0] not in APPENDED.get(kind, {})]
+        fields = [
+            f for f in store_of(kind).fielddefs[kind][1] if f[0] not in APPENDED.get(kind, {})
+        ]
         return message(kind, **{name: _default(described) for name, described in fields})
     (element, base), count = kind
     length = count if node is Nodetype.ARRAY else 0
@@ -158,7 +219,8 @@ def encode(fields: Any) -> bytes:
     fields : message
         As `message` makes it.
     """
-    return bytes(typestore().serialize_cdr(fields, fields.__msgtype__, little_endian=True))
+    store = store_of(fields.__msgtype__)
+    return bytes(store.serialize_cdr(fields, fields.__msgtype__, little_endian=True))
 
 
 def decode(data: bytes | memoryview, typename: str) -> Any:
@@ -176,7 +238,7 @@ def decode(data: bytes | memoryview, typename: str) -> Any:
     message
         Of the typestore's class for this type.
     """
-    return typestore().deserialize_cdr(data, typename)
+    return store_of(typename).deserialize_cdr(data, typename)
 
 
 @cache
@@ -188,7 +250,7 @@ def definition(typename: str) -> str:
     typename : str
         ROS 2 name of the type.
     """
-    return typestore().generate_msgdef(typename, ros_version=2)[0]
+    return store_of(typename).generate_msgdef(typename, ros_version=2)[0]
 
 
 @cache
@@ -200,4 +262,4 @@ def type_hash(typename: str) -> str:
     typename : str
         ROS 2 name of the type.
     """
-    return typestore().hash_rihs01(typename)
+    return store_of(typename).hash_rihs01(typename)

@@ -19,7 +19,7 @@ from hearthlog.schemas.messages.cdr_layout import (
     LayoutWalk,
     TypeDefinition,
 )
-from hearthlog.schemas.messages.message_types import PACKAGE, definition, typestore
+from hearthlog.schemas.messages.message_types import PACKAGE, definition, store_of
 from hearthlog.schemas.messages.versions import APPENDED
 
 _MESSAGE_LIMIT = 100 << 20  # bytes
@@ -186,7 +186,7 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
     LogError
         If the encoding is another one, or the text is larger than 256 KiB or cannot be understood.
     """
-    ours = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
+    ours = {key: fields for key, (_, fields) in store_of(name).fielddefs.items()}
     theirs = {key: fields for key, (_, fields) in defined_types(name, encoding, text).items()}
     growth = {
         key: _growth(key, fields, ours[key])
@@ -215,7 +215,7 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
     LogError
         As `message_type`.
     """
-    ours = typestore().fielddefs
+    ours = store_of(name).fielddefs
     if name in ours and (not encoding or text == definition(name).encode()):
         return {}
     if not encoding:
