@@ -465,6 +465,24 @@ def test_arrays_that_do_not_fit_are_refused(why, tmp_path):
         save_model(replace(broken, arrays=kept), tmp_path / "broken.safetensors")
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_same_sound_many_times_makes_one_landmark_of_each_of_its_windows():
+    data, scenario = data_of(3)
+    windows = data.windows.copy()
+    windows[data.target == 0] = windows[0]
+    data, method = replace(data, windows=windows), method_of(LANDMARKS)
+    inputs, target, _ = prepare(method, data).windows(slice(None))
+    different = len(np.unique(rounded(inputs)[target == 0], axis=0))
+    counts = train_model(data, scenario, ignore_progress, method).arrays["landmark_counts"]
+    assert counts[0] == different < counts[1] == counts[2] == 20
+
+
+def test_fewer_landmarks_than_classes_are_refused():
+    method = replace(method_of(LANDMARKS), landmarks=2)
+    with pytest.raises(DataError, match="2 landmarks for 3 classes; each needs one"):
+        train_model(*data_of(3), ignore_progress, method)
+
+
 def votes_of(vectors, target, row, neighbours):
     arrays = {
         "scaler_mean": np.zeros(2),

@@ -161,13 +161,17 @@ class LandmarkMethod(WindowMethod):
         """Return the centres of the windows of each class, and their number."""
         windows = np.bincount(target)
         share = windows**_ROOT
-        counts = np.rint(self.landmarks * share / share.sum()).astype(np.intp)
-        counts = np.minimum(np.maximum(counts, 1), windows)
+        wanted = np.maximum(np.rint(self.landmarks * share / share.sum()), 1).astype(np.intp)
         centres = []
-        for number, count in enumerate(counts):
+        for number, count in enumerate(wanted.tolist()):
             own = target == number
-            means = KMeans(count, n_init=1, max_iter=_ROUNDS, random_state=self.random_state)
+            # The same sound twice makes no two centres.
+            most = len(np.unique(scaled[own], axis=0))
+            means = KMeans(
+                min(count, most), n_init=1, max_iter=_ROUNDS, random_state=self.random_state
+            )
             centres.append(means.fit(scaled[own], sample_weight=weight[own]).cluster_centers_)
+        counts = np.array([len(each) for each in centres])
         return np.concatenate(centres), counts
 
     def _move(
@@ -182,7 +186,7 @@ class LandmarkMethod(WindowMethod):
         base_weights = arrays.setdefault("base_weights", arrays["weights"])
         base_bias = arrays.setdefault("base_bias", arrays["bias"])
         old = len(base_bias)
-        new = max(int(target.max()) + 1 - old, 0)
+        new = max(int(target.max(initial=-1)) + 1 - old, 0)
         gamma = self.gamma / inputs.shape[1]
         map_ = _Map(arrays, gamma, self.steps)
         kernels = np.concatenate([map_.kernels(arrays["landmarks"]), map_.kernels(inputs)])
