@@ -93,6 +93,7 @@ def _forget() -> None:
     """Let nothing be remembered of other definitions."""
     for remembered in (
         message_types.typestore,
+        message_types.recorded_types,
         message_types.definition,
         message_types.type_hash,
         type_definitions.message_type,

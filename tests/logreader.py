@@ -20,8 +20,8 @@ from hearthlog.schemas.messages.message_types import (
     decode,
     duration_message,
     number_type,
+    store_of,
     time_message,
-    typestore,
 )
 from hearthlog.schemas.messages.type_definitions import message_type
 
@@ -62,8 +62,8 @@ class LogMessage:
 
 def _message(typename: str, values: Mapping[str, Any], prefix: str = "") -> Any:
     """Make a message of the values of its columns."""
-    fields = typestore().fielddefs[typename][1]
-    return typestore().types[typename](
+    fields = store_of(typename).fielddefs[typename][1]
+    return store_of(typename).types[typename](
         *(_field(described, values, f"{prefix}{name}") for name, described in fields)
     )
 

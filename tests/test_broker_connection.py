@@ -97,7 +97,8 @@ def open_sockets() -> set[str]:
 
 
 def test_a_value_is_said_once_and_an_event_each_time(broker):
-    with connected(broker) as (connection, _), Listener(broker.port) as listener:
+    with Listener(broker.port) as listener, connected(broker) as (connection, _):
+        listener.publish("c", "3")  # it is told of what comes from now on
         for _ in range(3):
             connection.keep("a", "1")
             connection.send("b", "2")

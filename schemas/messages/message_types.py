@@ -84,7 +84,8 @@ def typestore() -> Typestore:
 
 
 @cache
-def _recorded_types() -> Typestore:
+def recorded_types() -> Typestore:
+    """Return the types of what a recorder writes, and no others."""
     store = get_typestore(Stores.EMPTY)
     of_ros = (get_types_from_msg(text, name) for name, text in _OF_ROS.items())
     store.register({name: types for same in of_ros for name, types in same.items()} | _types_here())
@@ -108,7 +109,7 @@ def store_of(typename: str) -> Typestore:
     typename : str
         ROS 2 name of the type.
     """
-    recorded = _recorded_types()
+    recorded = recorded_types()
     return recorded if typename in recorded.fielddefs else typestore()
 
 
