@@ -282,9 +282,7 @@ def test_a_home_teaches_and_what_it_taught_goes_with_it(name, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "name", sorted(set(NAMES) - {"neighbours", LANDMARKS})
-)  # which decides by them
+@pytest.mark.parametrize("name", KEEPING)
 def test_a_model_without_its_windows_is_not_adapted(name):
     base = trained(name)
     others = {one: array for one, array in base.arrays.items() if not one.startswith("learned_")}

@@ -42,7 +42,7 @@ _BELOW = 2.0  # the others on average, is a new class before anything is learned
 
 
 class Prior(NamedTuple):
-    """What a home moves.
+    """A model whose weights a home moves.
 
     Attributes
     ----------
