@@ -18,20 +18,23 @@ from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.cross_validation import softmax
-from hearthlog.analyzer.training.dataset import Recording, cut_recordings
+from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.home_data import (
     HOME_WEIGHT,
     home_recordings,
     lesson_recordings,
 )
+from hearthlog.analyzer.training.home_landmarks import is_moved, learned_over
+from hearthlog.analyzer.training.landmark_method import ROOM
+from hearthlog.analyzer.training.learned_inputs import kept_inputs
+from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
-from hearthlog.analyzer.training.svm_method import BANDS, ROOM
+from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario, scenario_of
+from hearthlog.analyzer.training.svm_method import BANDS, SVM
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, SvmMachine, home_votes
+from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.augmentation import augmented
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
@@ -41,6 +44,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -48,6 +52,7 @@ from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.home.clips import SHIPPED
 
 
 @pytest.fixture
@@ -133,9 +138,10 @@ def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(method
     twice = adapt_model(once, few)
     for name, array in once.arrays.items():
         np.testing.assert_array_equal(array, twice.arrays[name])
+    moved = base if is_moved(base) else learned_over(base)
     temperatures = once.description.inverse_temperature, twice.description.inverse_temperature
-    assert temperatures[0] == temperatures[1] != base.description.inverse_temperature
-    assert twice.description.base_inverse_temperature == base.description.inverse_temperature
+    assert temperatures[0] == temperatures[1] != moved.description.inverse_temperature
+    assert twice.description.base_inverse_temperature == moved.description.inverse_temperature
 
 
 def test_few_marks_bring_back_the_temperature_that_the_model_had_before_more_marks(world):
@@ -144,25 +150,55 @@ def test_few_marks_bring_back_the_temperature_that_the_model_had_before_more_mar
     assert adapted.description.inverse_temperature == base.description.inverse_temperature
 
 
-def test_an_adapted_model_has_what_the_first_one_learned_and_nothing_twice(world):
-    base, few, _ = world
-    adapted = adapt_model(base, few)
-    for ours, expected in zip(ROOM.remembered(adapted), ROOM.remembered(base), strict=True):
-        np.testing.assert_array_equal(ours, expected)
-    arrays = adapted.arrays
-    assert 0 < len(arrays["base_vectors"]) < 0.3 * len(base.arrays["support_vectors"])
-    assert 0 < (arrays["support_base"] < 0).sum() <= 3 * len(few)  # windows of a segment
+def of_old(base, moved):
+    """A support vector machine as an earlier version adapted it: one vector in ten is of a home."""
+    support = base.arrays["support_vectors"]
+    counts = base.arrays["support_counts"]
+    target = np.repeat(np.arange(len(counts)), counts)
+    kept = np.arange(len(support)) % 10 > 0
+    rows = np.full(len(support), -1)
+    rows[kept] = np.flatnonzero(kept)
+    vectors = support.copy()
+    vectors[~kept] += np.float32(moved)
+    return with_arrays(
+        base,
+        support_vectors=vectors,
+        base_target=target.astype(np.int64),
+        support_base=rows,
+        base_vectors=support[~kept],
+        base_costs=np.ones(len(counts)),
+    )
+
+
+def test_what_an_earlier_version_adapted_begins_with_what_its_base_had_kept():
+    base, few, rest = world_of(SVM)
+    old = of_old(base, 40.0)
+    inputs, target = kept_inputs(old)
+    np.testing.assert_array_equal(inputs, base.arrays["support_vectors"])
+    assert target.tolist() == kept_inputs(base)[1].tolist()
+    assert accuracy(adapt_model(old, few), rest) > accuracy(old, rest) + 0.2
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_an_adapted_model_whose_vectors_are_numbered_wrongly_is_refused(world, twice, tmp_path):
-    base, few, _ = world
-    adapted = adapt_model(base, few)
+def test_an_adapted_machine_whose_vectors_are_numbered_wrongly_is_refused(twice, tmp_path):
+    adapted = of_old(world_of(SVM)[0], 0.0)
+    save_model(adapted, tmp_path / "right.safetensors")
     numbers = adapted.arrays["support_base"].copy()
     kept = np.flatnonzero(numbers >= 0)
     numbers[kept[0]] = numbers[kept[1]] if twice else 1_000_000
     with pytest.raises(ModelError, match="support_base has numbers that no vector of the base has"):
         save_model(with_arrays(adapted, support_base=numbers), tmp_path / "x.safetensors")
+
+
+@pytest.mark.parametrize("method", [BANDS, SVM])
+def test_landmarks_say_what_a_machine_says(method):
+    base, over = world_of(method)[0], learned_over(world_of(method)[0])
+    assert is_moved(over)
+    assert over.classes == base.classes
+    _, unseen, _ = sounds_of(method)
+    inputs = of_segments(Classifier(base).inputs, unseen.windows, unseen.floor)
+    before, after = (segment_probabilities(Classifier(one), inputs) for one in (base, over))
+    assert np.abs(after - before).mean() < 0.1
 
 
 def test_a_class_the_home_has_not_is_not_forgotten(world):
@@ -173,16 +209,22 @@ def test_a_class_the_home_has_not_is_not_forgotten(world):
     assert accuracy(adapt_model(base, three), own) > 0.9
 
 
-def test_a_model_without_what_it_learned_from_is_refused():
-    base, few, _ = world_of(BANDS)
-    bare = dataclasses.replace(base, name="bare", training_windows=base.training_windows[:0])
-    with pytest.raises(DataError, match="bare: has not kept what it learned from"):
-        adapt_model(bare, few)
+@pytest.mark.parametrize("method", [BANDS, ROOM])
+def test_a_model_keeps_no_windows(method):
+    assert not len(world_of(method)[0].training_windows)
 
 
-def test_a_model_keeps_its_training_windows_only_if_its_method_needs_them():
-    assert not len(world_of(ROOM)[0].training_windows)
-    assert len(world_of(BANDS)[0].training_windows)
+def test_what_a_home_says_of_coughs_and_shouts_changes_nothing_else():
+    base = load_model(starter_file(GENERAL))
+    scenario = scenario_of(base)
+    recordings = clip_recordings(read_manifest(SHIPPED, LABELS), scenario, ignore_progress)
+    data = cut_recordings(recordings, scenario)
+    of_home = np.isin(data.target, [data.classes.index(one) for one in ("coughing", "yelling")])
+    adapted = adapt_model(base, rows(data, of_home & (np.arange(len(data)) % 2 == 0)))
+    before, after = (predicted(one, data.windows, data.floor) for one in (base, adapted))
+    right = (before[of_home] == data.target[of_home]).mean()
+    assert (after[of_home] == data.target[of_home]).mean() > right
+    assert (before == after)[~of_home].mean() > 0.97
 
 
 def test_a_home_without_segments_is_refused(world):
@@ -191,39 +233,9 @@ def test_a_home_without_segments_is_refused(world):
         adapt_model(base, rows(few, few.target < 0))
 
 
-def test_an_adapted_model_decides_as_scikit_learn_does(world):
-    base, few, rest = world
-    adapted = adapt_model(base, few)
-    remembered, target = ROOM.remembered(base)
-    examples = prepare(ROOM, few)._replace(more_inputs=remembered, more_target=target)
-    inputs = of_segments(DEFAULT.inputs[ROOM.inputs], rest.windows, rest.floor)
-    inputs = inputs.reshape(-1, inputs.shape[-1])
-    again = ROOM.keeping(base.arrays, np.arange(4))
-    decision = again.fit(examples).decide(inputs, 4)
-    expected = softmax(adapted.description.inverse_temperature * decision)
-    ours = Classifier(adapted).probabilities(inputs)
-    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("adapted", [False, True])
-def test_a_machine_that_is_learned_again_without_anything_new_decides_as_before(adapted):
-    learned, _, scenario = sounds_of(ROOM)
-    uneven = rows(learned, (learned.target > 1) | (learned.group % 6 < 2))
-    base = train_model(uneven, scenario, ignore_progress, ROOM)
-    home = rows(learned, learned.target == 0)
-    model = adapt_model(base, home) if adapted else base
-    remembered, target = ROOM.remembered(model)
-    examples = prepare(ROOM, home)._replace(more_inputs=remembered, more_target=target)
-    again = ROOM.keeping(model.arrays, np.arange(4)).fit(examples, np.empty(0, np.intp))
-    inputs = of_segments(DEFAULT.inputs[ROOM.inputs], learned.windows, learned.floor)
-    inputs = inputs.reshape(-1, inputs.shape[-1])
-    before, _ = SvmMachine(base).decide(inputs)
-    np.testing.assert_allclose(again.decide(inputs, 4), before, rtol=0, atol=0.01)
-
-
-def test_a_model_with_vectors_of_a_home_labels_as_it_did(world):
-    base, few, rest = world
-    home = of_segments(DEFAULT.inputs[ROOM.inputs], few.windows, few.floor)[:, 0]
+def test_a_model_with_vectors_of_a_home_labels_as_it_did():
+    base, few, rest = world_of(SVM)
+    home = of_segments(DEFAULT.inputs[SVM.inputs], few.windows, few.floor)[:, 0]
     old = with_arrays(base, home_vectors=home, home_target=few.target.astype(np.int64))
     assert accuracy(old, rest) > accuracy(base, rest) + 0.2
 
@@ -421,30 +433,35 @@ def test_one_collection_cannot_be_left_out():
 
 
 def test_the_curve_of_adaptation_rises_where_homes_differ():
-    data, _ = blobs(3, 400, spread=1.0, features=BANDS.features)
+    data, _ = blobs(3, 400, spread=1.0, features=ROOM.features)
     group = np.arange(len(data)) // 4
     far = data.windows + np.float32(20.0) * (group % 2).astype(np.float32)[:, None, None]
     data = dataclasses.replace(
         data, windows=far, group=group, collection=group % 2, collection_names=("a", "b")
     )
-    curve = adaptation_curve(data, dataclasses.replace(BANDS, copies=0), ignore_progress)
+    curve = adaptation_curve(data, ROOM, ignore_progress)
     assert curve.corrected == CORRECTED
     assert set(curve.collections) == {"a", "b"}
     assert curve.mean[-1] > curve.mean[0]
 
 
 def test_no_collection_is_like_a_home_if_all_are_small_or_there_is_but_one():
-    data, _ = blobs(3, 30, features=BANDS.features)
+    data, _ = blobs(3, 30, features=ROOM.features)
     small = dataclasses.replace(
         data, collection=np.arange(len(data)) % 4, collection_names=("a", "b", "c", "d")
     )
     for alike in (data, small):
         with pytest.raises(DataError, match="none can stand for a new home"):
-            adaptation_curve(alike, BANDS, ignore_progress)
+            adaptation_curve(alike, ROOM, ignore_progress)
+
+
+def test_only_landmarks_have_a_curve_of_adaptation():
+    with pytest.raises(DataError, match="method bands learns no landmarks"):
+        adaptation_curve(blobs(3, 30, features=BANDS.features)[0], BANDS, ignore_progress)
 
 
 def test_only_classes_with_ten_segments_in_a_home_count(monkeypatch):
-    data, _ = blobs(4, 40, features=BANDS.features)
+    data, _ = blobs(4, 40, features=ROOM.features)
     there = np.flatnonzero(data.target < 2)
     few = np.flatnonzero(data.target == 2)[:9]
     collection = np.zeros(len(data), np.int64)
@@ -458,7 +475,7 @@ def test_only_classes_with_ten_segments_in_a_home_count(monkeypatch):
     tried = []
     original = curves._scores
     monkeypatch.setattr(curves, "_scores", lambda *a: tried.append(a[2]) or original(*a))
-    curve = adaptation_curve(data, dataclasses.replace(BANDS, copies=0), ignore_progress)
+    curve = adaptation_curve(data, ROOM, ignore_progress)
     assert {"home"} <= set(curve.collections)
     split = next(one for one in tried if collection[one.test[0]] == 1)
     assert set(data.target[np.concatenate([split.pool, split.test])]) == {0, 1}

@@ -64,7 +64,7 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     fitted = make_pipeline(in_whole_steps(StandardScaler(), PAPER.steps), machine).fit(
         rounded(statistics(data)).astype(np.float64), data.target
     )
-    learned = LearnedSvm(fitted, unseen(classes)[:0], np.empty(0, np.intp), PAPER.steps)
+    learned = LearnedSvm(fitted, unseen(classes)[:0], PAPER.steps)
     decision = learned.decide(unseen(classes), classes)
     expected = softmax(model.description.inverse_temperature * decision)
 

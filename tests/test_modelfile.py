@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
+from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.scenario import Scenario
-from hearthlog.analyzer.training.svm_method import ROOM
+from hearthlog.analyzer.training.svm_method import SVM
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import read_description
@@ -38,7 +39,7 @@ ARRAYS = (
 
 @cache
 def model():
-    return train_model(*blobs(3, 12), ignore_progress)
+    return train_model(*blobs(3, 12), ignore_progress, SVM)
 
 
 @cache

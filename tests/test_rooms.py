@@ -9,12 +9,12 @@ from scipy.signal import welch
 
 from hearthlog.analyzer.training import rooms
 from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings, cut_recordings
+from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.learned_inputs import spread_over_classes
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.rooms import empty_room, in_room, reverberated, steady_noise
 from hearthlog.analyzer.training.scenario import LABELS, Scenario, load_scenario
-from hearthlog.analyzer.training.svm_method import ROOM
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import FloorTracker

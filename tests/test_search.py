@@ -5,7 +5,9 @@ import json
 import os
 import pty
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from threading import Event
 
 import numpy as np
 import pytest
@@ -14,16 +16,18 @@ from blobs import blobs
 from clusters import running, scheduler_in, worker_of
 from joblib import delayed
 from spliced import run
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hearthlog.analyzer.errors import DataError, WorkerError
 from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
 from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
 from hearthlog.analyzer.evaluation.grid_search import search
 from hearthlog.analyzer.training.cross_validation import cross_validate
+from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
-from hearthlog.analyzer.workers.parallel import fits_on, in_parallel
+from hearthlog.analyzer.workers.parallel import fits_on, in_parallel, single_thread
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli import progress
@@ -97,12 +101,36 @@ def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
 
 
 def test_a_cluster_adapts_as_threads_do(cluster):
-    data, _ = blobs(3, 400, spread=3.0, features=PAPER.features)
+    data, _ = blobs(3, 400, spread=3.0)
     group = np.arange(len(data)) // 4
     data = dataclasses.replace(data, group=group, collection=group % 2, collection_names=("a", "b"))
-    here = adaptation_curve(data, PAPER, ignore_progress)
+    method = dataclasses.replace(ROOM, landmarks=60)
+    here = adaptation_curve(data, method, ignore_progress)
     with fits_on(cluster):
-        assert adaptation_curve(data, PAPER, ignore_progress) == here
+        assert adaptation_curve(data, method, ignore_progress) == here
+
+
+def blas_threads():
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_who_leaves_first_lets_the_others_go_on_with_one_thread():
+    before, entered, left = blas_threads(), Event(), Event()
+
+    def stay():
+        with single_thread():
+            entered.set()
+            assert left.wait(20)
+            return blas_threads()
+
+    with ThreadPoolExecutor(1) as pool, threadpool_limits(2, user_api="blas"):
+        with single_thread():
+            waiting = pool.submit(stay)
+            assert entered.wait(20)
+        left.set()
+        assert waiting.result() == {1}
+        assert blas_threads() == {2}
+    assert blas_threads() == before
 
 
 def test_a_cluster_runs_what_it_is_given(cluster):

@@ -15,9 +15,9 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training import clip_sound
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
+from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
-from hearthlog.analyzer.training.svm_method import ROOM
 from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
@@ -381,8 +381,8 @@ def test_another_seed_draws_other_rooms_and_the_model_says_which(home):
     none, first, other, again = (file.read_bytes() for file in files)
     assert none == first
     assert other == again
-    vectors = [load_model(file).arrays["support_vectors"] for file in files[1:3]]
-    assert not np.array_equal(*vectors)
+    landmarks = [load_model(file).arrays["landmarks"] for file in files[1:3]]
+    assert not np.array_equal(*landmarks)
     assert [json.loads(result.stdout).get("seed") for result in results] == [None, None, 1, 1]
 
 

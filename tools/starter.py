@@ -23,11 +23,12 @@ import soundfile
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import Dataset, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.installed import clip_embedder
+from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, LandmarkMethod
+from hearthlog.analyzer.training.learned_inputs import kept_inputs
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.mixture import head_inputs_of
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
-from hearthlog.analyzer.training.svm_method import EMBEDDING, ROOM, SvmMethod
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING, SILENCE
 from hearthlog.models.classifiers.description import SIMULATED
@@ -49,10 +50,7 @@ _FEWEST_SOURCES = 3  # a class of fewer would only mislead
 # babies, and speech is taken for it.
 _MISLEADING = {"general": (LAUGHING, CRYING)}
 _RING_TONES, _RING_SECONDS = 40, 4.0
-_METHODS: dict[str, SvmMethod] = {
-    ROOM.name: replace(ROOM, most_windows=7_000),  # both models take less than 6 MB
-    EMBEDDING.name: replace(EMBEDDING, most_windows=2_600),  # and these less than 1 MB each
-}
+_METHODS = {method.name: method for method in (ROOM, EMBEDDING)}
 _COLUMNS = ("path", "label", "source_group", "source", "licence", "seconds", "credit", "url")
 _ABOUT = """# The starter models
 
@@ -72,9 +70,7 @@ it.{by_names} Without the network they label by the features alone.
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
 
 
-def learn_starters(
-    manifests: Sequence[Path], folder: Path, method: SvmMethod = _METHODS[ROOM.name]
-) -> None:
+def learn_starters(manifests: Sequence[Path], folder: Path, method: LandmarkMethod = ROOM) -> None:
     """Learn the starter models, and write them and a page about them.
 
     Parameters
@@ -83,7 +79,7 @@ def learn_starters(
         Of the collections, with licences.
     folder : Path
         Is written over.
-    method : SvmMethod, optional
+    method : LandmarkMethod, optional
 
     Raises
     ------
@@ -101,7 +97,7 @@ def learn_starters(
     (folder / f"README{suffix}.md").write_text(_page(models, method), "utf-8")
 
 
-def _suffix(method: SvmMethod) -> str:
+def _suffix(method: LandmarkMethod) -> str:
     """Return what the names of files end in, of starters that are for a network."""
     return f"-{method.name}" if method.network else ""
 
@@ -150,7 +146,7 @@ def _ring_tones(folder: Path) -> list[LabelledClip]:
     return clips
 
 
-def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMethod) -> Model:
+def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: LandmarkMethod) -> Model:
     """Learn one model of the classes that have enough sources."""
     scenario, path = BUILTIN[name], folder / f"{name}{_suffix(method)}.safetensors"
     sources: dict[str, set[tuple[str, str]]] = {}
@@ -181,7 +177,7 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMe
     )
     others = [_own_windows(method, data, named)] if named else []
     if before is not None and kept:
-        others.append(_remembered(before, method, data, kept))
+        others.append(_kept(before, data, kept))
     joined = None
     if others:
         joined = (
@@ -202,20 +198,20 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path, method: SvmMe
     return model
 
 
-def _own_windows(method: SvmMethod, data: Dataset, classes: set[str]) -> tuple[Float32, Indices]:
+def _own_windows(
+    method: LandmarkMethod, data: Dataset, classes: set[str]
+) -> tuple[Float32, Indices]:
     """Return the windows of classes of which folds may leave nothing to learn from."""
     numbers = [data.classes.index(name) for name in classes]
     rows = np.flatnonzero(np.isin(data.target, numbers))
     return prepare(method, data).windows(rows)[:2]
 
 
-def _remembered(
-    before: Model, method: SvmMethod, data: Dataset, kept: set[str]
-) -> tuple[Float32, Indices]:
-    """Return the windows of some classes that a model without a network has learned from."""
-    remembered = method.as_of(before.description).remembered(before)
-    assert remembered is not None
-    inputs, target = remembered
+def _kept(before: Model, data: Dataset, kept: set[str]) -> tuple[Float32, Indices]:
+    """Return the windows of some classes that a model without a network has kept."""
+    windows = kept_inputs(before)
+    assert windows is not None
+    inputs, target = windows
     own = np.isin(target, [before.classes.index(one) for one in kept])
     numbers = [data.classes.index(before.classes[one]) for one in target[own].tolist()]
     return inputs[own], np.array(numbers, np.intp)
@@ -237,7 +233,7 @@ def _crediting(model: Model, before: Model) -> Model:
     return replace(model, description=described)
 
 
-def _page(models: Sequence[Model], method: SvmMethod) -> str:
+def _page(models: Sequence[Model], method: LandmarkMethod) -> str:
     """Describe the models, and name the classes that they lack."""
     about = _ABOUT.format(sources=f"sources{_suffix(method)}.csv")
     if method.network:

@@ -16,6 +16,8 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.confirmed import MOST_CONFIRMED
 from hearthlog.analyzer.training.dataset import Dataset, spread
 from hearthlog.analyzer.training.home_data import HOME_WEIGHT
+from hearthlog.analyzer.training.home_landmarks import HomeLandmarks
+from hearthlog.analyzer.training.landmark_method import LandmarkMethod
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
@@ -60,9 +62,14 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
     Raises
     ------
     DataError
-        If no collection is large and varied enough to stand for a home, or the method wants
-        augmented copies and its feature set has none.
+        If no collection is large and varied enough to stand for a home, or the method learns no
+        landmarks, which are what a home moves.
     """
+    if not isinstance(method, LandmarkMethod):
+        raise DataError(
+            f"method {method.name} learns no landmarks, and a home would have them instead: its "
+            "curve is that of room"
+        )
     names = data.collection_names
     homes = {number: _segments_of_home(data, number) for number in range(len(names))}
     chosen = [
@@ -132,14 +139,19 @@ def _split(data: Dataset, number: int, rows: Indices, shuffle: int) -> _Split:
     return _Split(others, pool, rows[~mine])
 
 
-def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float64:
+def _scores(method: LandmarkMethod, classes: int, split: _Split, *arrays: Any) -> Float64:
     """Return the F1 of each class after each number of corrections; NaN for a class without any."""
     examples = Examples(*arrays)
     target = examples.target
     base = method.fit(examples, split.others)
-    inputs, of_inputs, _ = examples.windows(split.others)
-    joined = examples._replace(more_inputs=inputs, more_target=of_inputs)
-    again = method.keeping(base.arrays(), np.unique(target[split.others]))
+    again = HomeLandmarks.of_learned(method, base)
+    # The base has numbers for what it learned; what only the home has comes behind.
+    order = np.concatenate([base.classes, np.setdiff1d(np.arange(classes), base.classes)])
+    at_home = examples._replace(
+        target=np.argsort(order)[target],
+        more_inputs=examples.more_inputs[:0],
+        more_target=examples.more_target[:0],
+    )
     labelled = examples.decide(base, split.pool, classes).argmax(axis=1)
     true = target[split.pool]
     wrong = np.flatnonzero((labelled != true) & (true != split.silence))
@@ -151,10 +163,11 @@ def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float6
         home = split.pool[np.concatenate([marked, _few_of_each(passed, true)])]
         weight = examples.weight.copy()
         weight[split.pool[marked]] = HOME_WEIGHT
-        learned = base
+        learned, numbers = base, np.arange(classes)
         if len(home):
-            learned = again.fit(joined._replace(weight=weight), home)
-        predicted = examples.decide(learned, split.test, classes).argmax(axis=1)
+            numbers = order
+            learned = again.fit(at_home._replace(weight=weight), home)
+        predicted = numbers[examples.decide(learned, split.test, classes).argmax(axis=1)]
         scores[place, labels] = f1_score(
             target[split.test], predicted, labels=labels, average=None, zero_division=0
         )

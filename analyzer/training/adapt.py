@@ -1,4 +1,4 @@
-"""Adaptation: a model is learned again, from its own segments and those of a home."""
+"""Adaptation: what a home teaches is added to the weights of a model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,8 +10,9 @@ from hearthlog.analyzer.training.calibration import home_temperature
 from hearthlog.analyzer.training.cross_validation import cross_validate
 from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, EmbeddingWindows
 from hearthlog.analyzer.training.home_heads import Heads, base_heads, learn_home
+from hearthlog.analyzer.training.home_landmarks import HomeLandmarks, is_moved, learned_over
 from hearthlog.analyzer.training.home_spans import merged_spans
-from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.learned_inputs import kept_inputs
 from hearthlog.analyzer.training.learned_segments import learned_digests, segment_digests
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scenario import Scenario
@@ -41,27 +42,22 @@ def base_classes(model: Model) -> tuple[str, ...]:
     Parameters
     ----------
     model : Model
-        Whose method is installed.
-
-    Raises
-    ------
-    DataError, ModelError
-        If the method is not installed, or cannot be imported.
     """
     insist_taught(model)
-    description = model.description
-    remembered = method_named(description.method).as_of(description).remembered(model)
-    target = model.training_target if remembered is None else remembered[1]
-    return model.classes[: int(target.max()) + 1] if len(target) else model.classes
+    kept = kept_inputs(model)
+    if kept is None or not len(kept[1]):
+        return model.classes
+    return model.classes[: int(kept[1].max()) + 1]
 
 
 def adapt_model(base: Model, home: Dataset) -> Model:
-    """Learn a model again, from its own segments and those of a home.
+    """Add what a home teaches to the weights of a model.
 
     Parameters
     ----------
     base : Model
-        A model whose arrays stand for what it learned, or that has kept its training windows.
+        One whose classifier is not on landmarks is learned over by what it says, if it has kept
+        windows that it learned from.
     home : Dataset
         Of the `base_classes` of the model, some of which may have no segments, and of new ones
         behind them, which have some.
@@ -76,31 +72,19 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     Raises
     ------
     DataError
-        If the base model has not kept what it learned from, or nothing of one of its classes, the
-        home has no segments, the method of the base model is not installed, or that method wants
-        augmented copies and its feature set has none.
+        If the home has no segments, or no loud ones of a new class, or if the base cannot be
+        learned over.
     ModelError
-        If the method cannot be imported, or its feature set is not installed.
+        If the feature set or the kind of classifier of the base is not installed.
     """
     insist_taught(base)
-    description = base.description
     if not len(home):
         raise DataError("the home has no segments of a class of the model")
-    method = method_named(description.method).as_of(description)
-    method = method.keeping(base.arrays, np.arange(len(base.classes)))
-    remembered = method.remembered(base)
-    if remembered is not None:
-        examples, others = prepare(method, home), 0
-        examples = examples._replace(more_inputs=remembered[0], more_target=remembered[1])
-    else:
-        joined, others = _joined(base, home), len(base.training_windows)
-        examples = prepare(method, joined)
-    _check_every_class(base, examples, home.classes)
-    here = np.arange(others, others + len(home))
+    moved = base if is_moved(base) else learned_over(base)
+    description, method = moved.description, HomeLandmarks.of(moved)
+    examples, here = prepare(method, home), np.arange(len(home))
+    _check_new_classes(base, examples, home.classes)
     learned = method.fit(examples)
-    arrays = learned.arrays()
-    if remembered is not None:
-        arrays |= method.memory(remembered, learned)
     before = description.base_inverse_temperature or description.inverse_temperature
     description = _of_classes(description, home.classes)
     left_out = _left_out(method, examples, here, ~_is_confirmed(home), description)
@@ -129,13 +113,9 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     plain = {"format": FORMAT, "direction_microphones": []}
     adapted = Model(
         description.model_copy(update=update | plain),
-        arrays,
+        learned.arrays(),
         transitions=transitions,
         training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
-        training_windows=base.training_windows,
-        training_floor=base.training_floor,
-        training_target=base.training_target,
-        training_group=base.training_group,
     )
     if description.embedding is not None:
         adapted = _with_heads(adapted, base, home, inverse * left_out[here])
@@ -205,14 +185,14 @@ def _confirmed_number(home: Dataset) -> int:
     return names.index(CONFIRMED) if CONFIRMED in names else -1
 
 
-def _check_every_class(base: Model, examples: Examples, classes: Sequence[str]) -> None:
-    """Refuse what would leave a class without a window to learn from."""
-    usable = examples.usable.any(axis=(0, 2))
-    learned = np.union1d(examples.target[usable], examples.more_target)
-    missing = np.setdiff1d(np.arange(len(classes)), learned)
-    if len(missing):
-        name = classes[missing[0]]
-        raise DataError(f"{base.name}: has kept nothing of {name}; train it anew to adapt")
+def _check_new_classes(base: Model, examples: Examples, classes: Sequence[str]) -> None:
+    """Refuse what would leave a class that the base lacks without a window to learn from."""
+    usable = examples.target[examples.usable.any(axis=(0, 2))]
+    for number in range(len(base_classes(base)), len(classes)):
+        if number not in usable:
+            raise DataError(
+                f"the home has no sound of {classes[number]} above its noise: mark louder ones"
+            )
 
 
 def _of_classes(description: Description, classes: Sequence[str]) -> Description:
@@ -288,21 +268,3 @@ def _confirmed(home: Dataset) -> dict[str, int]:
     """Count the segments of each class that are as they were labelled."""
     counts = np.bincount(home.target[_is_confirmed(home)], minlength=len(home.classes))
     return {name: int(count) for name, count in zip(home.classes, counts, strict=True) if count}
-
-
-def _joined(base: Model, home: Dataset) -> Dataset:
-    """Join the training windows of a model with the segments of a home."""
-    count = len(base.training_windows)
-    if not count:
-        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
-    floor = base.training_floor if len(base.training_floor) else np.zeros((count, home.bands))
-    return replace(
-        home,
-        windows=np.concatenate([base.training_windows, home.windows]),
-        target=np.concatenate([base.training_target, home.target]),
-        group=np.concatenate([base.training_group, home.group]),
-        weight=np.concatenate([np.ones(count), home.weight]),
-        floor=np.concatenate([floor, home.floor]),
-        copies=home.copies[:0],
-        copy_floor=home.copy_floor[:0],
-    )

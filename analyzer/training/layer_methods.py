@@ -10,7 +10,7 @@ from sklearn.neural_network import MLPClassifier
 from sklearn.preprocessing import StandardScaler
 
 from hearthlog.analyzer.training.learned_inputs import balanced, fitted_scaler, scaler_arrays
-from hearthlog.analyzer.training.window_method import WindowMethod, as_room, kept_windows
+from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.layers import LAYERS, LayersMachine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
@@ -40,7 +40,7 @@ class LogisticMethod(WindowMethod):
             scaler.transform(inputs.astype(np.float64)), target, balanced(target, weight)
         )
         arrays = layer_arrays(scaler, [regression.coef_.T], [regression.intercept_])
-        return LayersMachine(arrays), arrays | kept_windows(inputs, target), {}
+        return LayersMachine(arrays), arrays, {}
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class PerceptronMethod(WindowMethod):
             random_state=self.random_state,
         ).fit(scaler.transform(inputs.astype(np.float64)), target, balanced(target, weight))
         arrays = layer_arrays(scaler, network.coefs_, network.intercepts_)
-        return LayersMachine(arrays), arrays | kept_windows(inputs, target), {}
+        return LayersMachine(arrays), arrays, {}
 
 
 def layer_arrays(

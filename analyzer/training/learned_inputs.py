@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.rbf_distances import in_steps
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
@@ -119,3 +120,39 @@ def rounded(inputs: Float32) -> Float32:
         half = inputs.astype(np.float16).astype(np.float32)
     spread, error = inputs.std(axis=0), np.abs(half - inputs).max(axis=0)
     return half if ((error <= _ROUNDING * spread) | (spread == 0.0)).all() else inputs
+
+
+def kept_inputs(model: Model) -> tuple[Float32, Indices] | None:
+    """Return the inputs of windows that a model has kept of what it learned from.
+
+    Those of a model that was adapted are those of its base.
+
+    Parameters
+    ----------
+    model : Model
+
+    Returns
+    -------
+    inputs : np.ndarray [shape=(n, width)], float32
+    target : np.ndarray [shape=(n,)], intp
+        Numbers of their classes. None in place of both, if its kind keeps none.
+    """
+    arrays = model.arrays
+    if "landmarks" in arrays:
+        counts = arrays["landmark_counts"]
+        return arrays["landmarks"], np.repeat(np.arange(len(counts)), counts)
+    if "base_target" in arrays:
+        support, rows = arrays["support_vectors"], arrays["support_base"]
+        target = arrays["base_target"].astype(np.intp)
+        inputs = np.empty((len(target), support.shape[1]), np.float32)
+        inputs[rows[rows >= 0]] = support[rows >= 0]
+        inputs[np.setdiff1d(np.arange(len(target)), rows)] = arrays["base_vectors"]
+        return inputs, target
+    if "support_counts" in arrays:
+        counts = arrays["support_counts"]
+        return arrays["support_vectors"], np.repeat(np.arange(len(counts)), counts)
+    if "learned_inputs" in arrays:
+        return arrays["learned_inputs"], arrays["learned_target"].astype(np.intp)
+    if "vectors" in arrays:
+        return arrays["vectors"], arrays["vectors_target"].astype(np.intp)
+    return None

@@ -12,8 +12,6 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.rooms import empty_room
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.description import Description
-from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.features.window_inputs import Inputs, of_segments, window_places
@@ -204,65 +202,6 @@ class Method(ABC):
     def variations(self) -> list[Self]:
         """Return the methods that a grid search compares, this one among them."""
         return [self]
-
-    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
-        """Return the inputs that stand for all that a model has learned from, and their classes.
-
-        Parameters
-        ----------
-        base : Model
-            That this method has learned.
-
-        Returns
-        -------
-        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)]) or None
-            None if the model must learn from its training windows again.
-        """
-        del base
-        return None
-
-    def memory(
-        self, remembered: tuple[Float32, Indices], learned: Learned
-    ) -> dict[str, NDArray[Any]]:
-        """Return arrays by which a model that was learned from `remembered` gives it again.
-
-        Parameters
-        ----------
-        remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
-            As of the method.
-        learned : Learned
-
-        Returns
-        -------
-        dict of str to np.ndarray
-            By name of the array.
-        """
-        del remembered, learned
-        return {}
-
-    def as_of(self, description: Description) -> Self:
-        """Return this method with the parameters of a model.
-
-        Parameters
-        ----------
-        description : Description
-            Of a model that this method has learned.
-        """
-        del description
-        return self
-
-    def keeping(self, arrays: Mapping[str, NDArray[Any]], classes: Indices) -> Self:
-        """Return this method so that what a machine learned stays, where nothing new is learned.
-
-        Parameters
-        ----------
-        arrays : mapping of str to np.ndarray
-            Of a machine that this method has learned.
-        classes : np.ndarray [shape=(C,)], intp
-            Numbers of its classes.
-        """
-        del arrays, classes
-        return self
 
 
 def prepare(method: Method, data: Dataset) -> Examples:

@@ -10,7 +10,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
-from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.learned_inputs import kept_inputs
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.scenario import LABELS, Scenario
@@ -150,8 +150,8 @@ def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32
         If it has not kept what it learned from as inputs of the method.
     """
     description = model.description
-    remembered = method_named(description.method).as_of(description).remembered(model)
-    if remembered is None or (method.feature_set, method.inputs) != (
+    kept = kept_inputs(model)
+    if kept is None or (method.feature_set, method.inputs) != (
         description.feature_set,
         description.inputs,
     ):
@@ -159,7 +159,7 @@ def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32
             f"method {method.name} cannot learn from {model.name} how others sound; use --method "
             f"{description.method}, or give --data with silence and the speech of others"
         )
-    inputs, target = remembered
+    inputs, target = kept
     classes = list(scenario.classes)
     numbers = [
         classes.index(SILENCE if class_name(name) == SILENCE else UNKNOWN) for name in model.classes

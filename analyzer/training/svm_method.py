@@ -1,9 +1,9 @@
 """Methods that learn support vector machines, with scikit-learn."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,38 +12,21 @@ from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.learned_inputs import (
-    class_costs,
+    balanced,
     fitted_scaler,
     in_whole_steps,
     rounded,
     scaler_arrays,
     spread_over_classes,
 )
-from hearthlog.analyzer.training.method import Examples, Learned, Method
-from hearthlog.models.classifiers.description import Description
-from hearthlog.models.classifiers.model import Model
+from hearthlog.analyzer.training.method import Examples, Method
+from hearthlog.analyzer.training.window_method import as_room
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
 from hearthlog.models.features.network import INPUTS
-from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
+from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)
-
-
-class Scaling(NamedTuple):
-    """What a machine measures its inputs and errors with.
-
-    Attributes
-    ----------
-    mean, scale : np.ndarray [shape=(width,)], float64
-        Of the inputs.
-    costs : dict of int to float
-        By number of the class, relative to the cost of the method.
-    """
-
-    mean: Float64
-    scale: Float64
-    costs: dict[int, float]
 
 
 @dataclass(frozen=True)
@@ -63,15 +46,12 @@ class SvmMethod(Method):
         Of a standard deviation, to which inputs are rounded; None for a model that does not.
     most_windows : int
         That are learned from; the time that it takes grows with their square.
-    scaling : Scaling, optional
-        Of a machine that is learned again; by default that of the examples.
     """
 
     cost: float = 4.0
     gamma: float = 1.0
     steps: int | None = 50
     most_windows: int = 12_000
-    scaling: Scaling | None = field(default=None, compare=False)
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -93,39 +73,20 @@ class SvmMethod(Method):
             Indices of the segments to learn from; all by default.
         """
         inputs, target, weight = examples.windows(seen)
-        remembered = np.arange(-len(inputs), 0) + len(examples.more_target)
         if len(inputs) > self.most_windows:
             kept = spread_over_classes(target, weight, self.most_windows, self.seed)
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
-            remembered = remembered[kept]
         inputs = rounded(inputs)
-        scaler = self._scaler(inputs)
+        scaler = in_whole_steps(fitted_scaler(inputs), self.steps)
         machine = SVC(
             C=self.cost, gamma=self.gamma / inputs.shape[1], decision_function_shape="ovo"
         ).fit(
             scaler.transform(inputs.astype(np.float64)),
             target,
-            sample_weight=weight * self._costs(target, remembered >= 0),
+            sample_weight=balanced(target, weight),
         )
-        support = machine.support_
         learned = make_pipeline(*scaler, machine)
-        remembered = np.maximum(remembered[support], -1)
-        return LearnedSvm(learned, inputs[support], remembered, self.steps)
-
-    def _scaler(self, inputs: Float32) -> Pipeline:
-        scaler = fitted_scaler(inputs)
-        if self.scaling is not None:
-            scaler.mean_, scaler.scale_ = self.scaling.mean, self.scaling.scale
-        return in_whole_steps(scaler, self.steps)
-
-    def _costs(self, target: Indices, remembered: Bool) -> Float64:
-        """Weigh windows against the number of their class, an earlier machine's as it did."""
-        balanced = class_costs(target)
-        if self.scaling is None:
-            return balanced[target]
-        kept = balanced.copy()
-        kept[list(self.scaling.costs)] = list(self.scaling.costs.values())
-        return np.where(remembered, kept[target], balanced[target])
+        return LearnedSvm(learned, inputs[machine.support_], self.steps)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with another cost or gamma.
@@ -152,112 +113,6 @@ class SvmMethod(Method):
             for cost, gamma in product(_COST_TIMES, _GAMMA_TIMES)
         ]
 
-    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
-        """Return the support vectors, from which the same machine would be learned again.
-
-        Those of a model that was adapted are those of its own base. Copies in other rooms are among
-        them, which the training windows of a model lack.
-
-        Parameters
-        ----------
-        base : Model
-
-        Returns
-        -------
-        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)]) or None
-            None for a method without copies in other rooms.
-        """
-        if not self.rooms:
-            return None
-        arrays, support = base.arrays, base.arrays["support_vectors"]
-        if "base_target" not in arrays:
-            counts = arrays["support_counts"]
-            return support, np.repeat(np.arange(len(counts)), counts)
-        rows, target = arrays["support_base"], arrays["base_target"]
-        inputs = np.empty((len(target), support.shape[1]), np.float32)
-        inputs[rows[rows >= 0]] = support[rows >= 0]
-        inputs[np.setdiff1d(np.arange(len(target)), rows)] = arrays["base_vectors"]
-        return inputs, target
-
-    def memory(
-        self, remembered: tuple[Float32, Indices], learned: Learned
-    ) -> dict[str, NDArray[Any]]:
-        """Return arrays by which a model that was learned from `remembered` gives it again.
-
-        Parameters
-        ----------
-        remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
-        learned : LearnedSvm
-
-        Returns
-        -------
-        dict of str to np.ndarray
-            By name of the array.
-        """
-        assert isinstance(learned, LearnedSvm)
-        inputs, target = remembered
-        costs = {} if self.scaling is None else self.scaling.costs
-        numbers = range(len(learned.machine.classes_))
-        return {
-            "base_target": target.astype(np.int64),
-            "base_costs": np.array([costs.get(number, 1.0) for number in numbers]),
-            "support_base": learned.remembered.astype(np.int64),
-            "base_vectors": inputs[np.setdiff1d(np.arange(len(inputs)), learned.remembered)],
-        }
-
-    def keeping(self, arrays: Mapping[str, NDArray[Any]], classes: Indices) -> Self:
-        """Return this method with the scaling of a machine, which its vectors then give again.
-
-        With a scaling of the few vectors and of what is new, all borders would move.
-
-        Parameters
-        ----------
-        arrays : mapping of str to np.ndarray
-            As of `hearthlog.models.classifiers.svm_rbf.SvmKind`.
-        classes : np.ndarray [shape=(C,)], intp
-            Numbers of its classes.
-
-        Returns
-        -------
-        SvmMethod
-            Itself, if it has no copies in other rooms: it learns from all windows again.
-        """
-        if not self.rooms:
-            return self
-        if "base_costs" in arrays:
-            number = int(arrays["base_target"].max()) + 1
-            costs = dict(enumerate(arrays["base_costs"][:number].tolist()))
-        else:  # a coefficient is never above the cost of its class, and on the wrong side just that
-            target = np.repeat(classes, arrays["support_counts"])
-            largest = np.abs(arrays["dual_coefficients"]).max(axis=0) / self.cost
-            own = arrays.get("support_base", np.zeros(len(target))) >= 0
-            numbers = np.unique(target[own]).tolist()
-            costs = {number: float(largest[own & (target == number)].max()) for number in numbers}
-        return replace(self, scaling=Scaling(arrays["scaler_mean"], arrays["scaler_scale"], costs))
-
-    def as_of(self, description: Description) -> Self:
-        """Return this method with cost, gamma and number of copies of a model.
-
-        Parameters
-        ----------
-        description : Description
-            Of a support vector machine.
-
-        Raises
-        ------
-        ModelError
-            If the feature set of the method is not installed.
-        """
-        width = self.features.inputs[description.inputs].width
-        values = description.parameters
-        return replace(
-            self,
-            cost=values["cost"],
-            gamma=values["gamma"] * width,
-            steps=values.get("steps"),
-            copies=description.copies,
-        )
-
 
 class LearnedSvm:
     """A fitted machine.
@@ -268,18 +123,13 @@ class LearnedSvm:
         A scaler, what rounds to steps if they are rounded, and an `SVC`.
     support : np.ndarray [shape=(n, width)], float32
         Inputs that became support vectors, in the order of the `SVC`.
-    remembered : np.ndarray [shape=(n,)], intp
-        Their places in `Examples.more_inputs`; -1 for those of segments.
     steps : int or None
         Of a standard deviation, to which inputs are rounded.
     """
 
-    def __init__(
-        self, machine: Pipeline, support: Float32, remembered: Indices, steps: int | None
-    ) -> None:
+    def __init__(self, machine: Pipeline, support: Float32, steps: int | None) -> None:
         self.machine = machine
         self._steps = steps
-        self.remembered = remembered
         self._support = support
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
@@ -325,22 +175,7 @@ class LearnedSvm:
 
 BANDS = SvmMethod("bands", "auros21", "bands", SVM_RBF.name, copies=1, cost=4.0, gamma=1.25)
 PAPER = SvmMethod("paper", "auros21", "statistics", SVM_RBF.name, copies=0, cost=4.0, gamma=0.5)
-ROOM = SvmMethod(
-    "room",
-    "home33",
-    "above_floor",
-    SVM_RBF.name,
-    copies=0,
-    rooms=3,
-    gate=2.0,
-    observation_weight=0.45,
-    cost=1.0,  # with 4 sounds of few sources, a shower, are hardly ever recognised
-    gamma=0.5,
-)
-ROOM21 = replace(ROOM, name="room21", feature_set="auros21")
-EMBEDDING = replace(
-    ROOM, name="embedding", network="yamnet", observation_weight=0.5, class_exponent=0.2
-)
+SVM = SvmMethod("svm", **as_room(SVM_RBF), cost=1.0, gamma=0.5)
 
 
 def network_method(name: str) -> SvmMethod:

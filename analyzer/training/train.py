@@ -157,16 +157,7 @@ def train_model(  # noqa: PLR0913, PLR0917
             embedding_bias=mixture.heads.bias,
             embedding_scaler=scaler_of(data.embedding_windows, data.classes),
         )
-    model = with_directions(model, data.target, data.sightings)
-    if method.remembered(model) is not None:
-        return model
-    return replace(
-        model,
-        training_windows=data.windows,
-        training_floor=data.floor,
-        training_target=data.target.astype(np.int64),
-        training_group=data.group.astype(np.int64),
-    )
+    return with_directions(model, data.target, data.sightings)
 
 
 def check_varied(data: Dataset) -> None:

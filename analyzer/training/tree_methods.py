@@ -13,7 +13,7 @@ from sklearn.ensemble import (
 )
 
 from hearthlog.analyzer.training.learned_inputs import balanced
-from hearthlog.analyzer.training.window_method import WindowMethod, as_room, kept_windows
+from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.trees import TREES, TreesMachine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
@@ -50,7 +50,7 @@ class ForestMethod(WindowMethod):
             random_state=self.random_state,
         ).fit(inputs, target, balanced(target, weight))
         arrays = forest_arrays(forest)
-        return TreesMachine(arrays), arrays | kept_windows(inputs, target), {}
+        return TreesMachine(arrays), arrays, {}
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class BoostingMethod(WindowMethod):
             random_state=self.random_state,
         ).fit(inputs, target, balanced(target, weight))
         arrays = boosted_arrays(boosted)
-        return TreesMachine(arrays), arrays | kept_windows(inputs, target), {}
+        return TreesMachine(arrays), arrays, {}
 
 
 def forest_arrays(

@@ -12,9 +12,8 @@ from hearthlog.analyzer.training.learned_inputs import (
     in_whole_steps,
     scaler_arrays,
 )
-from hearthlog.analyzer.training.window_method import WindowMethod, as_room, kept_windows
+from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
-from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.neighbours import (
     NEIGHBOURS,
     NeighboursMachine,
@@ -57,12 +56,6 @@ class NeighboursMethod(WindowMethod):
         }
         machine = NeighboursMachine(arrays, parameters, int(target.max()) + 1)
         return machine, arrays, parameters.model_dump()
-
-    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
-        """Return the windows that vote, as of `WindowMethod.remembered`."""
-        if "learned_inputs" in base.arrays:
-            return super().remembered(base)
-        return base.arrays["vectors"], base.arrays["vectors_target"]
 
 
 @dataclass(frozen=True)
@@ -108,8 +101,7 @@ class OneClassMethod(WindowMethod):
             "coefficients": np.concatenate(coefficients),
             "offsets": np.concatenate(offsets),
         }
-        learned = arrays | kept_windows(inputs, target)
-        return OneClassMachine(arrays, parameters), learned, parameters.model_dump()
+        return OneClassMachine(arrays, parameters), arrays, parameters.model_dump()
 
 
 NEIGHBOURS_VOTE = NeighboursMethod("neighbours", **as_room(NEIGHBOURS))

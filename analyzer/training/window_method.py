@@ -1,4 +1,4 @@
-"""Methods that learn a classifier of scikit-learn from windows, and keep them in the model."""
+"""Methods that learn a classifier of scikit-learn from windows."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.training.learned_inputs import rounded, spread_over_classes
-from hearthlog.analyzer.training.method import Examples, Learned, Method
-from hearthlog.analyzer.training.svm_method import ROOM
+from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
-from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _ROWS_AT_ONCE = 256
@@ -78,31 +76,6 @@ class WindowMethod(Method):
             Those of a model.
         """
 
-    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
-        """Return the windows of a model before it was ever adapted, as of `Method.remembered`."""
-        if "learned_inputs" not in base.arrays:
-            return None
-        return base.arrays["learned_inputs"], base.arrays["learned_target"]
-
-    def memory(
-        self, remembered: tuple[Float32, Indices], learned: Learned
-    ) -> dict[str, NDArray[Any]]:
-        """Return the windows themselves, as of `Method.memory`."""
-        del learned
-        return kept_windows(*remembered)
-
-
-def kept_windows(inputs: Float32, target: Indices) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `hearthlog.models.classifiers.learned_windows`.
-
-    Parameters
-    ----------
-    inputs : np.ndarray [shape=(n, width)], float32
-    target : np.ndarray [shape=(n,)], intp
-        Numbers of their classes.
-    """
-    return {"learned_inputs": inputs, "learned_target": target.astype(np.int64)}
-
 
 def as_room(kind: ClassifierKind) -> dict[str, Any]:
     """Return the fields of a method with the inputs of method `room`.
@@ -113,13 +86,13 @@ def as_room(kind: ClassifierKind) -> dict[str, Any]:
         That it learns.
     """
     return {
-        "feature_set": ROOM.feature_set,
-        "inputs": ROOM.inputs,
+        "feature_set": "home33",
+        "inputs": "above_floor",
         "kind": kind.name,
-        "copies": ROOM.copies,
-        "rooms": ROOM.rooms,
-        "gate": ROOM.gate,
-        "observation_weight": ROOM.observation_weight,
+        "copies": 0,
+        "rooms": 3,
+        "gate": 2.0,
+        "observation_weight": 0.45,
     }
 
 
@@ -131,7 +104,7 @@ class LearnedMachine:
     machine : Machine
         Of the classes that were learned.
     classes : np.ndarray [shape=(c,)], intp
-        Their numbers.
+        Their numbers, an attribute.
     arrays : mapping of str to np.ndarray
         Of a model.
     parameters : mapping of str to value
@@ -146,7 +119,7 @@ class LearnedMachine:
         parameters: Mapping[str, Any],
     ) -> None:
         self._machine = machine
-        self._classes = classes
+        self.classes = classes
         self._arrays = arrays
         self._parameters = parameters
 
@@ -155,7 +128,7 @@ class LearnedMachine:
         decision = np.full((len(inputs), classes), -np.inf)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
-            decision[rows, self._classes] = self._machine.decide(inputs[rows])[0]
+            decision[rows, self.classes] = self._machine.decide(inputs[rows])[0]
         return decision
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from contextvars import ContextVar
+from threading import Lock
 from typing import Any
 
 from hearthlog.analyzer.workers.cluster import Cluster, connected
@@ -71,3 +72,47 @@ def fits_on(scheduler: str | None) -> Iterator[None]:
             yield
         finally:
             _CLUSTER.reset(token)
+
+
+class _SingleThread:
+    """Lets libraries of linear algebra use one thread while anybody is inside.
+
+    The limit of a BLAS is of the process: who leaves first must not lift it for the others.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._inside = 0
+        self._limits: Any = None
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        from threadpoolctl import threadpool_limits  # noqa: PLC0415  as joblib
+
+        with self._lock:
+            if not self._inside:
+                _forget_controlling_thread()
+                self._limits = threadpool_limits(1, user_api="blas")
+            self._inside += 1
+        try:
+            with threadpool_limits(1, user_api="openmp"):  # of this thread alone
+                yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside:
+                    _forget_controlling_thread()
+                    self._limits.restore_original_limits()
+                    _forget_controlling_thread()
+
+
+def _forget_controlling_thread() -> None:
+    """Let this thread set limits: since 3.8 threadpoolctl heeds only the one that did last."""
+    import threadpoolctl  # noqa: PLC0415  as joblib
+
+    openblas = getattr(threadpoolctl, "OpenBLASController", None)
+    if openblas is not None and hasattr(openblas, "clear_controlling_thread"):
+        openblas.clear_controlling_thread(force=True)
+
+
+single_thread = _SingleThread()  # a sum depends on how many threads share it

@@ -46,7 +46,9 @@ class LandmarksKind(ClassifierKind):
         Inputs, not scaled, class after class.
     landmark_counts : [shape=(C,)], int64
         Number of landmarks of each class; 0 for one that a home has taught.
-    weights : [shape=(m, C)], float64
+    home_landmarks : [shape=(h, width)], float32, optional
+        Those of a home that the model was adapted to, behind the others.
+    weights : [shape=(m + h, C)], float64
         Of the kernels.
     bias : [shape=(C,)], float64
     base_weights : [shape=(m, B)], float64, optional
@@ -64,6 +66,7 @@ class LandmarksKind(ClassifierKind):
         "bias": np.dtype(np.float64),
     }
     optional: Mapping[str, np.dtype[Any]] = {
+        "home_landmarks": np.dtype(np.float32),
         "base_weights": np.dtype(np.float64),
         "base_bias": np.dtype(np.float64),
     }
@@ -72,17 +75,19 @@ class LandmarksKind(ClassifierKind):
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
         """Return shapes, as of `ClassifierKind.shapes`."""
-        count, before = (
+        count, home, before = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
-            for name in ("landmarks", "base_bias")
+            for name in ("landmarks", "home_landmarks", "base_bias")
         )
         shapes: dict[str, tuple[int, ...]] = {
             **scaler_shapes(width),
             "landmarks": (count, width),
             "landmark_counts": (classes,),
-            "weights": (count, classes),
+            "weights": (count + home, classes),
             "bias": (classes,),
         }
+        if home:
+            shapes["home_landmarks"] = (home, width)
         if before:
             shapes["base_weights"], shapes["base_bias"] = (count, before), (before,)
         return shapes
@@ -104,10 +109,17 @@ class LandmarksKind(ClassifierKind):
 
     def summary(self, model: Model) -> str:
         """Return the number of landmarks, in words."""
-        return f"{len(model.arrays['landmarks'])} landmarks"
+        return f"{len(all_landmarks(model.arrays))} landmarks"
 
 
 RBF_LANDMARKS = LandmarksKind()
+
+
+def all_landmarks(arrays: Mapping[str, Array]) -> Float32:
+    """Return the landmarks of a model and of its home, in the order of the weights."""
+    own: Float32 = arrays["landmarks"]
+    home = arrays.get("home_landmarks")
+    return own if home is None else np.concatenate([own, home])
 
 
 class LandmarksMachine:
@@ -123,7 +135,7 @@ class LandmarksMachine:
     def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
         self._scaled = Scaler(arrays)
         self._distances = RoundedDistances(parameters.gamma, parameters.steps)
-        landmarks, weights = self._scaled(arrays["landmarks"]), arrays["weights"]
+        landmarks, weights = self._scaled(all_landmarks(arrays)), arrays["weights"]
         self._bias = arrays["bias"]
         self._blocks = []
         for start in range(0, len(landmarks), _LANDMARKS_AT_ONCE):

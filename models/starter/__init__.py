@@ -19,8 +19,8 @@ def with_network(name: str) -> str:
 
 STARTERS = (*BY_FEATURES, *map(with_network, BY_FEATURES))
 SHA256 = {  # of their files, as `sha256sum` prints it
-    GENERAL: "d5f6f6cb0736ba4ab933943ebbef25d1d53f99de02f49ffa509d621747f2587f",
-    BATHROOM: "0344b38fa1cf06a446ee491bbad6fe8b6dd73ec89296849baf7e7adae6cb6d75",
+    GENERAL: "e8d9881ca23c612b1ac56bf9ffa98c5db140215caf77ea71e39f60d2d6e6028c",
+    BATHROOM: "d3bb9a7f0a5a08a704e70744be52eedc9d07088c091022002e5d04c54458372e",
     with_network(GENERAL): "40f4e88a375706f1891633b97e0e1128a59710e21f19e11923896d1e0b62afda",
     with_network(BATHROOM): "7196f934d21562bdbef8bbfd12f262309cbbc5711150271c92bcb7ae63bcea3c",
 }

@@ -32,11 +32,11 @@ from hearthlog.analyzer.training.calibration import collection_folds, nested_pro
 from hearthlog.analyzer.training.cross_validation import Fold, cross_validate
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
 from hearthlog.analyzer.training.installed import OTHERS
+from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scenario import load_scenario
 from hearthlog.analyzer.training.scores import Scores, calibration_error, difference, score
-from hearthlog.analyzer.training.svm_method import ROOM
 from hearthlog.analyzer.training.train import MOST_FOLDS
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.description import Description
@@ -56,7 +56,7 @@ _Line = tuple[str, ...]
 _OF_EACH = ("95 %", "of seeds", "error")
 _RIGHT = ("method", "sources", *_OF_EACH, "collections", *_OF_EACH)
 _AGAINST = ("against room", "95 %")
-_TAKES = ("method", "MB", "of which decides", "ms/s", "ms/s live", "s to learn")
+_TAKES = ("method", "MB", "ms/s", "ms/s live", "s to learn")
 
 
 class Tried(NamedTuple):
@@ -84,8 +84,8 @@ class Cost(NamedTuple):
 
     Attributes
     ----------
-    stored_bytes, deciding_bytes : int
-        Of its arrays in the file; without the windows by which it is learned again in a home.
+    stored_bytes : int
+        Of its arrays in the file.
     seconds, live_seconds : float
         Of CPU for a second of sound, many windows at once and one by one.
     fit_seconds : float
@@ -93,7 +93,6 @@ class Cost(NamedTuple):
     """
 
     stored_bytes: int
-    deciding_bytes: int
     seconds: float
     live_seconds: float
     fit_seconds: float
@@ -186,8 +185,7 @@ def cost_of(method: Method, data: Dataset, examples: Examples) -> Cost:
     )
     windows_a_second = 1.0 / FRAME_SECONDS
     of_many, of_one = (seconds[name].cpu / len(rows) * windows_a_second for name in seconds)
-    deciding = {name: array for name, array in arrays.items() if not name.startswith("learned_")}
-    return Cost(stored_bytes(arrays), stored_bytes(deciding), of_many, of_one, fit_seconds)
+    return Cost(stored_bytes(arrays), of_many, of_one, fit_seconds)
 
 
 def stored_bytes(arrays: Mapping[str, NDArray[Any]]) -> int:
@@ -265,7 +263,6 @@ def _against(data: Dataset, room: Tried, other: Tried) -> tuple[str, str]:
 def _takes(cost: Cost) -> _Line:
     return (
         f"{cost.stored_bytes / 1e6:.2f}",
-        f"{cost.deciding_bytes / 1e6:.2f}",
         f"{1000 * cost.seconds:.2f}",
         f"{1000 * cost.live_seconds:.2f}",
         f"{cost.fit_seconds:.1f}",

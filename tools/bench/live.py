@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import CANDIDATE
 from hearthlog.models.starter import GENERAL, starter_file
@@ -62,7 +62,7 @@ class _Usage:
 
 def measure(work: Workload) -> Table:
     """Record sound for a minute, once more with a candidate; hear it without doing anything."""
-    size = SVM_RBF.summary(work.model)
+    size = RBF_LANDMARKS.summary(work.model)
     title = f"live: one microphone for {_SECONDS:.0f} s, {size}"
     try:
         rows = _live(work)

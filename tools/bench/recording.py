@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of_processes
 from hearthlog.tools.bench.workload import Workload
@@ -17,7 +17,7 @@ def measure(work: Workload) -> Table:
     whole = best_of_processes([_record(work, work.wav, i) for i in range(_REPEATS)])
     start = best_of_processes([_record(work, second, i) for i in range(_REPEATS)])
     speed = work.seconds / whole.cpu, work.seconds / whole.elapsed
-    size = SVM_RBF.summary(work.model)
+    size = RBF_LANDMARKS.summary(work.model)
     return Table(
         f"recording: {work.seconds:.0f} s of WAV to a labelled log on one core, {size}",
         [

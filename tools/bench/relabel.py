@@ -16,8 +16,8 @@ from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.schemas.messages.message_types import (
     LABEL,
@@ -85,7 +85,7 @@ def measure(work: Workload) -> Table:
         ),
         Row("peak memory of a process", two.megabytes, "MB", target=Target(500, at_most=True)),
     ]
-    size, classes = SVM_RBF.summary(model), len(model.classes)
+    size, classes = RBF_LANDMARKS.summary(model), len(model.classes)
     title = f"relabel: {two.frames:,} frames, {size}, {classes} classes, CPU time"
     return Table(title, rows)
 

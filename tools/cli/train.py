@@ -353,6 +353,7 @@ def _learned_voices(
 def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.training.adapt import adapt_model
+    from hearthlog.analyzer.training.home_landmarks import is_moved
     from hearthlog.analyzer.training.home_lessons import home_lessons
     from hearthlog.models.modelfile.modelfile import load_model
 
@@ -364,6 +365,11 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
         reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]
         why = "; ".join(reasons) or nothing
         raise DataError(f"the home has no segments of a class of the model ({why})")
+    if not is_moved(model):
+        tell(
+            f"{model.name} is of kind {model.description.kind}: landmarks learn what it says, and "
+            "then from the home"
+        )
     what = f"learning from {len(segments)} segments of the home besides"
     with share_done(what, announce=True):
         adapted = adapt_model(model, segments)

@@ -185,7 +185,7 @@ class _Space(NamedTuple):
 
 
 def _space(model: Model) -> _Space | None:
-    """Return the space of a support vector machine; None for other models."""
+    """Return the space of a classifier with kernels; None for other models."""
     description, arrays = model.description, model.arrays
     gamma = description.parameters.get("gamma")
     if gamma is None or not {"scaler_mean", "scaler_scale"} <= arrays.keys():
