@@ -17,12 +17,12 @@ def keep_models(folder: Path, model_file: Path) -> Path:
     folder.mkdir()
     one = load_model(model_file)
     rng = np.random.default_rng(3)
-    intercepts = one.arrays["intercepts"]
-    moved = intercepts + rng.standard_normal(intercepts.shape)
+    bias = one.arrays["bias"]
+    moved = bias + 3.0 * rng.standard_normal(bias.shape)
     two = replace(
         one,
         description=one.description.model_copy(update={"smoothing": Smoothing(method="merge")}),
-        arrays={**one.arrays, "intercepts": moved},
+        arrays={**one.arrays, "bias": moved},
         transitions=np.empty((0, 0)),
     )
     save_model(one, folder / "one.safetensors")
@@ -44,7 +44,7 @@ def put_by_hand(folder: Path, name: str) -> None:
 def _of_a_second(model: Model) -> Model:
     """Make a model that looks at the same sounds in another way, and smooths what it sees."""
     rng = np.random.default_rng(4)
-    count = len(model.arrays["support_vectors"])
+    count = len(model.arrays["landmarks"])
     width, classes = DEFAULT.inputs["statistics"].width, len(model.classes)
     description = model.description.model_copy(
         update={
@@ -60,7 +60,7 @@ def _of_a_second(model: Model) -> Model:
         **model.arrays,
         "scaler_mean": rng.standard_normal(width),
         "scaler_scale": rng.uniform(10.0, 20.0, width),
-        "support_vectors": rng.normal(0, 15, (count, width)).astype(np.float32),
+        "landmarks": rng.normal(0, 15, (count, width)).astype(np.float32),
     }
     transitions = np.full((classes, classes), 0.02 / classes) + 0.98 * np.eye(classes)
     return replace(model, description=description, arrays=arrays, transitions=transitions)

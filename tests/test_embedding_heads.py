@@ -74,7 +74,7 @@ def windows(count, seed=2):
 
 
 def inputs_of(model, count, seed=3):
-    vectors = model.arrays["support_vectors"]
+    vectors = model.arrays["landmarks"]
     return np.ascontiguousarray(vectors[RNG(seed).permutation(len(vectors))[:count]], np.float32)
 
 

@@ -21,8 +21,8 @@ STARTERS = (*BY_FEATURES, *map(with_network, BY_FEATURES))
 SHA256 = {  # of their files, as `sha256sum` prints it
     GENERAL: "e8d9881ca23c612b1ac56bf9ffa98c5db140215caf77ea71e39f60d2d6e6028c",
     BATHROOM: "d3bb9a7f0a5a08a704e70744be52eedc9d07088c091022002e5d04c54458372e",
-    with_network(GENERAL): "40f4e88a375706f1891633b97e0e1128a59710e21f19e11923896d1e0b62afda",
-    with_network(BATHROOM): "7196f934d21562bdbef8bbfd12f262309cbbc5711150271c92bcb7ae63bcea3c",
+    with_network(GENERAL): "4327d3a56cc170dc1bd54cfd391633a347f51dece33c20045a683eea96014f6a",
+    with_network(BATHROOM): "c0bb6c7efb362ea436b4ff9b97c079b9f0fcf01ddfe0931194c0966468bf79db",
 }
 
 

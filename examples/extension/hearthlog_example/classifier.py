@@ -8,6 +8,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.learned_windows import (
+    LEARNED,
+    learned_shapes,
+    target_problem,
+)
 from hearthlog.models.classifiers.model import Array, Model
 
 Float32 = NDArray[np.float32]
@@ -27,6 +32,8 @@ class NearestMean(ClassifierKind):
         Of the inputs of each class.
     spread : [shape=(width,)], float64
         By which distances are divided.
+    learned_inputs, learned_target : optional
+        Windows that it was learned from, by which a home adapts it.
     """
 
     name = "nearest-mean"
@@ -35,18 +42,23 @@ class NearestMean(ClassifierKind):
         "means": np.dtype(np.float64),
         "spread": np.dtype(np.float64),
     }
+    optional = LEARNED
 
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
         """Return the shapes that arrays must have."""
-        del arrays
-        return {"means": (classes, width), "spread": (width,)}
+        return {
+            "means": (classes, width),
+            "spread": (width,),
+            **learned_shapes(width, arrays),
+        }
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
         """Say what contradicts itself."""
-        del classes
-        return None if (arrays["spread"] > 1e-9).all() else "spread has values that are too small"
+        if not (arrays["spread"] > 1e-9).all():
+            return "spread has values that are too small"
+        return target_problem(classes, arrays, "learned_target")
 
     def machine(self, model: Model) -> "NearestMeanMachine":
         """Make what decides."""

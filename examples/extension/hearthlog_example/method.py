@@ -26,16 +26,21 @@ class MeansMethod(Method):
             [np.average(inputs[target == c], axis=0, weights=weight[target == c]) for c in classes]
         )
         spread = (inputs - means[np.searchsorted(classes, target)]).std(axis=0)
-        return LearnedMeans(classes, means, np.maximum(spread, _LEAST_SPREAD))
+        kept = {"learned_inputs": inputs, "learned_target": target.astype(np.int64)}
+        return LearnedMeans(classes, means, np.maximum(spread, _LEAST_SPREAD), kept)
 
 
 class LearnedMeans:
     """What was learned."""
 
     def __init__(
-        self, classes: Indices, means: NDArray[np.float64], spread: NDArray[np.float64]
+        self,
+        classes: Indices,
+        means: NDArray[np.float64],
+        spread: NDArray[np.float64],
+        kept: dict[str, NDArray[Any]],
     ) -> None:
-        self._classes, self._means, self._spread = classes, means, spread
+        self._classes, self._means, self._spread, self._kept = classes, means, spread, kept
 
     def decide(self, inputs: NDArray[np.float32], classes: int) -> NDArray[np.float64]:
         """Decide as the classifier does."""
@@ -46,7 +51,7 @@ class LearnedMeans:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of `NearestMean`."""
-        return {"means": self._means, "spread": self._spread}
+        return {"means": self._means, "spread": self._spread, **self._kept}
 
     def parameters(self) -> dict[str, Any]:
         """Return nothing."""
