@@ -394,7 +394,7 @@ def test_a_layer_of_another_model_of_that_name_is_kept(model, logs, tmp_path, ca
     loaded = load_model(model)
     (tmp_path / "other").mkdir()
     other = tmp_path / "other" / model.name
-    save_model(with_arrays(loaded, intercepts=loaded.arrays["intercepts"] + 1), other)
+    save_model(with_arrays(loaded, bias=-loaded.arrays["bias"]), other)
     done = run(capfd, "relabel", logs, "--model", other, "--workers", 1)
     assert done.returncode == 1
     assert "was made by another model of this name" in done.stderr

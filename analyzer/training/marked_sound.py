@@ -256,12 +256,19 @@ def with_embeddings(
 
 
 def _coarse(values: Float32, features: FeatureSet) -> Bool:
-    """Tell which frames have the very values of one beside them, though there is sound."""
+    """Return which frames have the very values of one beside them though there is sound, or border.
+
+    One that borders may be the only one there of its second, and share its values with others that
+    lie farther away in it.
+    """
     coarse = np.zeros(len(values), bool)
     if values.shape[1]:
         same = (values[1:] == values[:-1]).all(axis=1) & (features.power(values[1:]) > 0)
         coarse[1:] |= same
         coarse[:-1] |= same
+        inner = coarse.copy()
+        coarse[1:] |= inner[:-1]
+        coarse[:-1] |= inner[1:]
     return coarse
 
 

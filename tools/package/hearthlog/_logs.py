@@ -253,7 +253,7 @@ class Logs:
         --------
         >>> spans = hearthlog.open_logs("logs").segments()
         >>> spans.labels[0], float(spans.ends[0] - spans.starts[0]) / 1e9
-        ('silence', 3.65)
+        ('silence', 3.7)
         """
         microphone = self._labellings.microphone(microphone)
         name = self._labellings.find(microphone, labelling)
