@@ -190,6 +190,15 @@ def test_an_adapted_machine_whose_vectors_are_numbered_wrongly_is_refused(twice,
         save_model(with_arrays(adapted, support_base=numbers), tmp_path / "x.safetensors")
 
 
+def test_landmarks_are_as_unsure_as_the_machine_that_they_learn_from():
+    base, few, _ = world_of(SVM)
+    update = {"inverse_temperature": 0.01}
+    unsure = dataclasses.replace(base, description=base.description.model_copy(update=update))
+    inputs = of_segments(Classifier(base).inputs, few.windows, few.floor)
+    said = segment_probabilities(Classifier(learned_over(unsure)), inputs)
+    np.testing.assert_allclose(said, 1 / len(base.classes), atol=0.05)
+
+
 @pytest.mark.parametrize("method", [BANDS, SVM])
 def test_landmarks_say_what_a_machine_says(method):
     base, over = world_of(method)[0], learned_over(world_of(method)[0])

@@ -67,8 +67,7 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
     """
     if not isinstance(method, LandmarkMethod):
         raise DataError(
-            f"method {method.name} learns no landmarks, and a home would have them instead: its "
-            "curve is that of room"
+            f"method {method.name} learns no landmarks, which are what a home moves: choose room"
         )
     names = data.collection_names
     homes = {number: _segments_of_home(data, number) for number in range(len(names))}

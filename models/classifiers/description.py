@@ -274,7 +274,7 @@ class Description(_Record):
     feature_set_sha256 : str
         SHA-256 of the network whose values the features are; empty for other feature sets.
     method : str
-        Method by which it was learned, and is adapted.
+        Method by which it was learned.
     label_frame : int
         Frame of a window, from 0 on, which the label of the window speaks of.
     gate : float

@@ -1,4 +1,4 @@
-"""The windows that a model was learned from, which it keeps to be learned again in a home."""
+"""The windows that a model was learned from, which it keeps to be learned over for a home."""
 
 from collections.abc import Mapping
 from typing import Any

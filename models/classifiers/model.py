@@ -28,7 +28,7 @@ class Model:
     training_digests : np.ndarray [shape=(k,)], int64
         Digests of the segments that it was learned from.
     training_windows : np.ndarray [shape=(m, window_frames, d)], float32
-        Features that it was learned from, where its method needs them to adapt it; else empty.
+        Features that it was learned from, of some models of earlier versions; else empty.
     training_floor : np.ndarray [shape=(m, b)], float64
         Floor of the room in each training window; empty for a feature set without bands.
     training_target, training_group : np.ndarray [shape=(m,)], int64
