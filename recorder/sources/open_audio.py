@@ -64,6 +64,7 @@ _MP3_BIT_RATES = (  # in kbit/s: of MPEG 2 and 2.5, and of MPEG 1
 )
 _OGG_PAGE = 65_307  # bytes, at most
 _OGG_END = 4  # flag of the last page
+_INT16_STEP = np.float32(1 / 32768)  # full scale is 1
 _MOST_SAMPLES = 1 << 25  # of all channels in a block
 _MOST_CHUNKS = 10_000
 _MOST_FAILED_SYNCS = 10_000
@@ -346,6 +347,13 @@ def _read(
     path: Path, sound: soundfile.SoundFile, count: int, complaints: list[bytes]
 ) -> tuple[Float32, bool]:
     """Read so many samples, or fewer; return whether libsndfile cannot go on."""
+    if sound.format == "WAV" and sound.subtype == "PCM_16" and sound.seekable():
+        place = sound.tell()
+        try:  # libsndfile takes four times as long to convert them, to the same bits
+            samples = sound.read(count, "int16", always_2d=True)
+            return np.multiply(samples, _INT16_STEP, dtype=np.float32), False
+        except soundfile.LibsndfileError:
+            _sought(sound, place)
     block = np.full((count, sound.channels), np.nan, np.float32)
     try:
         with _without_mpg123(path, complaints):
