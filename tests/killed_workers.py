@@ -2,13 +2,14 @@
 
     python tests/killed_workers.py LOGS MODEL HOMES DAYS SECONDS
 
-LOGS is a folder of small logs, of which all homes have copies. Every SECONDS one of the processes
-is killed. Says whether the layers are those that one process makes of such a home.
+LOGS is a folder with the logs of a day, which all homes have again every day. Every SECONDS one of
+the processes is killed. Says whether the layers are those that one process makes of such a home.
 """
 
 import hashlib
 import os
 import random
+import shutil
 import subprocess
 import sys
 import threading
@@ -21,10 +22,11 @@ from typing import NamedTuple
 
 import psutil
 from clusters import scheduler_in, worker_of
-from simulated_fleet import write_fleet
 
-from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.files import is_layer
+from hearthlog.tools.home.copies import copy_logs
 
+_DAY = 86_400  # seconds
 _COMMAND = [sys.executable, "-m", "hearthlog.tools.cli.main", "relabel"]
 
 
@@ -117,15 +119,17 @@ def _main(logs: str, model: str, homes: str, days: str, seconds: str) -> None:
     os.environ["SOURCE_DATE_EPOCH"] = "1772348400"
     with TemporaryDirectory() as text:
         folder = Path(text)
-        small = [path for path in find_logs(Path(logs)) if not is_layer(path)]
-        fleet = write_fleet(small, folder / "fleet", int(homes), int(days))
-        home = write_fleet(small, folder / "alone", 1, int(days))
+        home = folder / "alone" / "home-000"
+        copy_logs(Path(logs), home, int(days), _DAY)
+        fleet = folder / "fleet"
+        for number in range(int(homes)):  # links, which take no room
+            shutil.copytree(home, fleet / f"home-{number:03}", copy_function=os.link)
         subprocess.run([*_COMMAND, str(home), "--model", model, "--workers", "1"], check=True)
         began = time.monotonic()
         run = relabel_under_fire(fleet, Path(model), folder, every(float(seconds)))
         elapsed = time.monotonic() - began
         print(f"{run.said}status {run.status}, {run.kills} kills, {elapsed:.0f} s")  # noqa: T201
-        (alone,) = map(layers, home.iterdir())
+        alone = layers(home)
         equal = sum(layers(one) == alone for one in fleet.iterdir())
         print(  # noqa: T201
             f"{equal} of {homes} homes have the {len(alone)} layers, of {days} logs, that one "
