@@ -13,7 +13,7 @@ from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.timing import BenchError
 
 DEVICE, SECOND_DEVICE = "labmic", "second"
-_SOURCE = Path(__file__).parents[2] / "tests" / "labmic" / "labmic.c"
+_SOURCE = Path(__file__).resolve().parents[2] / "tests" / "labmic" / "labmic.c"
 _ALSA_CONFIGURATION = Path("/usr/share/alsa/alsa.conf")
 
 

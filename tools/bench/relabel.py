@@ -1,6 +1,5 @@
 """A day relabelled: read, classified, smoothed and written; ours, and with the libraries alone."""
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -14,11 +13,9 @@ from rosbags.highlevel import AnyReader
 
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.hidden_markov import viterbi
-from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.schemas.messages.message_types import (
     LABEL,
     definition,
@@ -27,13 +24,11 @@ from hearthlog.schemas.messages.message_types import (
     message,
     nanoseconds,
 )
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.bench.inference import fit_scikit_learn, inputs_above_floor
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import HEARTHLOG, BenchError, Seconds
 from hearthlog.tools.bench.workload import Workload
 
-_SUPPORT = 2000
 _CALL = 1000  # rows
 _WORKERS = 2
 _RUN = """
@@ -55,13 +50,10 @@ class _Run(NamedTuple):
 
 def measure(work: Workload) -> Table:
     """Measure relabelling a day of hourly logs; one of them beside the libraries alone."""
-    data = _part(work)
-    model = train_model(data, work.training[1], ignore_progress)
-    path = work.folder / "day.safetensors"
-    save_model(model, path)
+    model, path = work.model, work.model_file
     one, two = (_ours(work.day, path, workers) for workers in (1, _WORKERS))
     hour = _ours(work.live.finished.parents[3], path, 1)
-    peer = _peer(work.live.finished, model, data, work.folder / "peer.mcap")
+    peer = _peer(work.live.finished, model, work.training[0], work.folder / "peer.mcap")
     ratio = one.seconds.elapsed / two.seconds.elapsed
     rows = [
         Row(
@@ -88,19 +80,6 @@ def measure(work: Workload) -> Table:
     size, classes = RBF_LANDMARKS.summary(model), len(model.classes)
     title = f"relabel: {two.frames:,} frames, {size}, {classes} classes, CPU time"
     return Table(title, rows)
-
-
-def _part(work: Workload) -> Dataset:
-    """Take so much of the training data that about 2,000 vectors support what it teaches."""
-    data, _ = work.training
-    # The fewer segments, the larger the share of them at the borders between classes.
-    share = min(_SUPPORT / len(work.model.arrays["support_vectors"]), 1.0) ** 1.2
-    rows = np.random.default_rng(0).permutation(len(data))[: round(share * len(data))]
-    rows.sort()
-    fields = ("windows", "target", "group", "collection", "weight", "floor")
-    chosen = {name: getattr(data, name)[rows] for name in fields}
-    copies = {name: getattr(data, name)[:, rows] for name in ("copies", "copy_floor")}
-    return dataclasses.replace(data, **chosen, **copies)
 
 
 def _ours(logs: Path, model: Path, workers: int) -> _Run:
