@@ -7,7 +7,7 @@ from threading import Event as Flag
 from typing import NamedTuple
 
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.events import Event, Frames
+from hearthlog.recorder.events import Event, Frames, SoundSource
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.salvage.recover import recover_log
@@ -68,12 +68,30 @@ def record_as_live(folder: Path, sound: Path, model: Path) -> LiveLogs:
     """
     places = [folder / name for name in LiveLogs._fields]
     source = _Blocks(FileSource([sound], _MIDNIGHT), places[2], places[0])
-    settings = Settings(output=places[2], model=model, timezone="UTC")
-    finished, *later = record(settings, source, Flag()).logs
-    for log in later:  # the end of the last segment, if that is that of the hour
-        log.unlink()
+    finished = _recorded(source, places[2], model)
     (unfinished,) = places[0].iterdir()
     completed = places[1] / finished.relative_to(places[2])
     completed.parent.mkdir(parents=True)
     recover_log(unfinished, completed, completed.name)
     return LiveLogs(unfinished, completed, finished)
+
+
+def record_file(folder: Path, sound: Path, model: Path) -> Path:
+    """Record a file of up to an hour, and return its finished log.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the logs.
+    sound, model : Path
+        Files.
+    """
+    return _recorded(FileSource([sound], _MIDNIGHT), folder, model)
+
+
+def _recorded(source: SoundSource, folder: Path, model: Path) -> Path:
+    settings = Settings(output=folder, model=model, timezone="UTC")
+    finished, *later = record(settings, source, Flag()).logs
+    for log in later:  # the end of the last segment, if that is that of the hour
+        log.unlink()
+    return finished

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
@@ -16,12 +15,11 @@ from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import save_model
-from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.arrays import Float32, Int16
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.bench.live_logs import LiveLogs, record_as_live
-from hearthlog.tools.bench.timing import BenchError
+from hearthlog.tools.bench.hours import DENSE, lay_out, read_recordings
+from hearthlog.tools.bench.live_logs import LiveLogs, record_as_live, record_file
 from hearthlog.tools.home.copies import copy_logs
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS
@@ -29,7 +27,7 @@ from hearthlog.tools.home.sounds import LABELS
 _MOST_SECONDS = 3600
 _DAY = 86_400
 _SEED = 1
-# Simulated sounds hardly overlap, and would need a third of the support vectors that real ones do.
+# Simulated sounds hardly overlap, and would teach a machine of a third of the support vectors.
 _OVERLAP = 0.75  # standard deviations
 
 
@@ -43,7 +41,7 @@ class Workload:
         An empty one, for files on the way.
     audio : Path or None
         Folder of recordings to use instead of the simulated home; with a `manifest.csv` in it the
-        model is trained from them too.
+        models are trained from them too.
     minutes : float
         Length of the simulated day.
     clips_per_class : int
@@ -56,8 +54,8 @@ class Workload:
     clips_per_class: int = 40
 
     @cached_property
-    def samples(self) -> NDArray[np.int16]:
-        """Up to an hour of sound at 16 kHz, mono, in whole frames.
+    def samples(self) -> Int16:
+        """Up to an hour of sound at 16 kHz, mono, in whole frames: recordings are back to back.
 
         Raises
         ------
@@ -71,7 +69,7 @@ class Workload:
             write_day(day, self.minutes, _SEED + 1, manifest=None)
             samples, _ = soundfile.read(day, dtype="int16")
         else:
-            samples = _recordings(self.audio)
+            samples = np.concatenate(self._recordings)
         return samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES]
 
     @property
@@ -92,9 +90,25 @@ class Workload:
     def write_wav(self, name: str, seconds: float) -> Path:
         """Write the first seconds of the sound to a file of this name."""
         path = self.folder / name
-        samples = self.samples[: round(seconds * SAMPLE_RATE)]
-        soundfile.write(path, samples, SAMPLE_RATE, "PCM_16", format="WAV")
+        return _written(path, self.samples[: round(seconds * SAMPLE_RATE)])
+
+    def wav_of(self, kind: str) -> Path:
+        """Return as much sound of one of `KINDS`: of the recordings, or of the simulated clips."""
+        if kind == DENSE and self.audio is not None:
+            return self.wav
+        path = self.folder / f"{kind}.wav"
+        if not path.exists():
+            _written(path, lay_out(self._recordings, kind, len(self.samples)))
         return path
+
+    @cached_property
+    def _recordings(self) -> list[Int16]:
+        return read_recordings(self.audio or self._clips.parent, _MOST_SECONDS)
+
+    @cached_property
+    def _clips(self) -> Path:
+        """Simulated clips, by their manifest."""
+        return write_training_set(self.folder / "clips", self.clips_per_class, _SEED)
 
     @cached_property
     def training(self) -> tuple[Dataset, Scenario]:
@@ -105,17 +119,23 @@ class Workload:
         DataError
             If the manifest of the recordings is not one of a home.
         """
-        if self.audio is not None and (self.audio / "manifest.csv").exists():
-            scenario = BUILTIN["general"]
-            clips = read_manifest(self.audio / "manifest.csv", scenario.labels)
-            return build_dataset(clips, scenario, ignore_progress), scenario
-        manifest = write_training_set(self.folder / "clips", self.clips_per_class, _SEED)
+        if self.are_labelled:
+            return self.labelled(BUILTIN["general"]), BUILTIN["general"]
         scenario = Scenario("simulated", {label: (label,) for label in LABELS})
-        clips = read_manifest(manifest, scenario.labels)
-        data = build_dataset(clips, scenario, ignore_progress)
+        data = _segments(self._clips, scenario)
         noise = np.random.default_rng(_SEED).standard_normal((len(data), 1, data.windows.shape[2]))
         blurred = data.windows + _OVERLAP * noise * data.windows.std(axis=(0, 1))
         return dataclasses.replace(data, windows=blurred.astype(np.float32)), scenario
+
+    @property
+    def are_labelled(self) -> bool:
+        """Whether there are recordings with a manifest."""
+        return self.audio is not None and (self.audio / "manifest.csv").exists()
+
+    def labelled(self, scenario: Scenario) -> Dataset:
+        """Return segments of recordings with a manifest."""
+        assert self.audio is not None
+        return _segments(self.audio / "manifest.csv", scenario)
 
     @cached_property
     def model(self) -> Model:
@@ -137,31 +157,34 @@ class Workload:
     @cached_property
     def day(self) -> Path:
         """A folder of a day of finished logs: the sound as often as it takes."""
-        return self._copies("finished")
+        return self._copies(self.live.finished, "finished")
 
     @cached_property
     def completed_day(self) -> Path:
         """The same of logs with chunks of half a second."""
-        return self._copies("completed")
+        return self._copies(self.live.completed, "completed")
 
-    def _copies(self, state: str) -> Path:
-        """Copy the logs of a folder of `live` until they are a day."""
-        logs, day = self.live.finished.parents[4] / state, self.folder / f"day-{state}"
-        period = math.ceil(self.seconds)
-        copy_logs(logs, day, max(round(_DAY / period), 1), period)
+    def day_of(self, kind: str) -> Path:
+        """Return such a folder of sound of one of `KINDS`."""
+        wav = self.wav_of(kind)
+        if wav == self.wav:
+            return self.day
+        if not (day := self.folder / f"day-{kind}").exists():
+            self._copies(record_file(self.folder / f"logs-{kind}", wav, self.model_file), kind)
+        return day
+
+    def _copies(self, log: Path, name: str) -> Path:
+        """Copy a log until there is a day of it."""
+        day, period = self.folder / f"day-{name}", math.ceil(self.seconds)
+        copy_logs(log.parents[3], day, max(round(_DAY / period), 1), period)
         return day
 
 
-def _recordings(folder: Path) -> NDArray[np.int16]:
-    blocks: list[NDArray[np.int16]] = []
-    missing = _MOST_SECONDS * SAMPLE_RATE
-    for path in sorted(p for p in folder.rglob("*") if p.suffix in {".flac", ".wav"}):
-        for block in read_audio(path):
-            scaled = np.clip(np.rint(block * 32768), -32768, 32767).astype(np.int16)
-            blocks.append(scaled[:missing])
-            missing -= len(blocks[-1])
-        if missing == 0:
-            break
-    if sum(map(len, blocks)) < SAMPLE_RATE:
-        raise BenchError(f"{folder}: holds no second of sound in files *.flac or *.wav")
-    return np.concatenate(blocks)
+def _written(path: Path, samples: Int16) -> Path:
+    soundfile.write(path, samples, SAMPLE_RATE, "PCM_16", format="WAV")
+    return path
+
+
+def _segments(manifest: Path, scenario: Scenario) -> Dataset:
+    clips = read_manifest(manifest, scenario.labels)
+    return build_dataset(clips, scenario, ignore_progress)
