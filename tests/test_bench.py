@@ -26,12 +26,15 @@ from hearthlog.tools.bench import (
     check,
     features,
     history,
+    inference,
     queue,
     reading,
+    relabel,
     timing,
     workload,
     writing,
 )
+from hearthlog.tools.bench.hours import KINDS
 from hearthlog.tools.bench.labmic import make_microphone
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.workload import Workload
@@ -63,6 +66,7 @@ def work(tmp_path_factory):
         small = Workload(tmp_path_factory.mktemp("work"), minutes=0.5, clips_per_class=3)
         assert small.day
         assert small.completed_day
+        assert all(map(small.day_of, KINDS))
     return small
 
 
@@ -182,6 +186,22 @@ def test_the_readers_agree_and_each_gets_a_time_and_a_ratio(work):
     assert all(math.isfinite(row.value) and row.value >= 0 for row in rows)
     assert sum(row.ratio is not None for row in rows) == 6
     assert all(row.elapsed > 0 for row in rows if row.unit in {"s", "ms"})
+
+
+def test_days_of_each_kind_of_sound_and_hours_are_relabelled(work):
+    table = relabel.measure(work)
+    assert table.title.startswith("relabel: days of 2,3")
+    assert all(math.isfinite(row.value) and row.value > 0 for row in table.rows)
+    assert [row.what.split(",")[0] for row in table.rows[:3]] == list(KINDS)
+
+
+def test_models_that_homes_have_are_measured_on_the_same_features(work):
+    rows = {row.what: row for row in inference.measure(work).rows}
+    names = "simulated", "adapted", "starter"
+    adapted, starter = (rows[f"{name}: 600 frames labelled"].note for name in names[1:])
+    assert int(adapted.split()[0]) > int(rows["simulated: 600 frames labelled"].note.split()[0])
+    assert starter.endswith("landmarks, 8 classes")
+    assert all(0 < rows[f"{name}: its file"].value < 1000 for name in names)
 
 
 def test_logs_are_measured_in_the_states_in_which_the_live_recorder_leaves_them(work):
