@@ -14,7 +14,8 @@ _FAST = Target(1_800)
 
 def measure(work: Workload) -> Table:
     """Measure `hearthlog record FILE` on one core: the sound of all, and sound of each kind."""
-    rows = [_speed(work, work.wav, "hearthlog record", _FAST)]
+    note = "the simulated home" if work.audio is None else DENSE
+    rows = [_speed(work, work.wav, "hearthlog record", _FAST, note)]
     for kind in KINDS:
         if (wav := work.wav_of(kind)) != work.wav:
             target = _FAST if kind == DENSE else None
@@ -27,10 +28,10 @@ def measure(work: Workload) -> Table:
     return Table(title, rows)
 
 
-def _speed(work: Workload, wav: Path, what: str, target: Target | None) -> Row:
+def _speed(work: Workload, wav: Path, what: str, target: Target | None, note: str = "") -> Row:
     best = _best(work, wav)
     cpu, elapsed = work.seconds / best.cpu, work.seconds / best.elapsed
-    return Row(what, cpu, "x real time", target=target, elapsed=elapsed)
+    return Row(what, cpu, "x real time", target=target, note=note, elapsed=elapsed)
 
 
 def _best(work: Workload, wav: Path) -> Seconds:
