@@ -3,14 +3,29 @@
 import ctypes
 import gc
 from contextlib import suppress
+from functools import cache
 
-_ARENA_MAX = -8  # of malloc.h
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of malloc.h
+_MMAP_BYTES = 32 << 20  # up to which glibc raises it by itself, if nobody sets either
 
 
 def keep_one_heap() -> None:
     """Let all threads use one heap, where the C library can: others are never given back."""
     with suppress(OSError, AttributeError):  # not every C library has it
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
+
+
+@cache
+def keep_freed_blocks() -> None:
+    """Let freed arrays be used again, as where nobody has told the C library otherwise.
+
+    Nannies of Dask set MALLOC_TRIM_THRESHOLD_, for which glibc gives every array back to the
+    system: half of the time of relabelling went into having them again.
+    """
+    with suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_MMAP_THRESHOLD, _MMAP_BYTES)
+        mallopt(_TRIM_THRESHOLD, 2 * _MMAP_BYTES)
 
 
 def give_back() -> None:
