@@ -180,9 +180,6 @@ class RecordingSession:
             self._log.write([])  # unless the disk takes it now
         for accepted in stream.accepted(event, log_is_full=self._log.is_full):
             self._record(stream, accepted)
-        if isinstance(event, Frames):
-            for report in stream.pipeline.last_reports:
-                self._journal.add(microphone, report)
         if isinstance(event, SourceHealth):
             self._journal.add(microphone, stream.pipeline.judged(event))
             self._look_at_the_machine(stream, event.stamp)
@@ -198,11 +195,9 @@ class RecordingSession:
             pipeline = self._streams[microphone].pipeline
             state.sound[microphone] = pipeline.last_frames or event
             state.labels[microphone] = pipeline.last_labels
-        reports = event.reports if isinstance(event, Frames) else [event]
-        for report in reports:
-            if isinstance(report, SourceHealth):
-                is_heard = report.level == OK and report.summary in {LISTENING, READING}
-                state.trouble[microphone] = "" if is_heard else report.summary
+        elif isinstance(event, SourceHealth):
+            is_heard = event.level == OK and event.summary in {LISTENING, READING}
+            state.trouble[microphone] = "" if is_heard else event.summary
         state.clip_frames = self._clips.kept_frames
         state.keeps = self._settings.keep_audio != "off"
 

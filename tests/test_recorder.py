@@ -4,7 +4,6 @@ import itertools
 import signal
 import subprocess
 import time
-from dataclasses import replace
 from datetime import UTC, datetime
 from threading import Event
 
@@ -24,7 +23,7 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.message_types import DIAGNOSTICS, LABEL, decode, nanoseconds
+from hearthlog.schemas.messages.message_types import LABEL, decode, nanoseconds
 
 pytestmark = pytest.mark.fast
 
@@ -163,41 +162,6 @@ def test_diagnostics_come_at_least_every_ten_seconds(day, recorded):
     stamps = [nanoseconds(m.header.stamp) for m in read(recorded(day), "diagnostics")]
     assert len(stamps) == 18
     assert np.diff(stamps).max() <= 10_000_000_000
-
-
-@pytest.mark.parametrize("private", [(), ("speech",)])
-def test_the_health_within_long_blocks_is_that_between_short_ones(tmp_path, model_file, private):
-    sound = 0.05 * noise(75)
-    sound[31 * 16_000 : 33 * 16_000] = 1.0  # clips
-    sound[38 * 16_000 : 52 * 16_000] = 0.25  # stuck, and moving again when the block ends
-    soundfile.write(tmp_path / "noise.wav", sound, 16_000)
-    events = list(FileSource([tmp_path / "noise.wav"], START).events(Event()))
-    assert [len(e.stamps) for e in events if isinstance(e, Frames)] == [1200, 300]
-
-    def messages(events):
-        pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)), 20, private=private)
-        pushed = [m for event in events for m in pipeline.push(event)] + pipeline.finish()
-        assert [m.log_time for m in pushed] == sorted(m.log_time for m in pushed)
-        return sorted(pushed, key=lambda m: (m.log_time, m.topic))
-
-    long = messages(events)
-    assert long == messages(in_short_blocks(events))
-    levels = [
-        message.status[0].level
-        for message in (decode(m.data, DIAGNOSTICS) for m in long if m.topic == "/diagnostics")
-    ]
-    assert levels == [0, 0, 0, 0, 1, 1, 1, 1]
-
-
-def in_short_blocks(events):
-    for event in events:
-        if not isinstance(event, Frames):
-            yield event
-            continue
-        for start in range(0, len(event.stamps), 200):
-            part = event.part(start, start + 200)
-            yield from part.reports
-            yield replace(part, reports=())
 
 
 def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model_file, recorded):

@@ -3,7 +3,6 @@
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -26,7 +25,6 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
-_BLOCK_FRAMES = 6 * _HEALTH_FRAMES  # what every block costs is a third of what frames cost in 10 s
 _NAMED = 10  # of the files that are damaged
 _NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
 
@@ -122,7 +120,7 @@ class FileSource:
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield the frames, the gaps between files, and the health of the source.
 
-        The health comes every ten seconds of sound, within blocks of frames as their `reports`.
+        The health comes every ten seconds of sound.
 
         Parameters
         ----------
@@ -151,19 +149,19 @@ class FileSource:
                 next_frame, end = next_frame + lost, until
                 continue
             stamps = end + np.arange(len(item)) * FRAME_NANOSECONDS
+            frames = frames_of(next_frame, item, stamps)
             if self.realtime:
                 due = began + (self.frames + len(item)) * FRAME_NANOSECONDS / NANOSECONDS
                 stop.wait(max(due - time.monotonic(), 0.0))
             if stop.is_set():
                 return
-            reports: list[SourceHealth] = []
             if self.frames >= report:
-                yield from self._health(int(stamps[0]))
+                for problem in self._changes or [self._problem]:
+                    health = (WARNING, problem) if problem else (OK, READING)
+                    yield SourceHealth(int(stamps[0]), *health, {"device": self.device})
+                self._changes = []
                 report = self.frames + _HEALTH_FRAMES
-            while report < self.frames + len(item):
-                reports += self._health(int(stamps[report - self.frames]))
-                report += _HEALTH_FRAMES
-            yield replace(frames_of(next_frame, item, stamps), reports=tuple(reports))
+            yield frames
             next_frame += len(item)
             end += len(item) * FRAME_NANOSECONDS
             self.frames += len(item)
@@ -173,27 +171,20 @@ class FileSource:
             what = _NO_NUMBERS if self._hole_seconds else "shorter than one frame of 50 ms"
             raise SourceError("; ".join(self._faults) or f"{files}: {what}")
 
-    def _health(self, stamp: int) -> list[SourceHealth]:
-        """Return the health at a time, and what else it was since the last report."""
-        problems, self._changes = self._changes or [self._problem], []
-        values = {"device": self.device}
-        return [
-            SourceHealth(stamp, *((WARNING, problem) if problem else (OK, READING)), values)
-            for problem in problems
-        ]
-
     def _frames(self) -> Iterator["Float32 | _Pause"]:
-        """Yield blocks of frames."""
-        size = (_REALTIME_FRAMES if self.realtime else _BLOCK_FRAMES) * FRAME_SAMPLES
+        """Yield blocks of frames whose number divides the interval of the health reports."""
+        size = (_REALTIME_FRAMES if self.realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
         shape = () if self._channels is None else (self._channels,)
-        held = _HeldSamples(shape)
+        held = np.empty((0, *shape), np.float32)
         samples, begin, before = 0, self._start, ""  # since the last gap
         for path, moment in zip(self._paths, self._times, strict=True):
             end = begin + samples * NANOSECONDS // SAMPLE_RATE
             if before and moment is not None and self._is_later(path, moment, end):
-                yield from held.rest()
+                rest = len(held) - len(held) % FRAME_SAMPLES
+                if rest:
+                    yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
                 yield _Pause(moment.start, f"between the files {before} and {_text(path)}")
-                held, samples, begin = _HeldSamples(shape), 0, moment.start
+                held, samples, begin = held[:0], 0, moment.start
             before = _text(path)
             self._problem = ""
             blocks = read_audio(
@@ -205,9 +196,14 @@ class FileSource:
             )
             for block in blocks:
                 samples += len(block)
-                held.add(block)
-                yield from held.blocks(size)
-        yield from held.rest()
+                held = np.concatenate([held, block]) if len(held) else block
+                whole = len(held) - len(held) % size
+                for start in range(0, whole, size):
+                    yield held[start : start + size].reshape(-1, FRAME_SAMPLES, *shape)
+                held = held[whole:]
+        rest = len(held) - len(held) % FRAME_SAMPLES
+        if rest:
+            yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
 
     def _choose(self, path: Path, sentence: str) -> None:
         """Note which channels of a file are heard, if it is not all of them."""
@@ -223,34 +219,6 @@ class FileSource:
         if late <= -step:
             self._overlaps.append((-late / NANOSECONDS, path))
         return late >= step
-
-
-class _HeldSamples:
-    """Samples that are no block yet."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self._shape = shape  # of a sample
-        self._pieces: list[Float32] = []
-        self._count = 0
-
-    def add(self, samples: Float32) -> None:
-        self._pieces.append(samples)
-        self._count += len(samples)
-
-    def blocks(self, size: int) -> Iterator[Float32]:
-        """Take blocks of so many samples, as frames."""
-        while self._count >= size:
-            yield self._take(size)
-
-    def rest(self) -> Iterator[Float32]:
-        """Take all whole frames, as one block if there are any."""
-        if whole := self._count - self._count % FRAME_SAMPLES:
-            yield self._take(whole)
-
-    def _take(self, size: int) -> Float32:
-        samples = np.concatenate(self._pieces) if len(self._pieces) > 1 else self._pieces[0]
-        self._pieces, self._count = [samples[size:]], self._count - size
-        return samples[:size].reshape(-1, FRAME_SAMPLES, *self._shape)
 
 
 class _Pause(NamedTuple):

@@ -50,7 +50,8 @@ class _Blocks:
                 yield event
                 continue
             for start in range(0, len(event.stamps), _BLOCK):
-                yield event.part(start, start + _BLOCK)
+                part = slice(start, start + _BLOCK)
+                yield Frames(event.first + start, event.samples[part], event.stamps[part])
         (active,) = self._logs.rglob("*.active")
         self._copy.mkdir(parents=True)
         shutil.copy(active, self._copy)
