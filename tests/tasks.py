@@ -1,10 +1,13 @@
 """Tasks for workers: functions that another process can import."""
 
 import os
+import resource
 import signal
 import threading
 import time
 from pathlib import Path
+
+import numpy as np
 
 from hearthlog.schemas.errors import LogError
 
@@ -23,6 +26,14 @@ def own_id(*_):
 def add(first, second):
     print("a task may print")  # noqa: T201  that is what is tried
     return first + second
+
+
+def page_faults():
+    """Count the pages of the system that a hundred arrays of a megabyte take, one after another."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(100):
+        np.zeros(1 << 17).fill(1.0)  # 256 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
 def fail(path):

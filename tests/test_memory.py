@@ -1,6 +1,5 @@
-"""What the recorder took for a while, it gives back; what workers free, they use again."""
+"""What the recorder took for a while, it gives back."""
 
-import os
 import subprocess
 import sys
 
@@ -36,29 +35,3 @@ assert anonymous() - before < held - PIECES * BYTES * 0.8, anonymous() - before
 
 def test_what_many_small_pieces_took_goes_back_to_the_system():
     subprocess.run([sys.executable, "-c", SCRIPT], check=True, timeout=60)
-
-
-FAULTS = """
-import resource
-
-import numpy as np
-
-from hearthlog.recorder.memory import keep_freed_blocks
-
-
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(100):
-        np.zeros(1 << 17).fill(1.0)  # 256 pages
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-
-assert faults() > 20_000, "glibc keeps freed arrays by itself here"
-keep_freed_blocks()
-assert faults() < 2_000
-"""
-
-
-def test_freed_arrays_are_used_again_in_a_worker_of_dask():
-    env = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}  # as its nanny sets it
-    subprocess.run([sys.executable, "-c", FAULTS], check=True, timeout=60, env=env)

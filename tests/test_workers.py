@@ -74,6 +74,12 @@ def test_what_cannot_travel_is_an_error_of_its_task_alone():
         assert workers.submit(tasks.add, 1, 1).result(LONG) == 2
 
 
+def test_a_worker_of_dask_uses_the_memory_of_freed_arrays_again(cluster):
+    with open_workers(1, cluster) as workers:
+        assert workers.submit(os.getenv, "MALLOC_TRIM_THRESHOLD_").result(LONG)  # forbids it
+        assert workers.submit(tasks.page_faults).result(LONG) < 2_000
+
+
 def test_without_processes_a_task_is_done_when_it_was_submitted():
     with open_workers() as workers:
         future = workers.submit(tasks.own_id)
