@@ -195,8 +195,8 @@ def test_landmarks_are_as_unsure_as_the_machine_that_they_learn_from():
     update = {"inverse_temperature": 0.01}
     unsure = dataclasses.replace(base, description=base.description.model_copy(update=update))
     inputs = of_segments(Classifier(base).inputs, few.windows, few.floor)
-    said = segment_probabilities(Classifier(learned_over(unsure)), inputs)
-    np.testing.assert_allclose(said, 1 / len(base.classes), atol=0.05)
+    probabilities = segment_probabilities(Classifier(learned_over(unsure)), inputs)
+    np.testing.assert_allclose(probabilities, 1 / len(base.classes), atol=0.05)
 
 
 @pytest.mark.parametrize("method", [BANDS, SVM])

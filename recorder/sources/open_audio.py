@@ -352,7 +352,7 @@ def _read(
         try:  # libsndfile takes four times as long to convert them, to the same bits
             samples = sound.read(count, "int16", always_2d=True)
             return np.multiply(samples, _INT16_STEP, dtype=np.float32), False
-        except soundfile.LibsndfileError:
+        except soundfile.LibsndfileError:  # below, what is there before the fault is read
             _sought(sound, place)
     block = np.full((count, sound.channels), np.nan, np.float32)
     try:
