@@ -17,6 +17,7 @@ from hearthlog.models.embedding.networks import YAMNET, find_network
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import CANDIDATE
 from hearthlog.models.starter import GENERAL, starter_file, with_network
+from hearthlog.recorder.embedder_probe import NO_NETWORK
 from hearthlog.recorder.sources import capture
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.labmic import DEVICE, make_microphone
@@ -30,6 +31,7 @@ _START_SECONDS = 30.0
 _HEARD_SECONDS = 10  # again and again; the device keeps them in memory
 _CPU = Target(0.5, at_most=True)
 _WITH_NETWORK = Target(1.0, at_most=True)
+_NETWORK_LOGS = "logs-network"
 _MEMORY = Target(120.0, at_most=True)
 _HEAVY = ("sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy")
 _NO_HEAVY = Target(0, at_most=True)
@@ -80,14 +82,14 @@ def _live(work: Workload) -> list[Row]:
     env = make_microphone(work.folder, most_sounding(work.samples))
     models = {"logs-live": work.model_file, "logs-on-trial": _beside_candidate(work)}
     if find_network(YAMNET.name) is not None:
-        models["logs-network"] = starter_file(with_network(GENERAL))
+        models[_NETWORK_LOGS] = starter_file(with_network(GENERAL))
     folders = {work.folder / name: model for name, model in models.items()}
     block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
     latency = capture.LATENCY_SECONDS
     bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
     with ExitStack() as stack:
         recorders = [
-            stack.enter_context(running(_recorder(model, folder), env))
+            stack.enter_context(running(_recorder(model, folder), _environment(env, folder)))
             for folder, model in folders.items()
         ]
         processes = [*recorders, stack.enter_context(running(bare, env))]
@@ -109,6 +111,12 @@ def _live(work: Workload) -> list[Row]:
     megabytes = [[usage.memory / 1e6 for usage in last.values()] for last in after]
     notes = ["sound was lost: the machine was busy" if end == _GAPS else "" for end in ends]
     return _rows(percents, megabytes, notes)
+
+
+def _environment(env: dict[str, str], logs: Path) -> dict[str, str]:
+    """Let one recorder listen with the network: without a word, all would where it is installed."""
+    network = YAMNET.name if logs.name == _NETWORK_LOGS else NO_NETWORK
+    return env | {"HEARTHLOG_EMBEDDING": network}
 
 
 def _recorder(model: Path, logs: Path) -> list[object]:
