@@ -13,6 +13,16 @@ READING = "reading"  # the summary of the health of audio files
 
 
 @dataclass(frozen=True)
+class SourceHealth:
+    """State of a source of sound."""
+
+    stamp: int  # in nanoseconds of UTC
+    level: int  # `OK`, `WARNING` or `ERROR`
+    summary: str
+    values: Mapping[str, str] = field(default_factory=dict)  # details by name
+
+
+@dataclass(frozen=True)
 class Frames:
     """Successive frames of sound.
 
@@ -27,12 +37,23 @@ class Frames:
     channels : np.ndarray [shape=(n, 800, c)], float32, or None
         The same of all microphones of an array, of which `samples` is the first one; None of a
         single microphone.
+    reports : tuple of SourceHealth
+        The state of the source at the starts of some of the frames, in the order of time.
     """
 
     first: int
     samples: Float32
     stamps: Int64
     channels: Float32 | None = None
+    reports: tuple[SourceHealth, ...] = ()
+
+    def part(self, start: int, stop: int) -> "Frames":
+        """Return the frames from one row to before another, at least one, with their reports."""
+        rows = slice(start, stop)
+        stamps = self.stamps[rows]
+        channels = None if self.channels is None else self.channels[rows]
+        reports = tuple(each for each in self.reports if stamps[0] <= each.stamp <= stamps[-1])
+        return Frames(self.first + start, self.samples[rows], stamps, channels, reports)
 
 
 @dataclass(frozen=True)
@@ -43,16 +64,6 @@ class Gap:
     end: int
     reason: str
     frames_lost: int
-
-
-@dataclass(frozen=True)
-class SourceHealth:
-    """State of a source of sound."""
-
-    stamp: int  # in nanoseconds of UTC
-    level: int  # `OK`, `WARNING` or `ERROR`
-    summary: str
-    values: Mapping[str, str] = field(default_factory=dict)  # details by name
 
 
 Event = Frames | Gap | SourceHealth

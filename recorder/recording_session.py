@@ -1,5 +1,6 @@
 """One recording: the log of some sources, the clips beside it, and what labels them."""
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -180,6 +181,9 @@ class RecordingSession:
             self._log.write([])  # unless the disk takes it now
         for accepted in stream.accepted(event, log_is_full=self._log.is_full):
             self._record(stream, accepted)
+        if isinstance(event, Frames):
+            for report in stream.pipeline.last_reports:
+                self._journal.add(microphone, report)
         if isinstance(event, SourceHealth):
             self._journal.add(microphone, stream.pipeline.judged(event))
             self._look_at_the_machine(stream, event.stamp)
@@ -195,11 +199,19 @@ class RecordingSession:
             pipeline = self._streams[microphone].pipeline
             state.sound[microphone] = pipeline.last_frames or event
             state.labels[microphone] = pipeline.last_labels
+            self._update_trouble(state, microphone, event.reports)
         elif isinstance(event, SourceHealth):
-            is_heard = event.level == OK and event.summary in {LISTENING, READING}
-            state.trouble[microphone] = "" if is_heard else event.summary
+            self._update_trouble(state, microphone, [event])
         state.clip_frames = self._clips.kept_frames
         state.keeps = self._settings.keep_audio != "off"
+
+    @staticmethod
+    def _update_trouble(
+        state: RecorderState, microphone: str, reports: Sequence[SourceHealth]
+    ) -> None:
+        for report in reports:
+            is_well = report.level == OK and report.summary in {LISTENING, READING}
+            state.trouble[microphone] = "" if is_well else report.summary
 
     def _record(self, stream: MicrophoneStream, event: Event) -> None:
         if isinstance(event, Gap) and not event.reason.startswith(_NOT_LOST):
@@ -211,7 +223,7 @@ class RecordingSession:
             self._log.begin_anew(self._describe(), stream.pipeline.flush())
             self._tell(f"{stream.pipeline.microphone}: the microphone is {stream.device} now")
         notices = self._clips.before(stream.pipeline.microphone, event)
-        self._log.write(stream.pipeline.push(event))
+        self._write(stream.pipeline.push(event), event)
         labels = stream.pipeline.last_labels
         if isinstance(event, Frames) and labels is not None:
             self.summary.labels += len(labels.frames)
@@ -220,6 +232,15 @@ class RecordingSession:
         self._now = event_time(event)
         self._log.write(self._clip_messages(stream, notices))
         self._look_after_the_disk(stream)
+
+    def _write(self, messages: Sequence[EncodedMessage], event: Event) -> None:
+        """Write messages of an event; those up to each report of the health are a chunk."""
+        written = 0
+        for report in event.reports if isinstance(event, Frames) else ():
+            end = bisect_left(messages, report.stamp, written, key=attrgetter("log_time"))
+            self._log.write(messages[written:end])
+            written = end
+        self._log.write(messages[written:])
 
     def _look_after_the_disk(self, stream: MicrophoneStream) -> None:
         if self._keeper is not None:

@@ -12,7 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import OK, READING, WARNING, Event, Gap, SourceHealth
+from hearthlog.recorder.events import (
+    OK,
+    READING,
+    WARNING,
+    Event,
+    Frames,
+    Gap,
+    SoundSource,
+    SourceHealth,
+)
 from hearthlog.recorder.sources.decoding import check_channels, read_audio
 from hearthlog.recorder.sources.file_times import FileTime
 from hearthlog.recorder.sources.framing import frames_of
@@ -25,6 +34,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
+_LONG_FRAMES = 6 * _HEALTH_FRAMES  # what a block costs besides is a fifth of 10 s of frames
 _NAMED = 10  # of the files that are damaged
 _NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
 
@@ -219,6 +229,65 @@ class FileSource:
         if late <= -step:
             self._overlaps.append((-late / NANOSECONDS, path))
         return late >= step
+
+
+class LongBlocks:
+    """Another source, whose successive frames come a minute at once.
+
+    Parameters
+    ----------
+    source : SoundSource
+        What it reports between frames becomes a part of them, as their `reports`.
+    """
+
+    def __init__(self, source: SoundSource) -> None:
+        self._source = source
+
+    @property
+    def device(self) -> str:
+        """Name of the source."""
+        return self._source.device
+
+    def events(self, stop: Flag) -> Iterator[Event]:
+        """Yield the events of the source; those before an error come before it."""
+        held = list[Frames | SourceHealth]()
+        frames = 0
+        try:
+            for event in self._source.events(stop):
+                if isinstance(event, Frames):
+                    frames += len(event.stamps)
+                elif isinstance(event, Gap) or not held:
+                    yield from _joined(held)
+                    held, frames = [], 0
+                    yield event
+                    continue
+                held.append(event)
+                if frames >= _LONG_FRAMES:
+                    yield from _joined(held)
+                    held, frames = [], 0
+        except SourceError:
+            yield from _joined(held)
+            raise
+        yield from _joined(held)
+
+
+def _joined(events: Sequence[Frames | SourceHealth]) -> Iterator[Event]:
+    """Yield successive frames as one block with the reports between them, then those behind."""
+    blocks = [event for event in events if isinstance(event, Frames)]
+    reports = [event for event in events if isinstance(event, SourceHealth)]
+    if blocks:
+        end = int(blocks[-1].stamps[-1])
+        within = tuple(report for report in reports if report.stamp <= end)
+        reports = reports[len(within) :]
+        channels = [block.channels for block in blocks if block.channels is not None]
+        yield Frames(
+            blocks[0].first,
+            np.concatenate([block.samples for block in blocks]),
+            np.concatenate([block.stamps for block in blocks]),
+            np.concatenate(channels) if channels else None,
+            within,
+        )
+    yield from reports
 
 
 class _Pause(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE
+from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE, Directions
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.embeddings import DELAY_FRAMES, NO_EMBEDDINGS
 from hearthlog.models.embedding.networks import Embedder
@@ -74,6 +74,8 @@ class Pipeline:
         Frames behind its window that a label may wait for.
     last_frames : Frames or None
         Those that were pushed last, without what is below hearing and stands out.
+    last_reports : list of SourceHealth
+        The health within them, as `judged`.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -91,6 +93,7 @@ class Pipeline:
         self.microphone = microphone
         self.feature_set = features
         self.last_frames: Frames | None = None
+        self.last_reports: list[SourceHealth] = []
         live = {} if classifier is None else {LIVE: classifier}
         self._source = embedding if embedder is None else embedder.source
         self._embeddings = None if embedder is None else MicrophoneEmbeddings(embedder, features)
@@ -111,6 +114,7 @@ class Pipeline:
         self._recent: Float32 | None = None  # features of the last frames, one less than a window
         self._floor = None if features.band_powers is None else FloorTracker()
         self._recent_floors: Float64 | None = None  # of the last window
+        self._last_floor: Float64 = np.empty(0)  # of the last frame; empty without one
         self._recent_stamps = np.empty(0, np.int64)  # of the last window
         self._watch = SoundWatch()
         self._directions = None if array is None else ArrayDirections(array)
@@ -156,19 +160,18 @@ class Pipeline:
             In the order of their log times.
         """
         if isinstance(event, Frames):
-            directions = NOWHERE if self._directions is None else self._directions(event)
             samples = self._infrasound(event.samples)
-            self._watch.add_samples(event.samples, samples)
             self.last_frames = replace(event, samples=samples)
             features = self._features(samples)
             floors = self._track_floor(features, event.first)
+            directions, health = self._watch_frames(event, samples, floors)
             embeddings = NO_EMBEDDINGS
             if self._embeddings is not None:
                 embeddings = self._embeddings.push(
                     samples, features, floors, event.first, event.stamps
                 )
             known = Auxiliary(directions, embeddings)
-            return self._push_frames(features, floors, event.first, event.stamps, known)
+            return self._push_frames(features, floors, event.first, event.stamps, known, health)
         if isinstance(event, Gap):
             return self.hold(self._push_gap(event))
         return self.hold(self._push_health(event))
@@ -198,15 +201,49 @@ class Pipeline:
             In the order of their log times.
         """
         floors = self._track_floor(features, first)
+        if floors is not None:
+            self._add_floor(floors.powers[:, -1])
         return self._push_frames(features, floors, first, stamps, auxiliary)
 
-    def _push_frames(
+    def _watch_frames(
+        self, frames: Frames, samples: Float32, floors: Floors | None
+    ) -> tuple[Directions, list[EncodedMessage]]:
+        """Watch sound, filtered as `samples`; return its directions, and the health within it."""
+        powers = np.empty(0) if floors is None else floors.powers[:, -1]
+        unknown = len(samples) - len(powers)  # frames, before the first that has a floor
+        directions, messages, start = NOWHERE, list[EncodedMessage](), 0
+        self.last_reports = []
+        ends = np.searchsorted(frames.stamps, [report.stamp for report in frames.reports]).tolist()
+        for end, report in zip([*ends, len(samples)], [*frames.reports, None], strict=True):
+            if end > start:
+                part = frames.part(start, end)
+                if self._directions is not None:
+                    directions = directions.followed_by(self._directions(part))
+                is_filtered = samples is not frames.samples
+                self._watch.add_samples(
+                    part.samples, samples[start:end] if is_filtered else part.samples
+                )
+                self._add_floor(powers[max(start - unknown, 0) : max(end - unknown, 0)])
+                start = end
+            if report is not None:
+                self.last_reports.append(self.judged(report))
+                messages += self._health_messages(self.last_reports[-1])
+        return directions, messages
+
+    def _add_floor(self, powers: Float64) -> None:
+        """Watch the floor of the room at successive frames."""
+        self._watch.add_floor(powers)
+        if len(powers):
+            self._last_floor = powers[-1:]
+
+    def _push_frames(  # noqa: PLR0913, PLR0917
         self,
         features: Float32,
         floors: Floors | None,
         first: int,
         stamps: Int64,
         auxiliary: Auxiliary,
+        health: Sequence[EncodedMessage] = (),
     ) -> list[EncodedMessage]:
         labels = [
             message
@@ -222,7 +259,7 @@ class Pipeline:
             known = stamps[auxiliary.embeddings.last_frames - first]
             messages = self._feature_messages(*logged)
             messages += embedding_messages(self.microphone, auxiliary.embeddings, known)
-        messages += [*self._located(auxiliary, first, stamps), *labels]
+        messages = [*health, *messages, *self._located(auxiliary, first, stamps), *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
         return self.hold(messages)
@@ -422,6 +459,7 @@ class Pipeline:
         self._feature_messages.restart()
         self._recent = None
         self._recent_floors = None
+        self._last_floor = np.empty(0)
         self._recent_directions = NOWHERE
         self._recent_embeddings = NO_EMBEDDINGS
         if self._floor is not None:
@@ -439,7 +477,6 @@ class Pipeline:
         if self._floor is None or self.feature_set.band_powers is None:
             return None
         floors = self._floor(self.feature_set.band_powers(features), first)
-        self._watch.add_floor(floors.powers[:, -1])
         recent = [floors.powers]
         if self._recent_floors is not None:
             recent.insert(0, self._recent_floors)
@@ -457,19 +494,19 @@ class Pipeline:
         # of the sound is older, and comes first.
         ended = health.stamp > self._end
         closing = [*self._unveil(), *self._close(self._end)] if ended else []
-        values = {**health.values, **self._floor_value()}
-        told = replace(health, values=values)
-        messages = [diagnostics(self.microphone, told, self.microphone)]
+        return [*closing, *self._health_messages(health)]
+
+    def _health_messages(self, health: SourceHealth) -> list[EncodedMessage]:
+        values = dict(health.values)
+        if len(self._last_floor):
+            values["floor_dbfs"] = f"{decibels(self._last_floor)[0]:.1f}"
+        with_floor = replace(health, values=values)
+        messages = [diagnostics(self.microphone, with_floor, self.microphone)]
         if health.level != self._level:
             self._level = health.level
             line = rosout.health_line(self.microphone, health)
             messages.append(EncodedMessage(health.stamp, ROSOUT, line))
-        return [*closing, *messages]
-
-    def _floor_value(self) -> dict[str, str]:
-        if self._recent_floors is None or not len(self._recent_floors):
-            return {}
-        return {"floor_dbfs": f"{decibels(self._recent_floors[-1, -1]):.1f}"}
+        return messages
 
 
 def _from_frame(labelling: str, model: Model | None, frame: int) -> Notice:
