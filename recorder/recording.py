@@ -75,7 +75,9 @@ def record_files(
     with FolderLock(settings.output, settings.node):
         recovered = recover_active(settings.output, settings.node)
         sources = {settings.microphone[0].name: source}
-        summary = _record(settings, sources, stop, reload_requests, state=state)
+        # Notices of clips have the time of the block that they were kept in.
+        joins = not source.realtime and settings.keep_audio == "off"
+        summary = _record(settings, sources, stop, reload_requests, state=state, joins_blocks=joins)
     summary.recovered = recovered
     return summary
 
@@ -296,6 +298,8 @@ def _record(  # noqa: PLR0913, PLR0917
     reload_requests: ReloadRequests | None,
     lock: FolderLock | None = None,
     state: RecorderState | None = None,
+    *,
+    joins_blocks: bool = False,
 ) -> RecordingSummary:
     with ExitStack() as stack:
         # Who records for years goes on without a scenario that has become impossible.
@@ -315,18 +319,12 @@ def _record(  # noqa: PLR0913, PLR0917
         session.say_lacking_embeddings()
         manager = ServiceManager(sources)
         try:
-            blocks = {name: _in_blocks(source, settings) for name, source in sources.items()}
-            for microphone, event in merged_events(blocks, stop):
+            if joins_blocks:
+                sources = {name: LongBlocks(source) for name, source in sources.items()}
+            for microphone, event in merged_events(sources, stop):
                 session.add(microphone, event)
                 manager.add(microphone, event)
         finally:
             manager.stop(restarts=reload_requests is not None and reload_requests.restart)
             session.finish()
     return session.summary
-
-
-def _in_blocks(source: SoundSource, settings: Settings) -> SoundSource:
-    """Let files that are read faster than life come in long blocks, which take less time."""
-    is_read_ahead = isinstance(source, FileSource) and not source.realtime
-    # Notices of clips have the time of the block that they were kept in.
-    return LongBlocks(source) if is_read_ahead and settings.keep_audio == "off" else source

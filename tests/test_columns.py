@@ -203,7 +203,7 @@ def test_a_file_is_read_whatever_it_leaves_out(log, tmp_path, options):
 
 
 @pytest.mark.parametrize("name", ["cut.mcap", "cut.mcap.active"])
-@pytest.mark.parametrize("share", [0.1, 0.4, 0.77, 0.999])
+@pytest.mark.parametrize("share", [0.25, 0.4, 0.77, 0.999])
 def test_of_a_log_that_is_cut_everything_complete_is_read(log, tmp_path, name, share):
     data = log.read_bytes()
     cut = tmp_path / name

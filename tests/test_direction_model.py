@@ -215,13 +215,13 @@ def test_a_model_that_takes_over_knows_the_directions_of_the_second_before(recor
 def test_states_begin_to_converge_once_a_second_of_directions_is_known(recorded, monkeypatch):
     classifier = Classifier(taking(strong()))
     sound = next(one for one in events(recorded) if isinstance(one, Features))
-    powers = FloorTracker()(classifier.feature_set.band_powers(sound.values), sound.first).powers
+    floors = FloorTracker()(classifier.feature_set.band_powers(sound.values), sound.first)
     labeller, forgotten = Labeller(classifier, "mic"), []
     monkeypatch.setattr(labeller.segmenter, "forget", lambda: forgotten.append(frame.first))
     for place in range(60):
         frame = sound.part(slice(place, place + 1))
-        floors = Floors(powers[place : place + 1], powers[place : place + 1], converged=True)
-        labeller.push(frame.values, floors, frame.first, frame.stamps, frame.auxiliary)
+        of_frame = Floors(*(each[place : place + 1] for each in floors[:3]), converged=True)
+        labeller.push(frame.values, of_frame, frame.first, frame.stamps, frame.auxiliary)
     assert forgotten == [sound.first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)]
 
 

@@ -17,13 +17,14 @@ from logs import features, read
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.events import OK, READING, Frames, Gap, SourceHealth
+from hearthlog.recorder.sources.audio_files import FileSource, LongBlocks
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.message_types import LABEL, decode, nanoseconds
+from hearthlog.schemas.messages.message_types import DIAGNOSTICS, LABEL, decode, nanoseconds
 
 pytestmark = pytest.mark.fast
 
@@ -162,6 +163,54 @@ def test_diagnostics_come_at_least_every_ten_seconds(day, recorded):
     stamps = [nanoseconds(m.header.stamp) for m in read(recorded(day), "diagnostics")]
     assert len(stamps) == 18
     assert np.diff(stamps).max() <= 10_000_000_000
+
+
+@pytest.mark.parametrize("private", [(), ("speech",)])
+def test_messages_of_long_blocks_are_those_of_short_ones(tmp_path, model_file, private):
+    sound = 0.05 * noise(75)
+    sound[31 * 16_000 : 33 * 16_000] = 1.0  # clips
+    sound[38 * 16_000 : 52 * 16_000] = 0.25  # stuck, and moving again when a report comes
+    soundfile.write(tmp_path / "noise.wav", sound, 16_000)
+    source = FileSource([tmp_path / "noise.wav"], START)
+
+    def messages(events):
+        pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)), 20, private=private)
+        pushed = [m for event in events for m in pipeline.push(event)] + pipeline.finish()
+        assert [m.log_time for m in pushed] == sorted(m.log_time for m in pushed)
+        return sorted(pushed, key=lambda m: (m.log_time, m.topic))
+
+    short = messages(source.events(Event()))
+    joined = list(LongBlocks(FileSource([tmp_path / "noise.wav"], START)).events(Event()))
+    assert lengths(joined) == [1200, 300]
+    assert messages(joined) == short
+    reports = [decode(m.data, DIAGNOSTICS) for m in short if m.topic == "/diagnostics"]
+    assert [report.status[0].level for report in reports] == [0, 0, 0, 0, 1, 1, 1, 1]
+
+
+def test_long_blocks_end_at_gaps_and_where_the_source_fails():
+    class Source:
+        device = "a source"
+
+        def events(self, stop):
+            frames = np.zeros((200, FRAME_SAMPLES), np.float32)
+            for number in range(8):
+                stamps = START + (200 * number + np.arange(200)) * FRAME_NANOSECONDS
+                yield SourceHealth(int(stamps[0]), OK, READING)
+                yield Frames(200 * number, frames, stamps)
+                if number == 1:
+                    end = int(stamps[-1]) + FRAME_NANOSECONDS
+                    yield Gap(end, end, "a gap", 0)
+            raise SourceError("the file is damaged")
+
+    events = []
+    with pytest.raises(SourceError, match="damaged"):
+        for event in LongBlocks(Source()).events(Event()):
+            events.append(event)  # noqa: PERF402  those before the error, too
+    assert lengths(events) == [400, 1200]
+
+
+def lengths(events):
+    return [len(event.stamps) for event in events if isinstance(event, Frames)]
 
 
 def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model_file, recorded):

@@ -251,7 +251,7 @@ class _Listener:
         if begin == end:
             return
         labeller = Labeller(self._classifier, embedding=self._source)
-        floors, heard = self._floors(recording, len(features)), self._heard(recording, stamps)
+        floors, heard = self._floors(recording, features), self._heard(recording, stamps)
         pushed = labeller.push(features, floors, 0, stamps, Auxiliary(embeddings=heard))[1]
         segments = [*pushed, *labeller.close(length)]
         self._add(self._reference, begin, end, self._classifier.classes.index(label))
@@ -277,14 +277,15 @@ class _Listener:
         fit &= frames + WINDOW_FRAMES <= len(stamps)
         return Embeddings(frames[fit], stamps[frames[fit]], windows.values[fit])
 
-    def _floors(self, recording: Recording, frames: int) -> Floors | None:
-        """Return the floor of the room in a recording at each of some frames."""
-        features = self._classifier.feature_set
-        if not features.bands:
+    def _floors(self, recording: Recording, features: Float32) -> Floors | None:
+        """Return the floor of the room in a recording at each frame of its features."""
+        powers = self._classifier.feature_set.band_powers
+        if powers is None:
             return None
-        floor = np.zeros(features.bands) if recording.floor is None else recording.floor[-1]
-        floors = np.tile(floor, (frames, 1))
-        return Floors(floors, floors, converged=True)
+        sound = powers(features)
+        floor = np.zeros(sound.shape[1]) if recording.floor is None else recording.floor[-1]
+        floors = np.tile(floor, (len(sound), 1))
+        return Floors(floors, floors, sound, converged=True)
 
     def detections(self) -> Detections:
         """Score all of them."""

@@ -34,6 +34,8 @@ class Floors(NamedTuple):
         Powers of the bands; the last is that of the whole frame.
     room : np.ndarray [shape=(m, b)], float64
         The same with what is steady, sounds on and is not loud: what is not above it is silence.
+    sound : np.ndarray [shape=(m, b)], float64
+        Powers of the bands of the frames themselves.
     converged : bool
         Whether frames before the first one of the stream would leave no trace in them, nor in those
         of the second before.
@@ -41,6 +43,7 @@ class Floors(NamedTuple):
 
     powers: Float64
     room: Float64
+    sound: Float64
     converged: bool
 
 
@@ -84,7 +87,7 @@ class FloorTracker:
         if self._converged_for is not None:
             self._converged_for += len(powers)
         floors, room = np.split(self._track(powers, first), 2, axis=1)
-        return Floors(floors, room, converged)
+        return Floors(floors, room, powers[len(powers) - len(floors) :], converged)
 
     def _track(self, powers: Float64, first: int) -> Float64:
         """Return the floor and the room at each frame that has them, beside each other."""
@@ -110,17 +113,37 @@ class FloorTracker:
         past = 0 if self._blocks is None else len(self._blocks)
         if self._blocks is not None:
             blocks = np.concatenate([self._blocks, blocks])
-        for place in range(len(floors)):
+        ending = -(number + 1) % SECTION_BLOCKS  # the first block that ends a section
+        if past + ending + 1 < SECTION_BLOCKS:
+            ending += SECTION_BLOCKS
+        are_steady = _are_steady(blocks[past + ending + 1 - SECTION_BLOCKS :])
+        place = 0
+        while place < len(floors):
             end = past + place + 1
-            if (number + place + 1) % SECTION_BLOCKS == 0 and end >= SECTION_BLOCKS:
-                self._end_section(blocks[max(end - _MINUTE_BLOCKS, 0) : end])
+            until_ending = (ending - place) % SECTION_BLOCKS
+            if not until_ending and place >= ending:
+                steady = are_steady[(place - ending) // SECTION_BLOCKS]
+                self._end_section(
+                    blocks[max(end - _MINUTE_BLOCKS, 0) : end], is_steady=bool(steady)
+                )
             elif not self._settled:
                 self._floor = _low(blocks[:end])
-            if self._steady is not None and _STANDS_OUT * blocks[end - 1, -1] < self._steady[-1]:
-                self._steady = None
-            floors[place] = self._now()
+            # Then the floor stays until the section ends.
+            stop = place + ((until_ending or SECTION_BLOCKS) if self._settled else 1)
+            self._write_floors(blocks[end - 1 : past + stop], floors[place:stop])
+            place = stop
         self._blocks = blocks[-_MINUTE_BLOCKS:].copy()
         return floors
+
+    def _write_floors(self, blocks: Float64, floors: Float64) -> None:
+        """Write floor and room after each of some blocks, over which the floor is one."""
+        floors[:] = self._now()
+        if self._steady is None:
+            return
+        fainter = np.flatnonzero(_STANDS_OUT * blocks[:, -1] < self._steady[-1])
+        if len(fainter):
+            self._steady = None
+            floors[fainter[0] :] = self._now()
 
     def _now(self) -> Float64 | None:
         if self._floor is None:
@@ -128,12 +151,12 @@ class FloorTracker:
         room = self._floor if self._steady is None else np.maximum(self._floor, self._steady)
         return np.concatenate([self._floor, room])
 
-    def _end_section(self, minute: Float64) -> None:
+    def _end_section(self, minute: Float64, *, is_steady: bool) -> None:
         """Move the floor at the end of a section, by the blocks of the minute before."""
         low, section = _low(minute), minute[-SECTION_BLOCKS:]
         self._settled = True
         self._unsteady += 1
-        if decibels(section[:, :-1]).std(axis=0).mean() < _STEADY_DB:
+        if is_steady:
             self._floor, self._unsteady = section.mean(axis=0), 0
             self._steady = self._floor if self._floor[-1] < _LOUD else None
         elif self._floor is None or self._unsteady >= _MEMORY_SECTIONS:
@@ -208,6 +231,14 @@ def low_power(powers: Float64, share: float = 0.2) -> Float64:
         mean: Float64 = powers.mean(axis=0)
         return mean
     return _low(_block_means(powers, count), share)
+
+
+def _are_steady(blocks: Float64) -> Bool:
+    """Return which whole sections of successive blocks are as steady as noise."""
+    sections = blocks[: len(blocks) - len(blocks) % SECTION_BLOCKS, :-1]
+    levels = decibels(sections.reshape(-1, SECTION_BLOCKS, sections.shape[1]))
+    are_steady: Bool = levels.std(axis=1).mean(axis=1) < _STEADY_DB
+    return are_steady
 
 
 def _stands_out(steady: Float64, floor: Float64) -> bool:

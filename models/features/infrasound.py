@@ -69,11 +69,12 @@ class InfrasoundFilter:
         self.is_active = bool(removed[-1])
         if not removed.any():
             return frames
-        coefficients = _coefficients(frames)
-        coefficients[~wavy, 1:] = 0.0
-        coefficients[~removed] = 0.0
+        coefficients = _coefficients(frames[removed])
+        coefficients[~wavy[removed], 1:] = 0.0
         baseline = np.rint(_STEPS * rowwise_matmul(coefficients, _curves().T)) / _STEPS
-        return frames - baseline.astype(np.float32)
+        filtered = frames.copy()
+        filtered[removed] -= baseline.astype(np.float32)
+        return filtered
 
     def _may_stand_out(self, frames: Float32) -> Bool:
         """Find the frames that need a closer look, by bounds that cost less than the powers."""

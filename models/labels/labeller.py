@@ -15,7 +15,7 @@ from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
 from hearthlog.models.embedding.embeddings import Int8
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
-from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
@@ -113,7 +113,6 @@ class Labeller:
         self.segmenter = Segmenter(classifier.classes, classifier.smoothing, classifier.transitions)
         self.timing = classifier.timing
         self._classifier = classifier
-        self._inputs = classifier.inputs.stream()
         self._window: _Frames | None = None  # the last frames, one less than a window
         weights = classifier.direction_weights(microphone)
         self._evidence = None if weights is None else DirectionEvidence(weights)
@@ -174,7 +173,11 @@ class Labeller:
             Of the last second before the frame, or more.
         """
         self._first_label, self._first_segment = unlabelled, frame
-        self._advance(features, floors if self.timing.needs_floor else None, stamps)
+        powers, known = self._classifier.feature_set.band_powers, None
+        if self.timing.needs_floor and floors is not None and powers is not None:
+            sound = powers(features[len(features) - len(floors) :])
+            known = Floors(floors, floors, sound, converged=False)
+        self._advance(features, known, stamps)
         if self._evidence is not None:
             before = frame - len(features), len(features)
             self._evidence.push(auxiliary.directions, *before, 0)
@@ -211,17 +214,16 @@ class Labeller:
         segments : list of Segment
             Those whose end these frames decide.
         """
-        needed = floors if floors is not None and self.timing.needs_floor else None
-        powers, room = (None, None) if needed is None else (needed.powers, needed.room)
         self._converge(floors, first)
-        inputs, window = self._advance(features, powers, stamps)
+        window = self._advance(features, floors if self.timing.needs_floor else None, stamps)
+        count = max(len(window.stamps) - self.timing.window_frames + 1, 0)
         evidence = None
         if self._evidence is not None:
-            directions = auxiliary.directions
-            evidence = self._evidence.push(directions, first, len(features), len(inputs))
+            evidence = self._evidence.push(auxiliary.directions, first, len(features), count)
         ahead = self.timing.ahead
-        probabilities, novelty = self._classify(inputs, window, room, None if ahead else evidence)
-        count, spoken = len(inputs), self.timing.label_frame
+        room = None if floors is None else floors.room
+        probabilities, novelty = self._classify(window, count, room, None if ahead else evidence)
+        spoken = self.timing.label_frame
         by_features = LabelledFrames(
             probabilities,
             window.powers[spoken:][:count],
@@ -265,7 +267,6 @@ class Labeller:
         list of Segment
             In the order of time.
         """
-        self._inputs.restart()
         if self._evidence is not None:
             self._evidence.restart()
         for each in self._window_evidence:
@@ -311,47 +312,45 @@ class Labeller:
         probabilities, novelty = self._classifier.mix(frames.probabilities, by_heads, evidence)
         return frames._replace(probabilities=probabilities), novelty
 
-    def _advance(
-        self, features: Float32, floors: Float64 | None, stamps: Int64
-    ) -> tuple[Float32, "_Frames"]:
-        """Return the inputs of the windows that are complete now, and all their frames."""
+    def _advance(self, features: Float32, floors: Floors | None, stamps: Int64) -> "_Frames":
+        """Return the frames of the windows that are complete now, or will be."""
+        known = len(features) if floors is None else len(floors.powers)
+        features, stamps = features[len(features) - known :], stamps[len(stamps) - known :]
+        frames = _Frames(features, self._classifier.feature_set.power(features), stamps)
         if floors is not None:
-            begin = len(features) - len(floors)
-            features, stamps = features[begin:], stamps[begin:]
-        feature_set = self._classifier.feature_set
-        frames = _Frames(features, feature_set.power(features), stamps)
+            frames = frames._replace(floors=floors.powers, bands=floors.sound)
         if self._window is not None:
-            before = self._window
-            frames = _Frames(
-                np.concatenate([before.features, features]),
-                np.concatenate([before.powers, frames.powers]),
-                np.concatenate([before.stamps, stamps]),
-            )
-        keep = max(len(frames.stamps) - self.timing.window_frames + 1, 0)
-        self._window = _Frames(
-            frames.features[keep:].copy(), frames.powers[keep:].copy(), frames.stamps[keep:].copy()
-        )
-        return self._inputs(features, floors), frames
+            frames = self._window.followed_by(frames)
+        self._window = frames.last(self.timing.window_frames - 1)
+        return frames
 
     def _classify(
-        self,
-        inputs: Float32,
-        window: "_Frames",
-        room: Float64 | None,
-        evidence: Float64 | None,
+        self, frames: "_Frames", count: int, room: Float64 | None, evidence: Float64 | None
     ) -> tuple[Float32, Float32]:
-        """Classify windows; those that are not above the room by the gate are silence."""
-        gate, powers = self._classifier.gate, self._classifier.feature_set.band_powers
-        if not gate or room is None or powers is None or not len(inputs):
-            return self._classifier.classify(inputs, evidence)
-        room = room[len(room) - len(inputs) :]
-        quiet = is_quiet(powers(window.features), room, self.timing.window_frames, gate)
-        probabilities = np.zeros((len(inputs), len(self.classes)), np.float32)
-        novelty = np.zeros(len(inputs), np.float32)
-        probabilities[quiet, self.classes.index(SILENCE)] = 1.0
-        loud = None if evidence is None else evidence[~quiet]
-        probabilities[~quiet], novelty[~quiet] = self._classifier.classify(inputs[~quiet], loud)
+        """Classify so many windows; those that are not above the room by the gate are silence."""
+        length, gate = self.timing.window_frames, self._classifier.gate
+        loud = np.ones(count, bool)
+        if gate and room is not None and frames.bands is not None and count:
+            loud = ~is_quiet(frames.bands, room[len(room) - count :], length, gate)
+        probabilities = np.zeros((count, len(self.classes)), np.float32)
+        novelty = np.zeros(count, np.float32)
+        if not loud.all():
+            probabilities[~loud, self.classes.index(SILENCE)] = 1.0
+        if loud.any():
+            inputs = self._inputs_of(frames, loud)
+            of_loud = None if evidence is None else evidence[loud]
+            probabilities[loud], novelty[loud] = self._classifier.classify(inputs, of_loud)
         return probabilities, novelty
+
+    def _inputs_of(self, frames: "_Frames", wanted: Bool) -> Float32:
+        """Compute the inputs of some of the windows, from the frames that lie in one of them."""
+        within = np.zeros(len(frames.stamps), bool)
+        for place in range(self.timing.window_frames):
+            within[place : place + len(wanted)] |= wanted
+        floors = None if frames.floors is None else frames.floors[within]
+        inputs = self._classifier.inputs.stream()(frames.features[within], floors)
+        begins = np.cumsum(within)[: len(wanted)] - 1
+        return inputs[begins[wanted]]
 
 
 def _logits_of_names(values: Int8, source: EmbeddingSource, classes: Sequence[str]) -> Float64:
@@ -365,9 +364,36 @@ def _logits_of_names(values: Int8, source: EmbeddingSource, classes: Sequence[st
 
 
 class _Frames(NamedTuple):
+    """Successive frames, with the floor at each and the powers of its bands where they count."""
+
     features: Float32
     powers: NDArray[Any]
     stamps: Int64
+    floors: Float64 | None = None
+    bands: Float64 | None = None
+
+    def followed_by(self, others: "_Frames") -> "_Frames":
+        return _Frames(
+            np.concatenate([self.features, others.features]),
+            np.concatenate([self.powers, others.powers]),
+            np.concatenate([self.stamps, others.stamps]),
+            _joined(self.floors, others.floors),
+            _joined(self.bands, others.bands),
+        )
+
+    def last(self, count: int) -> "_Frames":
+        begin = max(len(self.stamps) - count, 0)
+        return _Frames(
+            self.features[begin:].copy(),
+            self.powers[begin:].copy(),
+            self.stamps[begin:].copy(),
+            None if self.floors is None else self.floors[begin:].copy(),
+            None if self.bands is None else self.bands[begin:].copy(),
+        )
+
+
+def _joined(before: Float64 | None, after: Float64 | None) -> Float64 | None:
+    return None if before is None or after is None else np.concatenate([before, after])
 
 
 def segment_columns(

@@ -11,7 +11,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 _FULL_SCALE = 0.999
 _CLIPPED_SAMPLES = 4  # of a frame; the highest sample of a recording may be full scale
 _CLIPPED_ENERGY = 0.99 * _CLIPPED_SAMPLES * _FULL_SCALE**2  # in which rounding may lie
-_LOOKED_AT = 16  # samples of a frame: mostly enough to see that it is not one value
+_LOOKED_AT = 16  # samples of a frame: mostly enough to see that it moves
 _CLIPPED_FRAMES = round(1.0 / FRAME_SECONDS)  # of the last minute
 _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
@@ -157,8 +157,11 @@ def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
     """Find the frames in which there is no more than an offset: a dead microphone."""
     if filtered is samples:
         return np.zeros(len(samples), bool)
-    is_flat: Bool = np.ptp(samples, axis=1) <= _DEAD_RANGE
-    return is_flat & (filtered != samples).any(axis=1)
+    is_offset_only = np.ptp(samples[:, :_LOOKED_AT], axis=1) <= _DEAD_RANGE
+    flat = np.flatnonzero(is_offset_only)
+    is_flat = np.ptp(samples[flat], axis=1) <= _DEAD_RANGE
+    is_offset_only[flat] = is_flat & (filtered[flat] != samples[flat]).any(axis=1)
+    return is_offset_only
 
 
 def _are_clipped(samples: Float32) -> Bool:
@@ -178,8 +181,10 @@ class _Infrasound:
     def add(self, samples: Float32, filtered: Float32) -> None:
         if filtered is samples and not self._powers.any():
             return
-        removed = samples - filtered
-        means, powers = removed.mean(axis=1), np.square(removed).mean(axis=1)
+        means, powers = np.zeros((2, len(samples)), np.float32)
+        changed = np.flatnonzero((filtered != samples).any(axis=1))
+        removed = samples[changed] - filtered[changed]
+        means[changed], powers[changed] = removed.mean(axis=1), np.square(removed).mean(axis=1)
         self._means = np.concatenate([self._means, means])[-_INFRASOUND_FRAMES:]
         self._powers = np.concatenate([self._powers, powers])[-_INFRASOUND_FRAMES:]
 
