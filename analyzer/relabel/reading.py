@@ -23,6 +23,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _WARM_UP = 30 * NANOSECONDS
 _FLOOR_WARM_UP = 150 * NANOSECONDS  # a minute, and the four seconds of steadiness behind it
 _NEVER = (1 << 63) - 1
+_FRAMES = 12_000  # ten minutes at once: their arrays stay in the memory of the process
 _LONGEST_LOSS_TEXT = 1000  # characters
 
 
@@ -105,7 +106,12 @@ def read_sound(
     try:
         sound = read_recorded(info, start, _NEVER, sound_only=True, auxiliary=auxiliary)
         for batch in sound:
-            yield from (event for event in batch.events if isinstance(event, Features | Gap))
+            for event in batch.events:
+                if isinstance(event, Gap):
+                    yield event
+                elif isinstance(event, Features):
+                    for begin in range(0, len(event.stamps), _FRAMES):
+                        yield event.part(slice(begin, begin + _FRAMES))
     except LogError as error:
         raise UnreadableError(info.path, error) from error
 

@@ -20,6 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.workers.pickled_calls import attempt, pack_call, read_reply
+from hearthlog.recorder.memory import keep_freed_blocks
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.blas import kernel_environment
 from hearthlog.schemas.errors import HearthlogWarning
@@ -177,6 +178,7 @@ def serve() -> None:
     os.dup2(2, 1)  # what a task prints must not get into the replies
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that a task can clean up
     warnings.simplefilter("ignore", HearthlogWarning)  # the parent warns once
+    keep_freed_blocks()
     waiting: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_listen, args=(calls, waiting), daemon=True).start()
     while True:

@@ -7,6 +7,7 @@ from typing import ParamSpec, Protocol, TypeVar
 
 from hearthlog.analyzer.workers.cluster import connected
 from hearthlog.analyzer.workers.processes import Processes
+from hearthlog.recorder.memory import keep_freed_blocks
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -72,6 +73,7 @@ def open_workers(
         with connected(scheduler) as cluster:
             yield cluster
     elif count == 1:
+        keep_freed_blocks()
         yield InlineWorkers()
     else:
         with closing(Processes(count, module)) as processes:
