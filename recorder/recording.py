@@ -23,7 +23,7 @@ from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock, check_writable
 from hearthlog.recorder.log.recovery import end_of_sound, recover_active
-from hearthlog.recorder.memory import keep_one_heap
+from hearthlog.recorder.memory import keep_freed_blocks, keep_one_heap
 from hearthlog.recorder.recording_session import (
     NOT_RUNNING,
     RecorderState,
@@ -72,6 +72,7 @@ def record_files(
         If another recorder of this name uses the folder. If the log cannot be written, in which
         case what was written stays, for the next start to complete.
     """
+    keep_freed_blocks()
     with FolderLock(settings.output, settings.node):
         recovered = recover_active(settings.output, settings.node)
         sources = {settings.microphone[0].name: source}

@@ -54,7 +54,7 @@ class LandmarkMethod(WindowMethod):
 
     cost: float = 10 / 3
     gamma: float = 0.5
-    landmarks: int = 800
+    landmarks: int = 400
     steps: int = 50
 
     @property

@@ -203,22 +203,15 @@ class StatisticsStream:
     Parameters
     ----------
     inputs : WindowStatistics
-
-    Attributes
-    ----------
-    recent : np.ndarray [shape=(n, d)], float32, or None
-        Features of the last frames, at most one less than a window; None at the start and after a
-        restart.
     """
 
     def __init__(self, inputs: WindowStatistics) -> None:
-        self.recent: Float32 | None = None
         self._inputs = inputs
-        self._values: NDArray[Any] | None = None
+        self._values: NDArray[Any] | None = None  # of the last frames, one less than a window
 
     def restart(self) -> None:
         """Forget the past: the next frame does not follow the last one."""
-        self.recent = self._values = None
+        self._values = None
 
     def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
         """Compute the inputs at successive frames.
@@ -238,11 +231,10 @@ class StatisticsStream:
         """
         kind, length = self._inputs, self._inputs.window_frames
         values = kind.values_of(features, floors)
-        if self.recent is not None:
-            features = np.concatenate([self.recent, features])
+        if self._values is not None:
             values = np.concatenate([self._values, values])
-        count = max(len(features) - length + 1, 0)
-        self.recent, self._values = features[count:].copy(), values[count:].copy()
+        count = max(len(values) - length + 1, 0)
+        self._values = values[count:].copy()
         inputs = np.empty((count, kind.width), np.float32)
         for start in range(0, count, _FRAMES_AT_ONCE):
             end = min(start + _FRAMES_AT_ONCE, count)

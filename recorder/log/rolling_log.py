@@ -292,7 +292,7 @@ class RollingLog:
             return
         assert self._writer is not None
         self._writer.write_messages(messages)
-        self._last = max(self._last, *(message.log_time for message in messages))
+        self._last = max(self._last, messages[-1].log_time)
         if self._flush_at is None:
             self._flush_at = messages[0].log_time + self._flush_nanoseconds
 

@@ -7,7 +7,7 @@ from hearthlog.recorder.direction.channel_watch import ChannelWatch
 from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.recorder.direction.srp_phat import DirectionFinder
 from hearthlog.recorder.events import Frames
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
@@ -83,4 +83,4 @@ def direction_messages(
     }
     rows = encode_rows(message_types.DIRECTION, columns, len(known))
     name = topic(microphone, "direction")
-    return [EncodedMessage(t, name, row) for t, row in zip(known.tolist(), rows, strict=True)]
+    return encoded_messages(name, known, rows)

@@ -7,7 +7,7 @@ from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import Floors, is_quiet
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
@@ -105,4 +105,4 @@ def embedding_messages(
     }
     rows = encode_rows(message_types.EMBEDDING, columns, len(known))
     name = topic(microphone, "embedding")
-    return [EncodedMessage(t, name, row) for t, row in zip(known.tolist(), rows, strict=True)]
+    return encoded_messages(name, known, rows)

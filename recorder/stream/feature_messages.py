@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages
 from hearthlog.recorder.stream.statistics import RollingStatistics
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.messages import message_types
@@ -53,10 +53,10 @@ class FeatureMessages:
         """
         if not len(features):
             return []
-        mean, std = self._statistics(features)
         frames = np.arange(first, first + len(features))
         logged = np.flatnonzero(frames % self._every == 0)
-        statistics = {"mean": mean[logged], "std": std[logged]}
+        mean, std = self._statistics(features, logged)
+        statistics = {"mean": mean, "std": std}
         return [
             *self._encode("features", frames, stamps, {"values": features}),
             *self._encode("statistics", frames[logged], stamps[logged], statistics),
@@ -73,6 +73,4 @@ class FeatureMessages:
         }
         typename = message_types.FEATURES if kind == "features" else message_types.STATISTICS
         name, rows = topic(self._microphone, kind), encode_rows(typename, columns, len(stamps))
-        return [
-            EncodedMessage(time, name, row) for time, row in zip(stamps.tolist(), rows, strict=True)
-        ]
+        return encoded_messages(name, stamps, rows)

@@ -11,7 +11,7 @@ from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder.stream import rosout
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
@@ -161,7 +161,4 @@ class LabelStream:
     ) -> list[EncodedMessage]:
         name = labelling_topic(self._microphone, self._labelling, kind)
         rows = encode_rows(typename, columns, len(log_times)) if len(log_times) else []
-        return [
-            EncodedMessage(time, name, row)
-            for time, row in zip(log_times.tolist(), rows, strict=True)
-        ]
+        return encoded_messages(name, log_times, rows)

@@ -1,9 +1,9 @@
-"""Mean and standard deviation of the features over the last window, at every frame."""
+"""Mean and standard deviation of the features over the last window."""
 
 import numpy as np
 
-from hearthlog.models.features.window_inputs import WindowStatistics, mean_and_std
-from hearthlog.schemas.arrays import Float32
+from hearthlog.models.features.window_inputs import mean_and_std
+from hearthlog.schemas.arrays import Float32, Indices
 
 LOGGED_EVERY = 20  # frames: each message is of a second of its own
 
@@ -22,36 +22,37 @@ class RollingStatistics:
     """
 
     def __init__(self, window_frames: int, width: int) -> None:
-        self._width = width
-        self._windows = WindowStatistics(window_frames, np.asarray, width).stream()
-
-    @property
-    def recent(self) -> Float32 | None:
-        """The features of the last frames, one less than a window; None after a gap."""
-        return self._windows.recent
+        self._length, self._width = window_frames, width
+        self.restart()
 
     def restart(self) -> None:
         """Empty the window: the next frame does not follow the last one."""
-        self._windows.restart()
+        self._recent: Float32 = np.empty((0, self._width), np.float32)
 
-    def __call__(self, features: Float32) -> tuple[Float32, Float32]:
-        """Compute the statistics at each of successive frames.
+    def __call__(self, features: Float32, places: Indices | None = None) -> tuple[Float32, Float32]:
+        """Compute the statistics at some of successive frames.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
+        places : np.ndarray [shape=(m,)], intp, optional
+            Of the frames, from 0 on, ascending; all by default.
 
         Returns
         -------
-        mean, std : np.ndarray [shape=(n, d)], float32
+        mean, std : np.ndarray [shape=(m, d)], float32
             Over the last window, or over all frames since the start or the last restart where
             these are fewer; the standard deviation divides by their number.
         """
-        before = features[:0] if self.recent is None else self.recent
-        rows = self._windows(features)
-        if filling := len(features) - len(rows):
-            frames = np.concatenate([before, features[:filling]])[:, np.newaxis]
-            ends = range(len(before) + 1, len(frames) + 1)
-            first = [np.concatenate(mean_and_std([*frames[:end]]), axis=1) for end in ends]
-            rows = np.concatenate([*first, rows], dtype=np.float32, casting="same_kind")
-        return rows[:, : self._width], rows[:, self._width :]
+        frames = np.concatenate([self._recent, features])
+        places = np.arange(len(features)) if places is None else places
+        begins = places + len(self._recent) + 1 - self._length
+        filling = int(np.count_nonzero(begins < 0))
+        mean, std = np.empty((2, len(places), self._width), np.float32)
+        for row, begin in enumerate(begins[:filling].tolist()):
+            first = [*frames[: begin + self._length, np.newaxis]]
+            (mean[row],), (std[row],) = mean_and_std(first)
+        windows = [frames[begins[filling:] + place] for place in range(self._length)]
+        mean[filling:], std[filling:] = mean_and_std(windows)
+        self._recent = frames[max(len(frames) - self._length + 1, 0) :].copy()
+        return mean, std

@@ -1,7 +1,7 @@
 """What is in a log, written to a stream: MCAP of profile `ros2`."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple
 
@@ -99,17 +99,19 @@ class LogStreamWriter:
         item = attachment
         self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
 
-    def write_messages(self, messages: Iterable[tuple[int, str, bytes]]) -> None:
-        """Append encoded messages.
+    def write_messages(self, messages: Sequence[tuple[int, str, bytes]]) -> None:
+        """Append encoded messages, in the order of their log times.
 
         Parameters
         ----------
-        messages : iterable of (int, str, bytes)
+        messages : sequence of (int, str, bytes)
             Log time in nanoseconds of UTC, which is also the publish time; name of one of the
             writer's topics; CDR.
         """
-        channels = self._channels
-        self._writer.add_messages((channels[topic], time, data) for time, topic, data in messages)
+        if messages:
+            times, topics, payloads = zip(*messages, strict=True)
+            channels = [self._channels[topic] for topic in topics]
+            self._writer.add_messages(channels, times, payloads)
 
     def write_columns(
         self, batch: Sequence[TopicBatch], encoded: Sequence[RawMessages] = ()

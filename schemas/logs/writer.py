@@ -3,7 +3,7 @@
 import errno
 import fcntl
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -78,7 +78,7 @@ class LogWriter:
         """Append one encoded message, as `write_messages` does."""
         self._content.write_messages([(log_time, topic, data)])
 
-    def write_messages(self, messages: Iterable[tuple[int, str, bytes]]) -> None:
+    def write_messages(self, messages: Sequence[tuple[int, str, bytes]]) -> None:
         """Append encoded messages, as `LogStreamWriter.write_messages` does.
 
         Raises

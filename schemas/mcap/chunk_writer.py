@@ -15,7 +15,12 @@ from mcap.opcode import Opcode
 
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.formats import HEAD
-from hearthlog.schemas.mcap.message_blocks import Block, MessageRecords, merge_blocks
+from hearthlog.schemas.mcap.message_blocks import (
+    Block,
+    MessageRecords,
+    join_messages,
+    merge_blocks,
+)
 from hearthlog.schemas.mcap.records import encode
 from hearthlog.schemas.mcap.stored_chunk import LATEST, ChunkBuilder, StoredChunk
 from hearthlog.schemas.storage.prefetch import prefetch
@@ -24,6 +29,7 @@ from hearthlog.schemas.times import NANOSECONDS
 CHUNK_SIZE = 1 << 20
 _LEAST = 4 << 10  # bytes that a chunk has before the span of time can end it
 _COMPRESSORS = 2  # threads
+_FEW = 48  # messages: one by one they take less time than as arrays
 GATHERED_SPAN = 60 * NANOSECONDS  # of messages that have chunks of their own
 
 
@@ -222,37 +228,33 @@ class ChunkWriter:
         sequence : int
             0 to 2**32 - 1.
         """
-        self._add([(channel_id, sequence, log_time, publish_time, data)])
+        chunk = self._chunk
+        chunk.entries[channel_id] += formats.INDEX_ENTRY.pack(log_time, len(chunk.content))
+        chunk.content += formats.MESSAGE.pack(
+            Opcode.MESSAGE,
+            formats.MESSAGE_FIXED + len(data),
+            channel_id,
+            sequence,
+            log_time,
+            publish_time,
+        )
+        chunk.content += data
+        chunk.start, chunk.end = min(chunk.start, log_time), max(chunk.end, log_time)
+        if len(chunk.content) > self._chunk_size:
+            self.flush()
 
-    def add_messages(self, messages: Iterable[tuple[int, int, bytes]]) -> None:
-        """Append messages: for each the number of its channel, log time and payload.
+    def add_messages(
+        self, channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
+    ) -> None:
+        """Append messages, by the number of the channel, log time and payload of each.
 
-        The publish time of a message is its log time.
+        The publish time of a message is its log time; log times ascend.
         """
-        self._add((channel, 0, time, time, data) for channel, time, data in messages)
-
-    def _add(self, messages: Iterable[tuple[int, int, int, int, bytes]]) -> None:
-        # A log has 40 messages a second: a call for each part of each takes longer than the parts.
-        pack, pack_entry = formats.MESSAGE.pack, formats.INDEX_ENTRY.pack
-        opcode, fixed, most = Opcode.MESSAGE, formats.MESSAGE_FIXED, self._chunk_size
-        waiting, chunk = iter(messages), None
-        while chunk is not self._chunk:
-            chunk = self._chunk
-            content, entries, start, end = chunk.content, chunk.entries, chunk.start, chunk.end
-            for channel, sequence, time, published, data in waiting:
-                entries[channel] += pack_entry(time, len(content))
-                content += pack(opcode, fixed + len(data), channel, sequence, time, published)
-                content += data
-                # min and max would take as long as all the rest
-                if time < start:  # noqa: PLR1730
-                    start = time
-                if time > end:  # noqa: PLR1730
-                    end = time
-                if len(content) > most:
-                    chunk.start, chunk.end = start, end
-                    self.flush()
-                    break
-            chunk.start, chunk.end = start, end
+        if len(payloads) > _FEW:
+            self._append(join_messages(channels, times, payloads))
+        else:
+            for message in zip(channels, times, payloads, times, strict=True):
+                self.add_message(*message)
 
     def write(self, blocks: Sequence[Block]) -> None:
         """Append blocks of messages, merged in the order of their log times.

@@ -8,7 +8,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64, gather, scatter
-from hearthlog.schemas.mcap.formats import MESSAGE_FIXED, MESSAGE_HEAD
+from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_FIXED, MESSAGE_HEAD
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 
 
@@ -106,6 +106,38 @@ class MessageRecords(NamedTuple):
     sizes: Int64
     channels: Int64
     times: Int64
+
+
+def join_messages(
+    channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
+) -> MessageRecords:
+    """Encode messages as records, in their order.
+
+    Parameters
+    ----------
+    channels : sequence of int
+        Number of the channel of each; one message at least.
+    times : sequence of int
+        Log time of each, which is also its publish time, in nanoseconds; ascending.
+    payloads : sequence of bytes
+    """
+    heads = np.empty(len(payloads), MESSAGE_HEAD)
+    heads["opcode"] = Opcode.MESSAGE
+    heads["length"] = np.fromiter(map(len, payloads), np.int64, len(payloads)) + MESSAGE_FIXED
+    heads["channel"] = channels
+    heads["sequence"] = 0
+    heads["log_time"] = heads["publish_time"] = times
+    pieces = [b""] * (2 * len(payloads))
+    pieces[::2] = heads.view(f"V{MESSAGE_HEAD.itemsize}").tolist()  # bytes; S would lose zeros
+    pieces[1::2] = payloads
+    sizes = heads["length"].astype(np.int64) + HEAD.size
+    return MessageRecords(
+        np.frombuffer(b"".join(pieces), np.uint8),
+        np.cumsum(sizes),
+        sizes,
+        heads["channel"].astype(np.int64),
+        heads["log_time"].astype(np.int64),
+    )
 
 
 def merge_blocks(blocks: Sequence[Block]) -> MessageRecords:
