@@ -19,10 +19,10 @@ def with_network(name: str) -> str:
 
 STARTERS = (*BY_FEATURES, *map(with_network, BY_FEATURES))
 SHA256 = {  # of their files, as `sha256sum` prints it
-    GENERAL: "e8d9881ca23c612b1ac56bf9ffa98c5db140215caf77ea71e39f60d2d6e6028c",
-    BATHROOM: "d3bb9a7f0a5a08a704e70744be52eedc9d07088c091022002e5d04c54458372e",
-    with_network(GENERAL): "4327d3a56cc170dc1bd54cfd391633a347f51dece33c20045a683eea96014f6a",
-    with_network(BATHROOM): "c0bb6c7efb362ea436b4ff9b97c079b9f0fcf01ddfe0931194c0966468bf79db",
+    GENERAL: "e3e7ee19f6e4d72ad2d96a0a542f73523909a01a732fd954673926946d2d50f9",
+    BATHROOM: "02858ba08481e7d780603cd9a21f00618e8dcb82b36e30f5bf5f895bf058a926",
+    with_network(GENERAL): "61f1c3a65b0bffd4529fb979a073452ce095a1ed4968fdbbe6e7336fdd784103",
+    with_network(BATHROOM): "75b6aa4555823e11bb8c640d20f7bc662aa0524b1542a49220528364f608e60b",
 }
 
 

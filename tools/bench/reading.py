@@ -28,7 +28,7 @@ from hearthlog.tools.bench.timing import BenchError, Seconds, best_of
 from hearthlog.tools.bench.workload import Workload
 
 _TOPIC = "/mic/features"
-_TWICE = Target(2, at_most=True)
+_SHARE = Target(1.3, at_most=True)
 _MINUTE_MILLISECONDS = Target(50, at_most=True)
 _MINUTE = 60_000_000_000
 _BLOCK = 32 << 10  # bytes, out of which rows are copied at once
@@ -89,9 +89,9 @@ def _rows_of_ours(name: str, best: Mapping[str, Seconds]) -> list[Row]:
     return [
         Row(f"{name}: to arrays", read.cpu, "s", elapsed=read.elapsed),
         Row(f"{name}: decompressed, nothing else", bare.cpu, "s", elapsed=bare.elapsed),
-        Row(f"{name}: to arrays / decompressed", read.cpu / bare.cpu, "", target=_TWICE),
+        Row(f"{name}: to arrays / decompressed", read.cpu / bare.cpu, ""),
         Row(checked, floor.cpu, "s", elapsed=floor.elapsed, note="what any reader must do"),
-        Row(f"{name}: to arrays / all that", read.cpu / floor.cpu, ""),
+        Row(f"{name}: to arrays / all that", read.cpu / floor.cpu, "", target=_SHARE),
     ]
 
 
