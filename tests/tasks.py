@@ -28,11 +28,14 @@ def add(first, second):
     return first + second
 
 
-def page_faults():
-    """Count the pages of the system that a hundred arrays of a megabyte take, one after another."""
+def page_faults(arrays=1):
+    """Count the pages that some arrays of a megabyte at once take of the system, a hundred times."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(100):
-        np.zeros(1 << 17).fill(1.0)  # 256 pages
+        held = [np.zeros(1 << 17) for _ in range(arrays)]  # 256 pages each
+        for array in held:
+            array.fill(1.0)
+        del held
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 

@@ -75,7 +75,8 @@ def windows(count, seed=2):
 
 def inputs_of(model, count, seed=3):
     vectors = model.arrays["landmarks"]
-    return np.ascontiguousarray(vectors[RNG(seed).permutation(len(vectors))[:count]], np.float32)
+    rows = np.resize(RNG(seed).permutation(len(vectors)), count)
+    return np.ascontiguousarray(vectors[rows], np.float32)
 
 
 def test_a_window_says_the_same_to_the_bit_whatever_is_computed_with_it():

@@ -404,7 +404,8 @@ def test_a_chunk_of_which_only_a_few_bytes_are_left_is_missed(log, recover, left
     behind = next(record.start for record in chunks if record.start > gone.start)
     end = next(record.start for record in records if record.opcode == DATA_END)
     recovery, _ = recover(data[: gone.start + left] + data[behind:end])
-    assert [damage.exact for damage in recovery.damages if not damage.cut] == [False]
+    # What is left may claim to end within the chunk behind, whose bytes are damaged then, too.
+    assert {damage.exact for damage in recovery.damages if not damage.cut} == {False}
 
 
 def test_messages_whose_channel_nothing_defines_are_counted(log, recover):

@@ -80,6 +80,11 @@ def test_a_worker_of_dask_uses_the_memory_of_freed_arrays_again(cluster):
         assert workers.submit(tasks.page_faults).result(LONG) < 2_000
 
 
+def test_a_process_uses_the_memory_of_freed_arrays_again():
+    with open_workers(2) as workers:
+        assert workers.submit(tasks.page_faults, 40).result(LONG) < 40 * 2_000
+
+
 def test_without_processes_a_task_is_done_when_it_was_submitted():
     with open_workers() as workers:
         future = workers.submit(tasks.own_id)

@@ -377,8 +377,8 @@ class _Frames(NamedTuple):
             np.concatenate([self.features, others.features]),
             np.concatenate([self.powers, others.powers]),
             np.concatenate([self.stamps, others.stamps]),
-            _joined(self.floors, others.floors),
-            _joined(self.bands, others.bands),
+            _both(self.floors, others.floors),
+            _both(self.bands, others.bands),
         )
 
     def last(self, count: int) -> "_Frames":
@@ -392,7 +392,7 @@ class _Frames(NamedTuple):
         )
 
 
-def _joined(before: Float64 | None, after: Float64 | None) -> Float64 | None:
+def _both(before: Float64 | None, after: Float64 | None) -> Float64 | None:
     return None if before is None or after is None else np.concatenate([before, after])
 
 
