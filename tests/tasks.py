@@ -29,7 +29,7 @@ def add(first, second):
 
 
 def page_faults(arrays=1):
-    """Count the pages that some arrays of a megabyte at once take of the system, a hundred times."""
+    """Count the pages that arrays of a megabyte, some at once, take of the system in 100 rounds."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(100):
         held = [np.zeros(1 << 17) for _ in range(arrays)]  # 256 pages each
