@@ -19,8 +19,8 @@ def keep_one_heap() -> None:
 def keep_freed_blocks() -> None:
     """Let freed arrays be used again, instead of giving them back to the system.
 
-    glibc gives back what is free above the last block in use, up to 64 MB here: a tenth of the time
-    of relabelling went into having it again, and half where a nanny of Dask asks for it.
+    Of what is free above the last block in use, glibc keeps 64 MB then. Otherwise a tenth of the
+    time of relabelling goes into having it again, and half where a nanny of Dask has set less.
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt

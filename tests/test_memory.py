@@ -1,4 +1,4 @@
-"""What the recorder took for a while, it gives back."""
+"""The recorder gives back the memory that it needed for a while."""
 
 import subprocess
 import sys

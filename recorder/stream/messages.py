@@ -27,8 +27,8 @@ def encoded_messages(
     topic_name: str, log_times: Int64, rows: Sequence[bytes]
 ) -> list[EncodedMessage]:
     """Return the messages of one topic, by their log times and their CDR."""
-    fields = zip(log_times.tolist(), repeat(topic_name), rows)
-    # `EncodedMessage` itself takes three times as long, which is most of an hour's messages.
+    fields = zip(log_times.tolist(), [topic_name] * len(rows), rows, strict=True)
+    # `EncodedMessage` itself takes three times as long, 150,000 times in an hour.
     return list(map(tuple.__new__, repeat(EncodedMessage), fields))
 
 
