@@ -194,7 +194,7 @@ def test_long_blocks_end_at_gaps_and_where_the_source_fails():
         def events(self, stop):
             del stop
             frames = np.zeros((200, FRAME_SAMPLES), np.float32)
-            for number in range(8):
+            for number in range(9):
                 stamps = START + (200 * number + np.arange(200)) * FRAME_NANOSECONDS
                 yield SourceHealth(int(stamps[0]), OK, READING)
                 yield Frames(200 * number, frames, stamps)
@@ -204,7 +204,7 @@ def test_long_blocks_end_at_gaps_and_where_the_source_fails():
             raise SourceError("the file is damaged")
 
     events = LongBlocks(Source()).events(Event())
-    assert lengths(itertools.islice(events, 5)) == [400, 1200]
+    assert lengths(itertools.islice(events, 7)) == [400, 1200, 200]
     with pytest.raises(SourceError, match="damaged"):
         next(events)
 
