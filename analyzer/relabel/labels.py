@@ -1,14 +1,15 @@
 """The tasks of a worker: the labels and segments of logs, and the layers that hold them."""
 
-from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from itertools import chain, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.relabel.jobs import Job
@@ -34,7 +35,7 @@ from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.labels.labeller import segment_columns
+from hearthlog.models.labels.labeller import FrameLabels, label_columns, segment_columns
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.arrays import Int64
@@ -42,13 +43,12 @@ from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
-from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.provenance import METADATA
-from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.storage.new_files import new_file, readers_of, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 _CHUNK_SPAN = 60 * NANOSECONDS  # who wants segments alone reads the minutes in which some end
+_PIECE_SPAN = 600 * NANOSECONDS  # of labels that are encoded at once
 
 
 class LabelledSound(NamedTuple):
@@ -96,7 +96,7 @@ class LabelledSound(NamedTuple):
 class UnfinishedLayer(NamedTuple):
     """The labels of a log, and the segments of each of its microphones."""
 
-    part: Path  # a file of the labels alone
+    part: Path  # of labels, as `_row_type` has them, one microphone behind the other
     inputs: LayerInputs
     node: str
     provenance: Mapping[str, str]  # the `hearthlog` record of the log
@@ -224,20 +224,17 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
         "method": f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
     }
     topics = [layer_topics(s.microphone, model.name, classifier.classes) for s in labelled.sounds]
-    segments = [segments.name for _, segments in topics]
+    segments = [
+        _segments_of(segments.name, sound, classifier.classes)
+        for (_, segments), sound in zip(topics, labelled.sounds, strict=True)
+    ]
     put = replaced_file if job.replaces else new_file
     try:
         with put(job.layer, readers=readers_of(job.log)) as temporary, temporary.open("xb") as out:
-            writer = LogStreamWriter(out, [topic for pair in topics for topic in pair])
-            current = 0
-            for minute, labels, decided in _by_minutes(labelled):
-                if minute != current:
-                    writer.flush()
-                    current = minute
-                rows = zip(segments, decided, labelled.sounds, strict=True)
-                writer.write_columns(
-                    [_segments_of(*row, classifier.classes) for row in rows], labels
-                )
+            writer = LogStreamWriter(out, list(chain.from_iterable(topics)), _CHUNK_SPAN)
+            labels = _read_labels(labelled, [topic.name for topic, _ in topics], classifier.classes)
+            for batch in _in_pieces([*labels, *segments]):
+                writer.write_columns(batch)
             record = layer_record(metadata, job.log.name, labelled.node, more)
             writer.add_metadata(METADATA, record)
             writer.finish(job.layer.name)
@@ -247,37 +244,41 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     delete_parts(job.layer)
 
 
-def _by_minutes(
-    labelled: UnfinishedLayer,
-) -> Iterator[tuple[int, list[RawMessages], list[Sequence[Segment]]]]:
-    """Yield what is known in each minute: its labels, and the segments of each microphone.
-
-    The last segments come with a minute of their own. A minute may come in pieces.
-    """
-    times = [[segment.decided_at for segment in sound.segments] for sound in labelled.sounds]
-    done = [0] * len(times)
-
-    def segments(ends: Sequence[int]) -> list[Sequence[Segment]]:
-        return [s.segments[a:b] for s, a, b in zip(labelled.sounds, done, ends, strict=True)]
-
-    for batch in iterate_messages([labelled.part]):
-        batch.sort(key=lambda messages: messages.channel.topic)
-        known = np.concatenate([messages.log_times for messages in batch])
-        for minute in np.unique(known // _CHUNK_SPAN).tolist():
-            start = minute * _CHUNK_SPAN
-            end = min(start + _CHUNK_SPAN, int(known.max()) + 1)
-            labels = [messages.between(start, end) for messages in batch]
-            ends = [bisect_left(same, end) for same in times]
-            yield minute, [messages for messages in labels if len(messages)], segments(ends)
-            done = ends
-    yield -1, [], segments([len(same) for same in times])
+def _in_pieces(batches: Sequence[TopicBatch]) -> Iterator[list[TopicBatch]]:
+    """Cut messages of several topics at the same times."""
+    times = np.concatenate([batch.log_times for batch in batches])
+    begins = np.unique(times // _PIECE_SPAN)[1:] * _PIECE_SPAN
+    places = [batch.log_times.searchsorted(begins).tolist() for batch in batches]
+    for parts in zip(*(pairwise([0, *each, None]) for each in places), strict=True):
+        yield [_part(batch, slice(*part)) for batch, part in zip(batches, parts, strict=True)]
 
 
-def _segments_of(
-    topic: str, segments: Sequence[Segment], sound: LabelledSound, classes: Sequence[str]
-) -> TopicBatch:
-    times: Int64 = np.array([segment.decided_at for segment in segments], np.int64)
-    return TopicBatch(topic, times, segment_columns(segments, classes, sound.microphone))
+def _part(batch: TopicBatch, rows: slice) -> TopicBatch:
+    fields = {
+        path: column if isinstance(column, str) else column[rows]
+        for path, column in batch.fields.items()
+    }
+    return TopicBatch(batch.topic, batch.log_times[rows], fields)
+
+
+def _read_labels(
+    labelled: UnfinishedLayer, topics: Sequence[str], classes: Sequence[str]
+) -> list[TopicBatch]:
+    """Read the labels of each microphone from the part."""
+    stored, first = labelled.part.read_bytes(), 0
+    batches = []
+    for topic, sound in zip(topics, labelled.sounds, strict=True):
+        rows = np.frombuffer(stored, _row_type(len(classes)), sound.frames, first)
+        first += rows.nbytes
+        rows = rows[rows["known_at"].argsort(kind="stable")]  # a sound card's time may jump back
+        fields = label_columns(rows, classes, sound.microphone)
+        batches.append(TopicBatch(topic, rows["known_at"].copy(), fields))
+    return batches
+
+
+def _segments_of(topic: str, sound: LabelledSound, classes: Sequence[str]) -> TopicBatch:
+    times: Int64 = np.array([segment.decided_at for segment in sound.segments], np.int64)
+    return TopicBatch(topic, times, segment_columns(sound.segments, classes, sound.microphone))
 
 
 @lru_cache(2)
@@ -304,7 +305,7 @@ def _label(
     infos, left_out = infos_for_model(log, model, job.log)
     begun = [_begin(job, info, before.get(info.microphone), classifier) for info in infos]
     part = part_path(job.layer)
-    frames = _write_labels(part, job, begun, model)
+    frames = _write_labels(part, job, begun)
     following = [_goes_on(job, each) for each in begun]
     ends = zip(begun, frames, following, strict=True)
     sounds = [_end(each, count, goes_on=bool(goes_on)) for each, count, goes_on in ends]
@@ -358,35 +359,38 @@ def _end(begun: _Begun, frames: int, *, goes_on: bool) -> LabelledSound:
     )
 
 
-def _write_labels(part: Path, job: Job, begun: Sequence[_Begun], model: Model) -> list[int]:
+def _write_labels(part: Path, job: Job, begun: Sequence[_Begun]) -> list[int]:
     """Write the labels of a log to a new file; return how many each microphone has."""
-    pairs = [layer_topics(each.info.microphone, model.name, model.classes) for each in begun]
-    topics = [labels for labels, _ in pairs]
     try:
         with part.open("xb") as out:
-            writer = LogStreamWriter(out, topics)
-            frames = [
-                _write_sound(writer, labels.name, each)
-                for each, labels in zip(begun, topics, strict=True)
-            ]
-            writer.finish(part.name)
+            return [_write_sound(out, each) for each in begun]
     except BaseException as error:
         with suppress(OSError):
             part.unlink()
         if isinstance(error, OSError):
             raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
         raise
-    return frames
 
 
-def _write_sound(writer: LogStreamWriter, topic: str, begun: _Begun) -> int:
-    """Write the labels of one microphone, in chunks of their own, and count them."""
+def _write_sound(out: BinaryIO, begun: _Begun) -> int:
+    """Write the labels of one microphone, and count them."""
     frames = 0
     for event in read_sound(begun.info, 0, auxiliary=begun.labeller.takes_auxiliary):
         labels = begun.labeller.push(event)
         if labels is not None:
-            columns = labels.columns(begun.info.microphone)
-            writer.write_columns([TopicBatch(topic, labels.known_at, columns)])
-            frames += len(labels.stamps)
-    writer.flush()
+            out.write(_rows_of(labels).tobytes())
+            frames += len(labels.frames)
     return frames
+
+
+def _rows_of(labels: FrameLabels) -> NDArray[np.void]:
+    rows = np.empty(len(labels.frames), _row_type(len(labels.classes)))
+    for name in rows.dtype.names or ():
+        rows[name] = getattr(labels, name)
+    return rows
+
+
+def _row_type(classes: int) -> np.dtype[np.void]:
+    """Return the type of a label in the part of a layer."""
+    times = [(name, np.int64) for name in ("frames", "stamps", "known_at")]
+    return np.dtype([*times, ("probabilities", np.float32, (classes,)), ("novelty", np.float32)])

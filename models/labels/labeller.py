@@ -1,6 +1,6 @@
 """From the features of one stream to labels and segments, and to columns of their messages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -71,16 +71,34 @@ class FrameLabels(NamedTuple):
         dict of str to column
             By field path, as `encode_groups` takes them.
         """
-        best = self.probabilities.argmax(axis=1)
-        return {
-            "header.stamp": self.stamps,
-            "header.frame_id": microphone,
-            "frame": self.frames,
-            "label": np.array(self.classes, object)[best],
-            "confidence": self.probabilities[np.arange(len(best)), best],
-            "novelty": self.novelty,
-            "probabilities": self.probabilities,
-        }
+        return label_columns(self._asdict(), self.classes, microphone)
+
+
+def label_columns(
+    labels: Mapping[str, Any] | NDArray[np.void], classes: Sequence[str], microphone: str
+) -> dict[str, Column]:
+    """Return the fields of one `AudioLabel` for each frame.
+
+    Parameters
+    ----------
+    labels : mapping of str to array, or structured array
+        With the names `frames`, `stamps`, `probabilities` and `novelty` of `FrameLabels`.
+    classes : sequence of str
+        Names behind the columns of the probabilities.
+    microphone : str
+        Its name.
+    """
+    probabilities = labels["probabilities"]
+    best = probabilities.argmax(axis=1)
+    return {
+        "header.stamp": labels["stamps"],
+        "header.frame_id": microphone,
+        "frame": labels["frames"],
+        "label": np.array(classes, object)[best],
+        "confidence": probabilities[np.arange(len(best)), best],
+        "novelty": labels["novelty"],
+        "probabilities": probabilities,
+    }
 
 
 class Labeller:

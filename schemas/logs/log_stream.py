@@ -10,8 +10,8 @@ import numpy as np
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.counted_writer import CountedWriter
-from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
-from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.mcap.message_blocks import Block
+from hearthlog.schemas.mcap.stored_chunk import LATEST
 from hearthlog.schemas.messages.cdr_codec import Column, encode_groups
 from hearthlog.schemas.messages.message_types import definition, type_hash
 from hearthlog.schemas.messages.topics import Topic
@@ -55,12 +55,14 @@ class LogStreamWriter:
     stream : BinaryIO
         At its start; stays open.
     topics : sequence of Topic
+    chunk_span : int, optional
+        As of `ChunkWriter`.
     """
 
-    def __init__(self, stream: BinaryIO, topics: Sequence[Topic]) -> None:
+    def __init__(self, stream: BinaryIO, topics: Sequence[Topic], chunk_span: int = LATEST) -> None:
         self._channels: dict[str, int] = {}
         self._topics: dict[str, rosbag2.TopicCount] = {}
-        self._writer = CountedWriter(stream)
+        self._writer = CountedWriter(stream, chunk_span=chunk_span)
         self._writer.start(profile=PROFILE, library="hearthlog")
         schemas: dict[str, int] = {}
         for topic in topics:
@@ -113,9 +115,7 @@ class LogStreamWriter:
             channels = [self._channels[topic] for topic in topics]
             self._writer.add_messages(channels, times, payloads)
 
-    def write_columns(
-        self, batch: Sequence[TopicBatch], encoded: Sequence[RawMessages] = ()
-    ) -> None:
+    def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, in the order of their log times.
 
         The file is the same as if they had been encoded and written one by one.
@@ -124,9 +124,6 @@ class LogStreamWriter:
         ----------
         batch : sequence of TopicBatch
             Messages of one time are written in the order of the batch.
-        encoded : sequence of RawMessages
-            Messages of the writer's topics in another file, which are copied. Those of one time
-            come before those of the batch.
 
         Raises
         ------
@@ -135,9 +132,6 @@ class LogStreamWriter:
         """
         blocks: list[Block] = []
         first = 0
-        for messages in encoded:
-            blocks += message_blocks(messages, self._channels[messages.channel.topic], first)
-            first += len(messages)
         for part in batch:
             count = len(part.log_times)
             for rows, payloads in encode_groups(self._topics[part.topic].type, part.fields, count):
