@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-from hearthlog.tools.bench import recurring_scene
+from hearthlog.tools.lab import recurring_scene
 
 CLIPS = Path(__file__).parent / "data" / "household"
 RECURRING = {

@@ -5,7 +5,7 @@ from pathlib import Path
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools import home
-from hearthlog.tools.bench.conversations import clips_of_voices, converse, record_samples
+from hearthlog.tools.lab.conversations import clips_of_voices, converse, record_samples
 
 START = 1_772_352_000 * NANOSECONDS
 DAY = 86_400 * NANOSECONDS

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -29,7 +29,7 @@ from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.config_origins import key_lines
 from hearthlog.recorder.disk.keeping import keep_disk
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.tools.reference import configuration_page
+from hearthlog.tools.lab.reference import configuration_page
 
 
 @pytest.fixture
@@ -560,4 +560,6 @@ def test_any_text_has_lines_of_keys_or_none(text):
 
 def test_the_page_of_the_keys_is_that_of_this_version():
     page = Path(__file__).parents[1] / "docs/configuration.md"
-    assert page.read_text("utf-8") == configuration_page(), "python -m hearthlog.tools.reference"
+    assert page.read_text("utf-8") == configuration_page(), (
+        "python -m hearthlog.tools.lab.reference"
+    )

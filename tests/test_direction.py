@@ -103,7 +103,7 @@ def test_the_louder_of_two_sounds_is_located():
 
 @pytest.mark.parametrize(("snr", "most"), [(20, 5), (5, 15)])
 def test_sounds_in_a_room_with_an_echo_of_a_third_of_a_second_are_located(snr, most):
-    room = pytest.importorskip("hearthlog.tools.bench.direction_room", reason="not in the wheel")
+    room = pytest.importorskip("hearthlog.tools.lab.direction_room", reason="not in the wheel")
     rng = np.random.default_rng(1)
     clips = [bursts(3, seed)[SAMPLE_RATE:] for seed in range(3)]
     scene = room.room_scene(clips, np.array(SQUARE), 0.3, rng)

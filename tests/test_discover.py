@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
 import spliced
@@ -41,7 +41,7 @@ from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS, read_time
-from hearthlog.tools.bench.recurring_scene import OTHER
+from hearthlog.tools.lab.recurring_scene import OTHER
 
 START = 1_772_352_000 * NANOSECONDS
 DAY = 86_400 * NANOSECONDS

@@ -17,15 +17,15 @@ import typer
 from spliced import run
 from typer.testing import CliRunner
 
-pytest.importorskip("hearthlog.tools.month", reason="the wheel leaves what developers run out")
+pytest.importorskip("hearthlog.tools.lab.month", reason="the wheel leaves what developers run out")
 
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.bench.classifiers import classifiers as compare_classifiers
-from hearthlog.tools.bench.routine import main as judge_routines
 from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.__main__ import home as simulate_home
 from hearthlog.tools.home.simulate import write_day, write_training_set
-from hearthlog.tools.month.__main__ import month as simulate_month
+from hearthlog.tools.lab.classifiers import classifiers as compare_classifiers
+from hearthlog.tools.lab.month.__main__ import month as simulate_month
+from hearthlog.tools.lab.routine import main as judge_routines
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(

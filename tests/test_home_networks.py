@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 
-pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
 import spliced

@@ -4,7 +4,7 @@ import tracemalloc
 
 import pytest
 
-pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 from spoken import START, record_conversation, two_voices
 

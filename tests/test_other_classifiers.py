@@ -552,7 +552,7 @@ def test_what_a_person_marked_weighs_in_votes_as_in_all_else():
 
 
 def test_the_comparison_counts_the_bytes_of_the_file(models):
-    bench = pytest.importorskip("hearthlog.tools.bench.classifiers", reason="not in the wheel")
+    bench = pytest.importorskip("hearthlog.tools.lab.classifiers", reason="not in the wheel")
     for path in models.iterdir():
         model, data = load_model(path), path.read_bytes()
         others = model.transitions.nbytes + model.training_digests.nbytes
@@ -561,7 +561,7 @@ def test_the_comparison_counts_the_bytes_of_the_file(models):
 
 
 def test_the_comparison_tries_what_was_not_learned(monkeypatch):
-    bench = pytest.importorskip("hearthlog.tools.bench.classifiers", reason="not in the wheel")
+    bench = pytest.importorskip("hearthlog.tools.lab.classifiers", reason="not in the wheel")
     data, _ = data_of(3)
     group, names = np.arange(len(data)) // 4, ("one", "two", "three")
     data = replace(data, group=group, collection=group % 3, collection_names=names)

@@ -348,7 +348,7 @@ def test_a_rule_reads_five_weeks_and_waits_for_the_end_of_the_night():
 
 def test_a_simulated_home_misses_its_water():
     about = "the wheel leaves the benchmarks out"
-    routine = pytest.importorskip("hearthlog.tools.bench.routine", reason=about)
+    routine = pytest.importorskip("hearthlog.tools.lab.routine", reason=about)
     clips = pytest.importorskip("hearthlog.tools.home.clips")
     home = routine.simulate(3, 4, [routine.once_in], clips.ClipLibrary())
     assert (home.normal >= 30).mean() < 0.1

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
 import soundfile
@@ -23,8 +23,8 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.bench.conversations import converse, record_samples
 from hearthlog.tools.cli.main import make_app
+from hearthlog.tools.lab.conversations import converse, record_samples
 
 RATE = 16_000
 

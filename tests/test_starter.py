@@ -29,7 +29,7 @@ from hearthlog.models.starter import (
 )
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.starter import _write_sources
+from hearthlog.tools.lab.starter import _write_sources
 
 
 @pytest.fixture

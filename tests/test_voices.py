@@ -7,7 +7,7 @@ from threading import Event
 
 import pytest
 
-pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
 import soundfile
@@ -51,7 +51,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS, read_time
-from hearthlog.tools.bench.conversations import converse
+from hearthlog.tools.lab.conversations import converse
 
 SPREAD = voice_space().spread
 

@@ -28,7 +28,7 @@ _TAIL = 0.3  # share of the days by which the rare ones are judged
 _PRIOR_DAYS, _PRIOR_SHARE = 4, 0.15  # of the tail: days, and their excess as a share of its edge
 # By how much the tail of days to come is longer than that of days that are left out, which lie
 # between those they are compared with; more where there are fewer than 28 of these. Fitted to
-# the false alarms of simulated homes, seeds 0 to 9 of `tools/bench/routine.py`.
+# the false alarms of simulated homes, seeds 0 to 9 of `tools/lab/routine.py`.
 _LONGER = {1: 1.8, SPAN: 2.7}
 _DIFFERS = {1: 1.5, SPAN: 1.0}
 

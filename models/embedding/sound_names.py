@@ -2,7 +2,7 @@
 
 A name is an *event* only where a threshold was measured on recordings; others are *hints*, said
 too often to be counted. `audioset_names.csv` has names, words and durations, and what
-`hearthlog.tools.bench.names` measured.
+`hearthlog.tools.lab.names` measured.
 """
 
 import csv

@@ -1,0 +1,226 @@
+"""One microphone recorded live: how much of a core, and how much memory."""
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
+from hearthlog.models.embedding.networks import YAMNET, find_network
+from hearthlog.models.modelfile.modelfile import SUFFIX
+from hearthlog.models.modelfile.registry import CANDIDATE
+from hearthlog.models.starter import GENERAL, starter_file, with_network
+from hearthlog.recorder.embedder_probe import NO_NETWORK
+from hearthlog.recorder.sources import capture
+from hearthlog.schemas.frames import SAMPLE_RATE
+from hearthlog.tools.lab.bench.labmic import DEVICE, make_microphone
+from hearthlog.tools.lab.bench.table import Row, Table, Target
+from hearthlog.tools.lab.bench.timing import HEARTHLOG, BenchError
+from hearthlog.tools.lab.bench.workload import Workload
+
+_SECONDS = 60.0
+_SETTLE_SECONDS = 5.0
+_START_SECONDS = 30.0
+_HEARD_SECONDS = 10  # again and again; the device keeps them in memory
+_CPU = Target(0.5, at_most=True)
+_WITH_NETWORK = Target(1.0, at_most=True)
+_NETWORK_LOGS = "logs-network"
+_MEMORY = Target(120.0, at_most=True)
+_HEAVY = ("sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy")
+_NO_HEAVY = Target(0, at_most=True)
+_GAPS = 3  # exit status
+
+# Opens the microphone as the recorder does, and throws the sound away.
+_BARE = """
+import sys, sounddevice
+device, rate, block, latency = sys.argv[1:]
+sounddevice.RawInputStream(
+    samplerate=int(rate), blocksize=int(block), latency=float(latency),
+    device=device, channels=1, dtype="int16", callback=lambda *_: None,
+).start()
+sys.stdin.read()
+"""
+# `hearthlog`, which at its end writes the names of the modules it imported.
+_TELLING_MODULES = """
+import atexit, sys
+atexit.register(lambda: print(*sys.modules, file=sys.stderr))
+from hearthlog.tools.cli.main import main
+main()
+"""
+
+
+@dataclass(frozen=True)
+class _Usage:
+    """Seconds of CPU time and bytes of memory, of one process."""
+
+    cpu: float
+    memory: int
+
+
+def measure(work: Workload) -> Table:
+    """Record sound for a minute, also with a candidate and a network, and hear it doing nothing."""
+    size = RBF_LANDMARKS.summary(work.model)
+    title = f"live: one microphone for {_SECONDS:.0f} s, {size}"
+    try:
+        rows = _live(work)
+    except (BenchError, ImportError) as error:
+        rows = [
+            Row("hearthlog, all processes", None, "% of a core", target=_CPU, note=str(error)),
+            Row("their memory (PSS)", None, "MB", target=_MEMORY, note=str(error)),
+        ]
+    return Table(title, [*rows, _imports(work)])
+
+
+def _live(work: Workload) -> list[Row]:
+    env = make_microphone(work.folder, most_sounding(work.samples))
+    models = {"logs-live": work.model_file, "logs-on-trial": _beside_candidate(work)}
+    if find_network(YAMNET.name) is not None:
+        models[_NETWORK_LOGS] = starter_file(with_network(GENERAL))
+    folders = {work.folder / name: model for name, model in models.items()}
+    block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
+    latency = capture.LATENCY_SECONDS
+    bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
+    with ExitStack() as stack:
+        recorders = [
+            stack.enter_context(running(_recorder(model, folder), _environment(env, folder)))
+            for folder, model in folders.items()
+        ]
+        processes = [*recorders, stack.enter_context(running(bare, env))]
+        for recorder, folder in zip(recorders, folders, strict=True):
+            wait_for_log(folder, recorder)
+        time.sleep(_SETTLE_SECONDS)
+        before, began = [usage(process) for process in processes], time.monotonic()
+        time.sleep(_SECONDS)
+        after, seconds = [usage(process) for process in processes], time.monotonic() - began
+        for recorder in recorders:
+            recorder.terminate()
+        ends = [recorder.wait(timeout=_START_SECONDS) for recorder in recorders]
+    if [one.keys() for one in before] != [one.keys() for one in after]:
+        raise BenchError("the recorder lost the microphone while it was measured")
+    percents = [
+        [100 * (last[pid].cpu - first[pid].cpu) / seconds for pid in first]
+        for first, last in zip(before, after, strict=True)
+    ]
+    megabytes = [[usage.memory / 1e6 for usage in last.values()] for last in after]
+    notes = ["sound was lost: the machine was busy" if end == _GAPS else "" for end in ends]
+    return _rows(percents, megabytes, notes)
+
+
+def _environment(env: dict[str, str], logs: Path) -> dict[str, str]:
+    """Let one recorder listen with the network: without a word, all would where it is installed."""
+    network = YAMNET.name if logs.name == _NETWORK_LOGS else NO_NETWORK
+    return env | {"HEARTHLOG_EMBEDDING": network}
+
+
+def _recorder(model: Path, logs: Path) -> list[object]:
+    return [*HEARTHLOG, "record", "--device", DEVICE, "--model", model, "--output", logs]
+
+
+def _beside_candidate(work: Workload) -> Path:
+    """Copy the model to a folder with a candidate; the same model would not label twice."""
+    folder = work.folder / "on-trial"
+    folder.mkdir()
+    shutil.copy(starter_file(GENERAL), folder / (CANDIDATE + SUFFIX))
+    return Path(shutil.copy(work.model_file, folder))
+
+
+def most_sounding(samples: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Return the ten seconds in which most seconds are loud: in quiet a model is hardly asked."""
+    seconds = samples[: len(samples) // SAMPLE_RATE * SAMPLE_RATE].reshape(-1, SAMPLE_RATE)
+    levels = np.log10(np.einsum("ij,ij->i", seconds, seconds, dtype=np.float64) + 1.0)
+    sums = np.convolve(levels, np.ones(min(_HEARD_SECONDS, len(levels))), "valid")
+    return seconds[sums.argmax() :][:_HEARD_SECONDS].ravel()
+
+
+def _rows(percents: list[list[float]], megabytes: list[list[float]], notes: list[str]) -> list[Row]:
+    """Make rows of what recorders and the bare microphone have used.
+
+    A recorder alone, one with a candidate, and one with a network if it is installed.
+    """
+    unit, names = "% of a core", ("recorder", "capture")
+    alone, on_trial, *network, (bare,) = percents
+    rows = [Row("hearthlog, all processes", sum(alone), unit, target=_CPU, note=notes[0])]
+    rows += [Row(f"  {n}", p, unit) for n, p in zip(names, alone, strict=True)]
+    rows += [
+        Row("with a candidate, all processes", sum(on_trial), unit, note=notes[1]),
+        *(
+            Row("with the network, all processes", sum(used), unit, None, _WITH_NETWORK, note)
+            for used, note in zip(network, notes[2:], strict=True)
+        ),
+        Row("the bare microphone", bare, unit, note="opened alike, sound thrown away"),
+    ]
+    alone, on_trial, *network, (bare,) = megabytes
+    rows += [Row("memory (PSS), all processes", sum(alone), "MB", target=_MEMORY)]
+    rows += [Row(f"  {n}", m, "MB") for n, m in zip(names, alone, strict=True)]
+    rows += [Row("memory with a candidate", sum(on_trial), "MB")]
+    rows += [Row("memory with the network", sum(used), "MB") for used in network]
+    return [*rows, Row("the bare microphone, memory", bare, "MB")]
+
+
+@contextmanager
+def running(command: list[object], env: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a process that ends with the block, or with this process if that is killed."""
+    process = subprocess.Popen(  # noqa: S603  our own
+        ["setpriv", "--pdeathsig", "KILL", *map(str, command)],  # noqa: S607  where it is, differs
+        env=env,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait_for_log(logs: Path, recorder: subprocess.Popen[bytes]) -> None:
+    """Wait until a recorder writes."""
+    deadline = time.monotonic() + _START_SECONDS
+    while not any(logs.rglob("*.active")):
+        if time.monotonic() > deadline or recorder.poll() is not None:
+            raise BenchError("the recorder did not start with the microphone of the tests")
+        time.sleep(0.1)
+
+
+def usage(process: subprocess.Popen[bytes]) -> dict[int, _Usage]:
+    """Read what a process, and then those it started, have used so far, by process id."""
+    import psutil  # noqa: PLC0415  an extra, like the peers
+
+    try:
+        root = psutil.Process(process.pid)
+        return {
+            one.pid: _Usage(_seconds_on_cpu(one.pid), one.memory_full_info().pss)
+            for one in (root, *root.children(recursive=True))
+        }
+    except (psutil.Error, OSError) as error:
+        raise BenchError(f"a process ended while it was measured ({error})") from error
+
+
+def _seconds_on_cpu(pid: int) -> float:
+    """Add up what the scheduler counted for each thread; other figures are sampled at ticks."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
+
+
+def _imports(work: Workload) -> Row:
+    """Ask a recorder what it imported."""
+    second = work.write_wav("imports.wav", 2.0)
+    logs = work.folder / "logs-imports"
+    arguments = ["record", second, "--model", work.model_file, "--output", logs]
+    command = [sys.executable, "-c", _TELLING_MODULES, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  ours
+    if done.returncode != 0:
+        raise BenchError(f"hearthlog record failed: {done.stderr.strip()[-300:]}")
+    modules = done.stderr.split()
+    heavy = sorted({name.split(".")[0] for name in modules} & set(_HEAVY))
+    note = f"{len(modules)} modules; " + (f"MUST NOT: {', '.join(heavy)}" if heavy else "none of ")
+    note += "" if heavy else ", ".join(_HEAVY)
+    return Row("heavy imports of the recorder", len(heavy), "packages", None, _NO_HEAVY, note)
