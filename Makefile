@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test test-fast test-wheel test-lowest test-3.13 test-ros check docs bench bench-history \
+.PHONY: install demo test test-fast test-lab test-wheel test-lowest test-3.13 test-ros check docs bench bench-history \
 	bench-check starter dist clean
 
 # What a machine with a microphone and a screen needs, in .venv.
@@ -17,6 +17,10 @@ demo: $(VENV)/.analyzer
 # Three at once, for many tests wait for sound.
 test: $(VENV)/.dev
 	$(BIN)/pytest -n 3 $(if $(SEED),--hypothesis-seed=$(SEED))
+
+# What developers measure with: a short form of each.
+test-lab: $(VENV)/.dev
+	$(BIN)/pytest -n 3 tests/lab
 
 # A little of every room, in two minutes.
 test-fast: $(VENV)/.dev
@@ -82,21 +86,21 @@ dist: $(VENV)/.dev
 	$(BIN)/pyproject-build --quiet --outdir build/dist
 
 bench: $(VENV)/.dev
-	$(BIN)/python -m hearthlog.tools.bench
+	$(BIN)/python -m hearthlog.tools.lab.bench
 
 # The same, kept, and the course of the figures drawn anew.
 bench-history: $(VENV)/.dev
-	$(BIN)/python -m hearthlog.tools.bench --record docs/benchmarks.jsonl
-	$(BIN)/python -m hearthlog.tools.bench.history docs/benchmarks.jsonl docs/benchmarks.svg
+	$(BIN)/python -m hearthlog.tools.lab.bench --record docs/benchmarks.jsonl
+	$(BIN)/python -m hearthlog.tools.lab.bench.history docs/benchmarks.jsonl docs/benchmarks.svg
 
 # What is quick, compared with the last run that was kept: fails where speed was lost.
 bench-check: $(VENV)/.dev
-	$(BIN)/python -m hearthlog.tools.bench --check docs/benchmarks.jsonl
+	$(BIN)/python -m hearthlog.tools.lab.bench --check docs/benchmarks.jsonl
 
 # The models that come with hearthlog, learned anew: make starter DATA="a/manifest.csv b/manifest.csv", and those for a
 # network with METHOD=embedding
 starter: $(VENV)/.dev
-	$(BIN)/python -m hearthlog.tools.starter $(DATA) -o models/starter --method $(or $(METHOD),room)
+	$(BIN)/python -m hearthlog.tools.lab.starter $(DATA) -o models/starter --method $(or $(METHOD),room)
 
 $(VENV)/.analyzer: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
