@@ -3,7 +3,7 @@
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event as Flag
@@ -38,16 +38,28 @@ def run(
     capfd: pytest.CaptureFixture[str], *arguments: object, env: Mapping[str, str] | None = None
 ) -> Result:
     """Run the command in this process, which is faster than in one of its own."""
+    return run_function(capfd, main, *arguments, env=env)
+
+
+def run_function(
+    capfd: pytest.CaptureFixture[str],
+    function: Callable[[], object],
+    *arguments: object,
+    env: Mapping[str, str] | None = None,
+) -> Result:
+    """Run what takes its arguments from the command line."""
     capfd.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["hearthlog", *map(str, arguments)])
         for name, value in (env or {}).items():
             patch.setenv(name, value)
         try:
-            main()
+            function()
             status = 0
         except SystemExit as end:
-            status = int(end.code or 0)
+            if isinstance(end.code, str):
+                sys.stderr.write(f"{end.code}\n")
+            status = 1 if isinstance(end.code, str) else int(end.code or 0)
     return Result(status, *capfd.readouterr())
 
 

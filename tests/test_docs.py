@@ -48,7 +48,7 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 NOT_HERE = re.compile(
     r"hearthlog( record( --model \S+)?( --keep-audio \w+)?( --config \S+)?$| devices| watch| demo"
     r"| models fetch yamnet| install-service| bridge|.*--start 2026-03-10 "
-    r"| evaluate (adaptation|paper)|.* s3://|.*tcp:|.* --web"
+    r"|.* s3://|.*tcp:|.* --web"
     r"|.* --microphone USB|.* --folds collection| discover| voices|.* speakers |.* mood.toml"
     r"|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
     r"| review(?!.* --save))"

@@ -482,9 +482,6 @@ def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
         (("log", *compared), 1, "no such log"),
         (("model", "m.safetensors", "--data", "d"), 1, "no such model file"),
         (("method", "--data", "d", "--scenario", "general", "--plot", "p.pdf"), 2, "*.png"),
-        (("search", "--data", "d", "--scenario", "general", "--folds", "x"), 2, "'collection'"),
-        (("search", "embedding", "--data", "d", "--scenario", "general"), 2, "such as room"),
-        (("adaptation", "embedding", "--data", "d", "--scenario", "general"), 2, "such as room"),
     )
     for words, status, said in cases:
         result = hearthlog("evaluate", *words)

@@ -18,7 +18,7 @@ from hearthlog.tools.cli.main import PANELS, make_app
 
 _WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
 _TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
-_WAYS = ("log", "model", "scenes", "robustness", "method", "search", "adaptation", "paper")
+_WAYS = ("log", "model", "scenes", "method")
 _HEAVY = {"numpy", "rosbags", "mcap", "soundfile", "sounddevice"}
 
 
@@ -123,7 +123,7 @@ def completed(*words):
         (("hearthlog", "models", "pro"), ["promote"]),
         (("hearthlog", "evaluate", ""), [*_WAYS]),
         (("hearthlog", "evaluate", "--model", "m", "--he"), ["--help"]),
-        (("hearthlog", "evaluate", "search", "--fo"), ["--folds"]),
+        (("hearthlog", "evaluate", "method", "--fo"), ["--folds"]),
         (
             ("hearthlog", "record", "--max-bag"),
             ["--max-bag-duration", "--max-bag-files", "--max-bag-size"],
@@ -188,8 +188,6 @@ def test_what_is_not_installed_is_named_with_a_command_that_installs_it(
         ("evaluate --data=clips --model=m.safetensors", "evaluate model"),
         ("evaluate logs --reference review", "evaluate log"),
         ("evaluate --data clips --scenario general --folds source", "evaluate method"),
-        ("evaluate --data clips --scenario general --folds source --search", "evaluate search"),
-        ("evaluate --data clips --scenario general --adaptation", "evaluate adaptation"),
         ("info homes --catalog", "catalog"),
     ],
 )
@@ -199,6 +197,23 @@ def test_what_a_verb_was_called_before_names_the_verb_of_now(hearthlog, words, v
     assert f"say `hearthlog {verb} " in result.stderr
     assert result.stderr.count("\n") == 1
     assert tuple(verb.split()) in VERBS
+
+
+@pytest.mark.parametrize(
+    ("words", "module"),
+    [
+        ("evaluate paper --data clips", "paper"),
+        ("evaluate robustness general --data clips", "robustness"),
+        ("evaluate search paper --data clips --scenario bathroom", "grid_search"),
+        ("evaluate --data clips --scenario general --folds source --search", "grid_search"),
+        ("evaluate --data clips --scenario general --adaptation", "adaptation_curve"),
+    ],
+)
+def test_a_verb_that_went_to_the_lab_names_its_module(hearthlog, words, module):
+    result = hearthlog(*words.split())
+    assert (result.returncode, result.stdout) == (2, "")
+    assert f"say `python -m hearthlog.tools.lab.{module} " in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_the_help_shows_every_verb_in_its_panel():

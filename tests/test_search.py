@@ -1,7 +1,6 @@
 """Searching for cost and gamma, and learning in threads or on a Dask cluster alike."""
 
 import dataclasses
-import json
 import os
 import pty
 import sys
@@ -18,12 +17,8 @@ from joblib import delayed
 from spliced import run
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from hearthlog.analyzer.errors import DataError, WorkerError
-from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
-from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
-from hearthlog.analyzer.evaluation.grid_search import search
+from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.training.cross_validation import cross_validate
-from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
@@ -62,33 +57,6 @@ def test_a_search_tries_less_as_much_and_more_of_both():
     }
 
 
-def test_a_search_puts_first_what_tells_segments_apart_best():
-    data, _ = blobs(3, 40, features=PAPER.features)
-    useless = dataclasses.replace(
-        PAPER, gamma=1e4
-    )  # so sharp that it knows nothing but what it has seen
-    tried = search(data, [useless, PAPER], "source", ignore_progress)
-    assert [one.method for one in tried] == [PAPER, useless]
-    assert tried[0].scores.macro_f1 > tried[1].scores.macro_f1 + 0.2
-
-
-def test_a_search_finds_the_figures_that_cross_validation_finds():
-    data, _ = blobs(3, 40, features=PAPER.features)
-    steps = []
-    methods = PAPER.variations()[:2]
-    tried = search(data, methods, "source", steps.append)
-    for method, scores in tried:
-        assert scores == evaluate_method(data, method, "source", ignore_progress).scores
-    assert steps == pytest.approx([done / 10 for done in range(1, 11)])
-
-
-def test_a_search_over_segments_that_are_all_alike_is_refused():
-    data, _ = blobs(2, 20, features=PAPER.features)
-    flat = dataclasses.replace(data, windows=np.ones_like(data.windows))
-    with pytest.raises(DataError, match="all segments are alike"):
-        search(flat, PAPER.variations(), "source", ignore_progress)
-
-
 def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
     data, _ = blobs(3, 60, features=PAPER.features)
     methods, examples = PAPER.variations()[:3], prepare(PAPER, data)
@@ -98,16 +66,6 @@ def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
         there = cross_validate(*arguments)
     assert not np.isnan(here).any()
     np.testing.assert_array_equal(here, there)
-
-
-def test_a_cluster_adapts_as_threads_do(cluster):
-    data, _ = blobs(3, 400, spread=3.0)
-    group = np.arange(len(data)) // 4
-    data = dataclasses.replace(data, group=group, collection=group % 2, collection_names=("a", "b"))
-    method = dataclasses.replace(ROOM, landmarks=60)
-    here = adaptation_curve(data, method, ignore_progress)
-    with fits_on(cluster):
-        assert adaptation_curve(data, method, ignore_progress) == here
 
 
 def blas_threads():
@@ -173,21 +131,6 @@ def test_a_model_learned_with_a_cluster_is_the_same_file(cluster, clips, tmp_pat
     assert here.description.parameters["cost"] == 2
     assert here.description.parameters["gamma"] == pytest.approx(PAPER.gamma / 42)
     assert here.sha256 == there.sha256
-
-
-def test_what_a_search_found_can_be_trained_with(clips, tmp_path, hearthlog):
-    words = ["--data", clips, "--scenario", "bathroom"]
-    printed = hearthlog("evaluate", "search", "paper", *words).stdout
-    result = hearthlog("evaluate", "search", "paper", *words, "--json")
-    found = json.loads(result.stdout)["tried"]
-    assert len(found) == 9
-    assert found == sorted(found, key=lambda one: -one["macro_f1"])
-    best = found[0]
-    chosen = ["--cost", f"{best['cost']:g}", "--gamma", f"{best['gamma']:g}"]
-    assert " ".join(chosen) in printed
-    words += ["--method", "paper"]
-    done = hearthlog("train", *words, *chosen, "-o", tmp_path / "a.safetensors", "--json")
-    assert json.loads(done.stdout)["metrics"]["macro_f1"] == pytest.approx(best["macro_f1"])
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from hearthlog.schemas.text import shortened
-from hearthlog.tools.cli.evaluate_paper import paper
-from hearthlog.tools.cli.evaluate_sounds import learned_lines, robustness, scenes
+from hearthlog.tools.cli.evaluate_scenes import learned_lines, scenes
 from hearthlog.tools.cli.options import (
     METHOD,
     METHODS,
@@ -28,8 +27,8 @@ from hearthlog.tools.cli.options import (
     starter_here,
 )
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
-from hearthlog.tools.cli.table import NAME_WIDTH, print_table
+from hearthlog.tools.cli.scores import print_reliability, print_scores, print_skipped
+from hearthlog.tools.cli.table import NAME_WIDTH
 from hearthlog.tools.cli.text import (
     end_with_warnings,
     number,
@@ -48,11 +47,17 @@ if TYPE_CHECKING:
     from hearthlog.schemas.progress import Progress
 
 _MOVED = {  # options of one verb that is several now
-    "--adaptation": "adaptation",
-    "--search": "search",
     "--folds": "method",
     "--model": "model",
     "--reference": "log",
+}
+_LAB = {  # verbs and options that are modules of `hearthlog.tools.lab` now
+    "paper": "paper",
+    "robustness": "robustness",
+    "search": "grid_search",
+    "--search": "grid_search",
+    "adaptation": "adaptation_curve",
+    "--adaptation": "adaptation_curve",
 }
 
 
@@ -62,6 +67,10 @@ class _Group(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the words behind `evaluate`."""
         options = {word.partition("=")[0] for word in args}
+        module = next((_LAB[word] for word in (*args[:1], *options) if word in _LAB), None)
+        if module and args[0] not in self.commands and not ctx.resilient_parsing:
+            command = f"python -m hearthlog.tools.lab.{module}"
+            wrong_use(f"say `{command} …` in a checkout of hearthlog; its --help lists the options")
         verb = next((verb for option, verb in _MOVED.items() if option in options), None)
         if verb and args[0] not in self.commands and not ctx.resilient_parsing:
             wrong_use(f"say `hearthlog evaluate {verb} …`; its --help lists the options")
@@ -73,11 +82,8 @@ evaluate = typer.Typer(
 )
 
 _Method = Annotated[str | None, typer.Argument(help=METHODS, show_default=METHOD)]
-_OfFeatures = Annotated[
-    str | None, typer.Argument(help="How to learn, by features alone.", show_default="room")
-]
-_Scenario = Annotated[str, typer.Option(help=SCENARIO)]
-_Folds = Annotated[
+Scenario = Annotated[str, typer.Option(help=SCENARIO)]
+Folds = Annotated[
     Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
 ]
 
@@ -202,7 +208,6 @@ def evaluate_model(
 
 
 evaluate.command()(scenes)
-evaluate.command()(robustness)
 
 
 @evaluate.command("method")
@@ -210,8 +215,8 @@ def evaluate_method(
     method: _Method = None,
     *,
     data: Clips,
-    scenario: _Scenario,
-    folds: _Folds = "source",
+    scenario: Scenario,
+    folds: Folds = "source",
     scheduler: Scheduler = None,
     plot: Plot = None,
     as_json: Json = False,
@@ -223,7 +228,7 @@ def evaluate_method(
     from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method as cross_validate
 
     check_output("--plot", plot, ".png", "a picture")
-    with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
+    with learning(method, data, scenario, scheduler) as (chosen, segments, progress):
         result = cross_validate(segments, chosen, folds, progress)
     title = f"{chosen.name} on {data} ({scenario}), by {folds}"
     _save_plot(plot, title, result.scores, result.reliability)
@@ -234,7 +239,7 @@ def evaluate_method(
             | _calibration(result)
             | {"skipped": dict(segments.skipped)}
         )
-        _end_with(segments.left_out)
+        end_with_left_out(segments.left_out)
         return
     print(
         f"method {chosen.name}, scenario {scenario}: {result.scores.segments} segments of "
@@ -243,97 +248,11 @@ def evaluate_method(
     )
     print_scores(result.scores)
     print_reliability(result.reliability, result.expected_calibration_error)
-    _end_with(segments.left_out)
-
-
-@evaluate.command()
-def search(
-    method: _OfFeatures = None,
-    *,
-    data: Clips,
-    scenario: _Scenario,
-    folds: _Folds = "source",
-    scheduler: Scheduler = None,
-    as_json: Json = False,
-) -> None:
-    """Cross-validate a way to learn with other costs and gammas, and list the best first."""
-    from hearthlog.analyzer.extras import require
-
-    require("sklearn", "scipy", "joblib")
-    from hearthlog.analyzer.evaluation import grid_search
-
-    method = _by_features(method, "its classifier has the costs and gammas of room")
-    with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
-        tried = grid_search.search(segments, chosen.variations(), folds, progress)
-    if as_json:
-        rows = [one.method.parameters | asdict(one.scores) for one in tried]
-        print_json({"scenario": scenario, "method": chosen.name, "by": folds, "tried": rows})
-        _end_with(segments.left_out)
-        return
-    print(
-        f"method {chosen.name}, scenario {scenario}: {len(segments)} segments of "
-        f"{chosen.features.window_seconds:g} s, folds by {folds}\n"
-    )
-    print_search(tried)
-    best = tried[0].method.parameters
-    options = "".join(f" --{name} {value:g}" for name, value in best.items())
-    print(f"\nhearthlog train --method {chosen.name}{options} …")
-    _end_with(segments.left_out)
-
-
-@evaluate.command()
-def adaptation(
-    method: _OfFeatures = None,
-    *,
-    data: Clips,
-    scenario: _Scenario,
-    scheduler: Scheduler = None,
-    as_json: Json = False,
-) -> None:
-    """Show how F1 grows with corrected segments of a home.
-
-    Each collection of the clips stands for a home once, and the others are learned from.
-    """
-    from hearthlog.analyzer.extras import require
-
-    require("sklearn", "scipy", "joblib")
-    from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
-
-    method = _by_features(method, "what marks teach its heads, `hearthlog train --home` tries")
-    with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
-        curve = adaptation_curve(segments, chosen, progress)
-    if as_json:
-        print_json({"scenario": scenario, "method": chosen.name} | curve._asdict())
-        _end_with(segments.left_out)
-        return
-    window = f"{chosen.features.window_seconds:g} s"
-    print(f"macro F1 after so many corrected segments of {window}\n")
-    curves = curve.collections | {"mean": curve.mean}
-    print_table(
-        ("collection left out", *map(str, curve.corrected)),
-        [(name, *(f"{value:.3f}" for value in row)) for name, row in curves.items()],
-    )
-    print(
-        f"\nlargest loss of a class in a home: {-min(curve.worst):.3f}, of silence "
-        f"{-min(curve.worst_of_silence):.3f}"
-    )
-    _end_with(segments.left_out)
-
-
-evaluate.command()(paper)
-
-
-def _by_features(name: str | None, why: str) -> str:
-    """Return the name of a method of features alone, by default the best; refuse others."""
-    from hearthlog.analyzer.training.installed import DEFAULT
-
-    if name is not None and chosen_method(name).network:
-        wrong_use(f"{name}: only methods of features alone are tried so, such as room; {why}")
-    return name or DEFAULT.name
+    end_with_left_out(segments.left_out)
 
 
 @contextmanager
-def _learning(
+def learning(
     name: str | None, data: Path, scenario: str, scheduler: str | None
 ) -> "Iterator[tuple[Method, Dataset, Progress]]":
     """Cut the clips into segments; what learns from them in the block runs on the cluster."""
@@ -362,7 +281,7 @@ def _learning(
             yield method, segments, progress
 
 
-def _end_with(left_out: "Sequence[LeftOut]") -> None:
+def end_with_left_out(left_out: "Sequence[LeftOut]") -> None:
     """Tell which clips were left out, and end with exit status 3 if any was."""
     from hearthlog.analyzer.training.manifest import left_out_lines
 

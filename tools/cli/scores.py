@@ -9,8 +9,6 @@ from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_scenes import SceneScores, SingleCoughs
     from hearthlog.analyzer.evaluation.event_scores import Detections
-    from hearthlog.analyzer.evaluation.grid_search import GridPoint
-    from hearthlog.analyzer.evaluation.robustness import Robustness
     from hearthlog.analyzer.training.scores import Bin, Interval, Scores
 
 _CLASS = ("class", "support", "precision", "recall", "F1", "95 %")
@@ -63,19 +61,6 @@ def print_reliability(bins: "Sequence[Bin]", error: float) -> None:
     print_table(("sure", "right", "segments"), rows, words=0)
 
 
-def print_search(tried: "Sequence[GridPoint]") -> None:
-    """Print the scores of each method that was tried."""
-    rows = [
-        (
-            *(f"{value:g}" for value in method.parameters.values()),
-            f"{scores.macro_f1:.3f}",
-            between(scores.macro_f1_interval),
-        )
-        for method, scores in tried
-    ]
-    print_table((*tried[0].method.parameters, "macro F1", "95 %"), rows, words=0)
-
-
 def print_scenes(scenes: "Sequence[SceneScores]") -> None:
     """Print how good the labels of each scene are, and their means and ranges."""
     figures = [(one.macro_f1, one.event_f1, one.false_alarms_per_hour) for one in scenes]
@@ -101,24 +86,6 @@ def print_coughs(coughs: "SingleCoughs") -> None:
         f"\n{coughs.coughs} single coughs of 0.3 s: {coughs.found:.3f} found{length}; "
         f"{coughs.others:.2f} other labels a cough"
     )
-
-
-def print_robustness(found: "Robustness") -> None:
-    """Print how good a model is in each condition."""
-    scores = found.unchanged
-    rows = [("unchanged", share(scores.macro_f1), between(scores.macro_f1_interval), "", "")]
-    for name, (scores, difference) in found.changed.items():
-        change = difference.interval
-        rows.append(
-            (
-                name,
-                share(scores.macro_f1),
-                between(scores.macro_f1_interval),
-                f"{difference.macro_f1:+.3f}",
-                "-" if change is None else f"{change[0]:+.3f} to {change[1]:+.3f}",
-            )
-        )
-    print_table(("clips", "macro F1", "95 %", "change", "95 %"), rows)
 
 
 def print_skipped(skipped: Mapping[str, int], what: str = "recordings") -> None:

@@ -70,7 +70,9 @@ def train(
     method: Annotated[str | None, typer.Option(help=METHODS, show_default=METHOD)] = None,
     cost: Annotated[
         float | None,
-        typer.Option(help="Cost of a wrong segment; `evaluate search` finds a good one."),
+        typer.Option(
+            help="Cost of a wrong segment; docs/evaluate.md says how a good one is found."
+        ),
     ] = None,
     gamma: Annotated[
         float | None,

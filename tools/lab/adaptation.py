@@ -5,7 +5,6 @@ first half: the first sounds that are labelled wrongly get their label, silence 
 model is adapted as `train --home` does it, and labels the last quarter, which it never heard.
 """
 
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -24,10 +23,10 @@ from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.person import Person, read_truth, write_review
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_scores import scored
 
@@ -183,7 +182,4 @@ def main(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except (HearthlogError, OSError) as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(main)

@@ -8,6 +8,7 @@ the others give. Size and time are of the model that learned from everything.
 import os
 
 from hearthlog.schemas.blas import kernel_environment
+from hearthlog.tools.lab.command import run
 
 if __name__ == "__main__":  # before numpy is imported: "one core" is to be true for everyone
     os.environ.update(
@@ -43,7 +44,6 @@ from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.table import print_table
@@ -278,7 +278,4 @@ def _interval(interval: tuple[float, float] | None, sign: str = "") -> str:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(classifiers)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(classifiers)

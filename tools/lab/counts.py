@@ -33,6 +33,7 @@ from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.home.person import read_truth
+from hearthlog.tools.lab.command import run
 
 _DAY = 1440  # minutes
 _CHECKED = (5, 10, 30)
@@ -231,6 +232,6 @@ def main(
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except (HearthlogError, OSError) as error:
         sys.exit(f"hearthlog: {error}")

@@ -9,7 +9,6 @@ os.environ.update(
     dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 )  # before numpy is imported: a core's share is of one core
 
-import sys
 import time
 from collections.abc import Sequence
 from itertools import product
@@ -28,9 +27,9 @@ from hearthlog.models.classifiers.directions import BLOCK_FRAMES
 from hearthlog.recorder.direction.geometry import array_geometry
 from hearthlog.recorder.direction.srp_phat import DirectionFinder
 from hearthlog.schemas.arrays import Float32, Float64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.direction_room import Placed, add_noise, room_noise, room_scene
 
 _SOUNDS = 12  # in a scene
@@ -173,7 +172,4 @@ def _print_cost(samples: Float32) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(direction)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(direction)

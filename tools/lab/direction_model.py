@@ -42,9 +42,9 @@ from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.direction_room import (
     Room,
     Scene,
@@ -142,7 +142,7 @@ def _divided(
     return Clips(parts[0], parts[1]), Clips(parts[2], parts[3])
 
 
-def _recorded(  # noqa: PLR0913, PLR0917
+def _recorded(
     logs: Path, day: int, room: Room, corner: Float64, clips: Clips, rng: np.random.Generator
 ) -> tuple[Path, list[Sound]]:
     """Record a scene as an array would; return also what is true."""
@@ -270,7 +270,4 @@ def _interval(values: Float64, draws: Int64, form: str) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(direction_model)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(direction_model)

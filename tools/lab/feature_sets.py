@@ -31,12 +31,12 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.lab.command import run
 
 _STATISTICS = "statistics"
 _START = 1_772_352_000 * NANOSECONDS
@@ -152,7 +152,4 @@ def _score(result: CrossValidation) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(feature_sets)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(feature_sets)

@@ -40,6 +40,7 @@ from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.person import read_truth
+from hearthlog.tools.lab.command import run
 
 _DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS
@@ -239,4 +240,4 @@ def _label(label: str) -> str:
 
 
 if __name__ == "__main__":
-    typer.run(gate)
+    run(gate)

@@ -5,7 +5,6 @@ Clips of sources that the model has not learned from are heard one after another
 of their loud frames `keep_audio = "always"` keeps; of other sounds that is what the guard costs.
 """
 
-import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -30,8 +29,8 @@ from hearthlog.recorder.clips.clip_choice import ClipFinder
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.tools.lab.command import run
 
 _NEAR_DBFS = -18.0  # of the loudest frame
 _FAINTER = -20.0  # dB
@@ -323,7 +322,4 @@ def _worst(clips: Sequence[LabelledClip], kept: Kept) -> tuple[str, float]:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(guard)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(guard)

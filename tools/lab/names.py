@@ -39,6 +39,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.stream.embedding_messages import MicrophoneEmbeddings
 from hearthlog.schemas.arrays import Bool, Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
+from hearthlog.tools.lab.command import run
 
 # Kinds as `label/detail`, or a label alone, and the names that are right for them.
 KINDS: Mapping[str, tuple[str, ...]] = {
@@ -499,4 +500,4 @@ def _row(name: SoundName) -> str:
 
 
 if __name__ == "__main__":
-    typer.run(names)
+    run(names)

@@ -9,7 +9,6 @@ other two.
 
 import csv
 import shutil
-import sys
 import tempfile
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
@@ -32,7 +31,6 @@ from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.cast import LEVELS
@@ -44,6 +42,7 @@ from hearthlog.tools.home.record import record_composition
 from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.truth import truth_of
 from hearthlog.tools.lab.adaptation import wrong_sounds
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_scores import scored
 
@@ -96,7 +95,7 @@ class Outcome(NamedTuple):
     notes: list[str]
 
 
-def compose(  # noqa: PLR0913, PLR0917
+def compose(
     manifests: Sequence[Path],
     model: Path | None,
     seed: int,
@@ -320,7 +319,4 @@ def main(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except (HearthlogError, OSError) as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(main)

@@ -6,7 +6,6 @@ sources, or other collections, label the clips as they are in the noise, and aft
 learned as always, and learned from sound that the remover went over.
 """
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,8 +26,8 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker, low_power
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64, Indices
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SAMPLES
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.noise_removers import Remover, SpectralSubtraction, Wiener
 from hearthlog.tools.lab.noise_sounds import (
     CONDITIONS,
@@ -347,7 +346,4 @@ def main(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(main)

@@ -7,7 +7,6 @@ learned from other speakers; and speakers by what is learned from their other di
 """
 
 import csv
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -32,8 +31,8 @@ from hearthlog.models.features.auros21.names import ENERGY, FLUX
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.recogniser import DIGITS, Recogniser, intelligibility, word_errors
 from hearthlog.tools.lab.vocoder import Logged, logged, sound_of
 
@@ -237,7 +236,4 @@ def _logarithmic(features: Logged) -> Logged:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(privacy)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(privacy)

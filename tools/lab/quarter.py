@@ -7,7 +7,6 @@ a model is learned from all marks, and may label if it is let.
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -24,7 +23,6 @@ from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
@@ -39,6 +37,7 @@ from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.home.truth import truth_of
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_picture import line_of, save_picture
 from hearthlog.tools.lab.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Week, scored
@@ -233,7 +232,4 @@ def quarter(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(quarter)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(quarter)

@@ -5,7 +5,6 @@ learned again, and scored on another scene of the same home.
 """
 
 import csv
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -41,7 +40,6 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.messages.topics import LIVE, EmbeddingSource, topic
@@ -49,6 +47,7 @@ from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED
 from hearthlog.tools.home.person import Person
 from hearthlog.tools.lab.bench.table import Row, Table, Target
+from hearthlog.tools.lab.command import run
 
 _SCENARIO = BUILTIN["general"]
 _START = 1_772_323_200 * NANOSECONDS
@@ -121,7 +120,7 @@ class Conditions(NamedTuple):
     draws: int
 
 
-def queue(  # noqa: PLR0913
+def queue(
     *,
     model: Annotated[Path, typer.Option(help="Which labels.")] = _STARTER,
     manifest: Annotated[
@@ -382,7 +381,4 @@ def _read(path: Path) -> Iterator[Outcome]:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(queue)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(queue)

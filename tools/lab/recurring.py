@@ -8,7 +8,6 @@ names give: by features, and where there is a network by what it hears, too.
 
 import csv
 import random
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,9 +27,9 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.bench.table import Row, Table, Target
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.recurring_scene import OTHER, Sounded, names_of, record_scene
 
 _KINDS = 10
@@ -41,7 +40,7 @@ _START = 1_772_352_000 * NANOSECONDS
 _DAY = 86_400 * NANOSECONDS
 
 
-def recurring(  # noqa: PLR0913, PLR0917
+def recurring(
     manifests: Annotated[list[Path], typer.Argument(help="Of clips, with a column detail.")],
     clips: Annotated[int, typer.Option(min=1, help="Of each kind, of as many sources.")] = 1,
     days: Annotated[int, typer.Option(min=2)] = 4,
@@ -198,7 +197,4 @@ def _is_one_group(kind: str, sounds: _Grouped) -> bool:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(recurring)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(recurring)

@@ -34,7 +34,7 @@ class Sounded(NamedTuple):
     name: str
 
 
-def record_scene(  # noqa: PLR0913, PLR0917
+def record_scene(
     recurring: Mapping[str, Sequence[Float32]],
     others: Sequence[Float32],
     seconds: float,

@@ -24,8 +24,8 @@ from hearthlog.analyzer.routine.compare import (
 )
 from hearthlog.analyzer.routine.day_profile import DayProfile, Profiles
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.home.clips import ClipLibrary
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.routine_hearing import Hearing
 from hearthlog.tools.lab.routine_months import (
     CHANGES,
@@ -269,7 +269,4 @@ def main(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(main)

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.labelling import Labelling, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.plan import RADIO, TELEVISION
+from hearthlog.tools.lab.command import run
 
 MEASURED = Path(__file__).with_suffix(".csv")
 _DAY = 86_400 * NANOSECONDS
@@ -144,7 +144,4 @@ def main(
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except (HearthlogError, OSError) as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(main)

@@ -32,6 +32,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RA
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.lab.command import run
 
 _PAUSES = (0.5, 2.0, 6.0)  # seconds
 _LENGTHS = (3.0, 10.0)
@@ -158,7 +159,7 @@ def _row(scores: Sequence[LogEvaluation]) -> str:
     return f"{frames:.3f}  {events:.3f}  {false:5.0f}"
 
 
-def main(  # noqa: PLR0913, PLR0917
+def main(
     manifest: Annotated[list[Path], typer.Argument(help="Labelled clips.")],
     model: Annotated[list[Path], typer.Option(help="Models to compare.")],
     scenario: Annotated[str, typer.Option()] = "general",
@@ -211,4 +212,4 @@ def main(  # noqa: PLR0913, PLR0917
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

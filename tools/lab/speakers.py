@@ -6,7 +6,6 @@ is right if most of it that is not labelled silence is labelled so. The voices o
 are not enrolled converse, too, and are to be `unknown`.
 """
 
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -29,13 +28,13 @@ from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32, Float64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.bench.table import Row, Table
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.conversations import (
     Clips,
     Turn,
@@ -122,7 +121,7 @@ def _learned(folder: Path) -> Path:
     return folder / "speakers.safetensors"
 
 
-def _turns(  # noqa: PLR0913, PLR0917
+def _turns(
     clips: Mapping[str, Clips],
     seconds: float,
     seed: int,
@@ -209,7 +208,4 @@ def _row(what: str, told: Sequence[_Told], is_so: Sequence[bool]) -> Row:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(speakers)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(speakers)

@@ -23,6 +23,7 @@ from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.lab.command import run
 
 LEVELS = -60.0, -50.0, -40.0, -36.0, -34.0, -25.0  # dBFS
 _ROOM, _ROOM_SECONDS = -70.0, 60
@@ -97,4 +98,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run(main)

@@ -4,7 +4,6 @@ The voices are the source groups of the manifest. Each is heard as it is and in 
 other microphones, so that a microphone is not taken for a voice.
 """
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +20,7 @@ from hearthlog.analyzer.training.rooms import in_room
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float32, Float64, Int64
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.tools.lab.command import run
 
 _DIMENSIONS = 20
 _ROOMS = 3
@@ -80,7 +79,4 @@ def learned_space(described: Float64, voices: Int64) -> VoiceSpace:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(voice_space)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(voice_space)

@@ -6,7 +6,6 @@ of the time of speech that is missed, false or of another voice; a collar is lef
 border. Beside it stand that of one voice for all, and that with the true times of speech.
 """
 
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,10 +23,10 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32, Int64
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.bench.table import Row, Table
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.conversations import Turn, clips_of_voices, converse, record_samples
 
 _START = 1_772_352_000 * NANOSECONDS
@@ -159,7 +158,4 @@ def _interval(errors: Sequence[tuple[float, ...]]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(voices)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(voices)

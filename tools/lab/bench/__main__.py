@@ -3,6 +3,7 @@
 import os
 
 from hearthlog.schemas.blas import kernel_environment
+from hearthlog.tools.lab.command import run
 
 # Before numpy is imported: "one core" is to be true for everyone.
 os.environ.update(
@@ -12,14 +13,12 @@ os.environ.update(
 )
 os.environ.update(kernel_environment())
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.lab.bench import (
     bridge,
     embedding,
@@ -113,7 +112,4 @@ def _ratios() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(bench)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog bench: {error}")
+    run(bench)

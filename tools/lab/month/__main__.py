@@ -14,6 +14,7 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.simulate import write_day
+from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults
 from hearthlog.tools.lab.month.folders import MonthFolder
 from hearthlog.tools.lab.month.summary import summarize
@@ -67,10 +68,7 @@ def _compose(folder: MonthFolder, minutes: float, seed: int) -> None:
 
 def main() -> None:
     """Run the command; one line on standard error says what is wrong."""
-    try:
-        typer.run(month)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog: {error}")
+    run(month)
 
 
 if __name__ == "__main__":

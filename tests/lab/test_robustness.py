@@ -5,17 +5,22 @@ import json
 import numpy as np
 import pytest
 from scipy.signal import welch
-from spliced import run
+from spliced import run_function
 
-from hearthlog.analyzer.evaluation import robustness as evaluation
 from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model
-from hearthlog.analyzer.evaluation.robustness import CONDITIONS, Condition, robustness
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import scenario_of
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.lab import robustness as evaluation
+from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.robustness import CONDITIONS, Condition, robustness
+
+
+def measured(capfd, *words):
+    return run_function(capfd, lambda: run(evaluation.main), *words)
 
 
 @pytest.fixture(scope="module")
@@ -159,13 +164,13 @@ def some(training_set, tmp_path):
 
 
 def test_the_command_prints_a_table_and_makes_a_picture(model_file, some, tmp_path, capfd):
-    words, picture = ("evaluate", "robustness", model_file, "--data", some), tmp_path / "map.png"
-    table = run(capfd, *words, "--plot", picture)
+    words, picture = (model_file, "--data", some), tmp_path / "map.png"
+    table = measured(capfd, *words, "--plot", picture)
     assert table.returncode == 3
     assert "the model has learned from 1" in table.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert max(map(len, table.stdout.splitlines())) <= 100
-    result = run(capfd, *words, "--json")
+    result = measured(capfd, *words, "--json")
     found = json.loads(result.stdout)
     assert list(found["changed"]) == [condition.name for condition in CONDITIONS]
     for name, one in found["changed"].items():
@@ -187,7 +192,7 @@ def test_bad_input_is_one_line(model_file, training_set, tmp_path, capfd):
         ((tmp_path / "no.csv",), 1, "no.csv"),
     )
     for (data, *options), status, said in cases:
-        result = run(capfd, "evaluate", "robustness", model_file, "--data", data, *options)
+        result = measured(capfd, model_file, "--data", data, *options)
         assert result.returncode == status
         assert said in result.stderr
         assert len([x for x in result.stderr.splitlines() if "listening" not in x]) == 1

@@ -1,5 +1,7 @@
 """What some corrected seconds of a new home are worth, and what they do to all other sounds.
 
+Run by `python -m hearthlog.tools.lab.adaptation_curve`.
+
 A collection that the machine has never heard stands for the home: it is adapted to segments from
 half of the collection's groups, and tried on those of the other half. Corrected are those that were
 labelled wrongly, but for silence; those that a reviewer passed by on the way to them, and left as
@@ -23,6 +25,12 @@ from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.progress import Progress
+from hearthlog.tools.cli.evaluate import Scenario, end_with_left_out, learning
+from hearthlog.tools.cli.options import Clips, Json, Scheduler
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import print_json
+from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.grid_search import OfFeatures, by_features
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_CLASSES = 2
@@ -187,3 +195,40 @@ def _turn_about(rows: Indices, target: Indices, rng: np.random.Generator) -> Ind
         same = target[rows] == value
         turn[same] = np.arange(same.sum())
     return rows[np.argsort(turn, kind="stable")]
+
+
+def main(
+    method: OfFeatures = None,
+    *,
+    data: Clips,
+    scenario: Scenario,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Show how F1 grows with corrected segments of a home.
+
+    Each collection of the clips stands for a home once, and the others are learned from.
+    """
+    method = by_features(method, "what marks teach its heads, `hearthlog train --home` tries")
+    with learning(method, data, scenario, scheduler) as (chosen, segments, progress):
+        curve = adaptation_curve(segments, chosen, progress)
+    if as_json:
+        print_json({"scenario": scenario, "method": chosen.name} | curve._asdict())
+        end_with_left_out(segments.left_out)
+        return
+    window = f"{chosen.features.window_seconds:g} s"
+    print(f"macro F1 after so many corrected segments of {window}\n")
+    curves = curve.collections | {"mean": curve.mean}
+    print_table(
+        ("collection left out", *map(str, curve.corrected)),
+        [(name, *(f"{value:.3f}" for value in row)) for name, row in curves.items()],
+    )
+    print(
+        f"\nlargest loss of a class in a home: {-min(curve.worst):.3f}, of silence "
+        f"{-min(curve.worst_of_silence):.3f}"
+    )
+    end_with_left_out(segments.left_out)
+
+
+if __name__ == "__main__":
+    run(main)

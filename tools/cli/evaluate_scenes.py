@@ -1,4 +1,4 @@
-"""`hearthlog evaluate scenes` and `robustness`: a model on sounds as homes and rooms have them."""
+"""`hearthlog evaluate scenes`: a model on sounds as homes have them."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +18,6 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import (
     print_coughs,
-    print_robustness,
     print_scenes,
     print_scores,
     print_skipped,
@@ -30,11 +29,11 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.scenario import Scenario
     from hearthlog.models.classifiers.model import Model
 
-_Model = Annotated[Path, typer.Argument(help="Model file.")]
+ModelFile = Annotated[Path, typer.Argument(help="Model file.")]
 
 
 def scenes(
-    model: _Model,
+    model: ModelFile,
     *,
     data: Clips,
     scenes: Annotated[int, typer.Option(min=1, max=100, help="How many to compose.")] = 3,
@@ -67,13 +66,13 @@ def scenes(
     from hearthlog.analyzer.training.manifest import left_out_lines
 
     check_output("--plot", plot, ".png", "a picture")
-    loaded, clips, classes, left_out = _read(model, data, scenario)
+    loaded, clips, classes, left_out = read_model_and_clips(model, data, scenario)
     options = SceneOptions(scenes, 60.0 * minutes, floor, colour, gain, seed)
     with share_done(f"recording {number(scenes, 'scene')}", announce=True) as report:
         found = evaluate_scenes(model, loaded, clips, classes, options, report)
     where = f"{colour} noise at {floor:g} dBFS"
     if plot is not None:
-        from hearthlog.analyzer.evaluation.plot_sounds import save_scenes
+        from hearthlog.analyzer.evaluation.plot_scenes import save_scenes
 
         save_scenes(plot, f"{loaded.name} on scenes of {data} over {where}", found)
     if as_json:
@@ -116,56 +115,6 @@ def scenes(
     end_with_warnings(warnings)
 
 
-def robustness(
-    model: _Model,
-    *,
-    data: Clips,
-    scenario: OwnScenario = None,
-    plot: Plot = None,
-    as_json: Json = False,
-) -> None:
-    """Score a model on labelled clips in noise, in other rooms and by other microphones.
-
-    Exit status 3: the model has learned from some of the clips, or some cannot be read.
-    """
-    from hearthlog.analyzer.extras import require
-
-    require("sklearn", "scipy", "joblib", "matplotlib")
-    from hearthlog.analyzer.evaluation import robustness as evaluation
-    from hearthlog.analyzer.training.manifest import left_out_lines
-
-    check_output("--plot", plot, ".png", "a picture")
-    loaded, clips, classes, left_out = _read(model, data, scenario)
-    with share_done(f"listening to {number(len(clips), 'clip')}", announce=True) as report:
-        found = evaluation.robustness(loaded, clips, classes, report)
-    if plot is not None:
-        from hearthlog.analyzer.evaluation.plot_sounds import save_robustness
-
-        save_robustness(plot, f"{loaded.name} on changed clips of {data}", found)
-    if as_json:
-        print_json(
-            {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
-            | {"unchanged": asdict(found.unchanged)}
-            | {
-                "changed": {
-                    name: asdict(one.scores) | {"difference": asdict(one.difference)}
-                    for name, one in found.changed.items()
-                },
-                "skipped": dict(found.skipped),
-                "sources_learned": found.sources_learned,
-            }
-        )
-    else:
-        print(
-            f"model {loaded.name}, scenario {classes.name}: {found.unchanged.segments} segments of "
-            f"1 s from {found.unchanged.groups} sources\n"
-        )
-        print_robustness(found)
-        print_skipped(found.skipped, "clips")
-    warnings = left_out_lines([*left_out, *found.left_out])
-    end_with_warnings([*warnings, *learned_lines(found.sources_learned, found.unchanged.groups)])
-
-
 def learned_lines(learned: int, sources: int) -> list[str]:
     """Say in a line of how many sources a model has learned, if of any."""
     if not learned:
@@ -174,7 +123,7 @@ def learned_lines(learned: int, sources: int) -> list[str]:
     return [f"the model has learned from {count}: the figures flatter it; leave these out"]
 
 
-def _read(
+def read_model_and_clips(
     model: Path, data: Path, scenario: str | None
 ) -> "tuple[Model, list[LabelledClip], Scenario, list[LeftOut]]":
     """Read a model, its scenario unless another one is named, and clips; some are of no use."""

@@ -1,8 +1,12 @@
-"""A model on labelled clips as other rooms and other microphones would give them."""
+"""A model on labelled clips as other rooms and other microphones would give them.
+
+Run by `python -m hearthlog.tools.lab.robustness`.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,10 +14,11 @@ from joblib import delayed
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_model import fitted, segment_probabilities
+from hearthlog.analyzer.evaluation.plot import new_figure, plot_names, save_figure
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of
+from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of, left_out_lines
 from hearthlog.analyzer.training.rooms import (
     RoomCopy,
     band_limits,
@@ -35,6 +40,13 @@ from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.tools.cli.evaluate_scenes import ModelFile, learned_lines, read_model_and_clips
+from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output
+from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.scores import between, print_skipped, share
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import end_with_warnings, number, print_json
+from hearthlog.tools.lab.command import run
 
 _SEED = 20_261_123
 _CLIPS_AT_ONCE = 16
@@ -222,8 +234,8 @@ class _Judged(NamedTuple):
 def _batches(clips: Sequence[LabelledClip]) -> Iterator[list[tuple[int, LabelledClip]]]:
     """Divide numbered clips; those of a source group stay together, for it has a limit."""
     groups: dict[str, list[tuple[int, LabelledClip]]] = {}
-    for number, clip in enumerate(clips):
-        groups.setdefault(clip.source_group, []).append((number, clip))
+    for place, clip in enumerate(clips):
+        groups.setdefault(clip.source_group, []).append((place, clip))
     batch: list[tuple[int, LabelledClip]] = []
     for group in groups.values():
         batch += group
@@ -300,3 +312,100 @@ def _copy(
     if silence and features.band_powers is not None:
         return RoomCopy(copy, low_power(features.band_powers(copy)))
     return RoomCopy(copy, np.zeros(features.bands))
+
+
+def main(
+    model: ModelFile,
+    *,
+    data: Clips,
+    scenario: OwnScenario = None,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Score a model on labelled clips in noise, in other rooms and by other microphones.
+
+    Exit status 3: the model has learned from some of the clips, or some cannot be read.
+    """
+    check_output("--plot", plot, ".png", "a picture")
+    loaded, clips, classes, left_out = read_model_and_clips(model, data, scenario)
+    with share_done(f"listening to {number(len(clips), 'clip')}", announce=True) as report:
+        found = robustness(loaded, clips, classes, report)
+    if plot is not None:
+        save_robustness(plot, f"{loaded.name} on changed clips of {data}", found)
+    if as_json:
+        print_json(
+            {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
+            | {"unchanged": asdict(found.unchanged)}
+            | {
+                "changed": {
+                    name: asdict(one.scores) | {"difference": asdict(one.difference)}
+                    for name, one in found.changed.items()
+                },
+                "skipped": dict(found.skipped),
+                "sources_learned": found.sources_learned,
+            }
+        )
+    else:
+        print(
+            f"model {loaded.name}, scenario {classes.name}: {found.unchanged.segments} segments of "
+            f"1 s from {found.unchanged.groups} sources\n"
+        )
+        print_robustness(found)
+        print_skipped(found.skipped, "clips")
+    warnings = left_out_lines([*left_out, *found.left_out])
+    end_with_warnings([*warnings, *learned_lines(found.sources_learned, found.unchanged.groups)])
+
+
+def print_robustness(found: Robustness) -> None:
+    """Print how good a model is in each condition."""
+    scores = found.unchanged
+    rows = [("unchanged", share(scores.macro_f1), between(scores.macro_f1_interval), "", "")]
+    for name, (scores, against) in found.changed.items():
+        change = against.interval
+        rows.append(
+            (
+                name,
+                share(scores.macro_f1),
+                between(scores.macro_f1_interval),
+                f"{against.macro_f1:+.3f}",
+                "-" if change is None else f"{change[0]:+.3f} to {change[1]:+.3f}",
+            )
+        )
+    print_table(("clips", "macro F1", "95 %", "change", "95 %"), rows)
+
+
+def save_robustness(path: Path, title: str, found: Robustness) -> None:
+    """Draw a map of F1 by class and condition.
+
+    Parameters
+    ----------
+    path : Path
+        Of a PNG file, which must not exist.
+    title : str
+    found : Robustness
+
+    Raises
+    ------
+    LogError
+        If the file exists, or cannot be written.
+    """
+    every = {"unchanged": found.unchanged} | {k: v.scores for k, v in found.changed.items()}
+    classes = [name for name, one in found.unchanged.per_class.items() if one.support]
+    f1 = np.array([[one.macro_f1 for one in every.values()]])
+    rows = [[one.per_class[name].f1 or 0.0 for one in every.values()] for name in classes]
+    f1 = np.concatenate([np.array(rows), f1])
+    figure = new_figure((2.5 + 0.62 * len(every), 2.5 + 0.4 * len(f1)), title)
+    axes = figure.subplots()
+    axes.imshow(f1, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for (row, column), value in np.ndenumerate(f1):
+        shade = "white" if value > 0.5 else "black"
+        axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", color=shade)
+    axes.axhline(len(classes) - 0.5, color="black", linewidth=1)
+    axes.set_xticks(range(len(every)), every, rotation=45, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(f1)), [*plot_names(classes), "macro"])
+    axes.set_title("F1 of segments of a second, %", fontsize=10)
+    save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,4 +1,4 @@
-"""Scores of scenes and of changed clips as pictures."""
+"""Scores of scenes as pictures."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,6 @@ from matplotlib.patches import Patch
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.evaluation.evaluate_scenes import ScenesEvaluation
 from hearthlog.analyzer.evaluation.plot import draw_f1, new_figure, plot_names, save_figure
-from hearthlog.analyzer.evaluation.robustness import Robustness
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.times import NANOSECONDS
@@ -56,39 +55,6 @@ def save_scenes(path: Path, title: str, found: ScenesEvaluation) -> None:
     figure.legend(
         patches, plot_names(shown), loc="outside lower center", ncols=min(len(shown), 9), fontsize=8
     )
-    save_figure(figure, path)
-
-
-def save_robustness(path: Path, title: str, found: Robustness) -> None:
-    """Draw a map of F1 by class and condition.
-
-    Parameters
-    ----------
-    path : Path
-        Of a PNG file, which must not exist.
-    title : str
-    found : Robustness
-
-    Raises
-    ------
-    LogError
-        If the file exists, or cannot be written.
-    """
-    every = {"unchanged": found.unchanged} | {k: v.scores for k, v in found.changed.items()}
-    classes = [name for name, one in found.unchanged.per_class.items() if one.support]
-    f1 = np.array([[one.macro_f1 for one in every.values()]])
-    rows = [[one.per_class[name].f1 or 0.0 for one in every.values()] for name in classes]
-    f1 = np.concatenate([np.array(rows), f1])
-    figure = new_figure((2.5 + 0.62 * len(every), 2.5 + 0.4 * len(f1)), title)
-    axes = figure.subplots()
-    axes.imshow(f1, cmap="Blues", vmin=0, vmax=1, aspect="auto")
-    for (row, column), value in np.ndenumerate(f1):
-        shade = "white" if value > 0.5 else "black"
-        axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", color=shade)
-    axes.axhline(len(classes) - 0.5, color="black", linewidth=1)
-    axes.set_xticks(range(len(every)), every, rotation=45, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(f1)), [*plot_names(classes), "macro"])
-    axes.set_title("F1 of segments of a second, %", fontsize=10)
     save_figure(figure, path)
 
 

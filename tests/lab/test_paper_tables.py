@@ -5,19 +5,25 @@ import json
 
 import numpy as np
 import pytest
+from spliced import run_function
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
-from hearthlog.analyzer.evaluation.paper import reproduce, share_right
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.cli.evaluate_paper import print_reproduction
 from hearthlog.tools.home.simulate import write_training_set
+from hearthlog.tools.lab import paper
+from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.paper import print_reproduction, reproduce, share_right
 
 KINDS = ["segment", "source", "collection"]
+
+
+def measured(capfd, *words):
+    return run_function(capfd, lambda: run(paper.main), *words)
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +117,8 @@ def test_a_table_has_a_row_for_each_class_and_folds_and_names_what_is_thin(table
     assert "fewer than 20 sources: silence, flushing_water, shower, tap_water, other" in lines
 
 
-def test_one_scenario_needs_the_clips_of_its_own_classes_only(hearthlog, unmusical):
-    result = hearthlog("evaluate", "paper", "--data", unmusical, "--scenario", "bathroom", "--json")
+def test_one_scenario_needs_the_clips_of_its_own_classes_only(capfd, unmusical):
+    result = measured(capfd, "--data", unmusical, "--scenario", "bathroom", "--json")
     [(name, found)] = json.loads(result.stdout).items()
     assert (name, found["paper_f1"], found["collections"]) == ("bathroom", 0.89, 2)
     assert set(found["methods"]) == {"paper", "room"}
@@ -154,8 +160,8 @@ def test_clips_that_cannot_be_divided_are_refused_before_anything_is_learned(
     assert max(steps) < 0.1
 
 
-def test_a_class_without_clips_is_named_in_one_line(hearthlog, unmusical):
-    result = hearthlog("evaluate", "paper", "--data", unmusical)
+def test_a_class_without_clips_is_named_in_one_line(capfd, unmusical):
+    result = measured(capfd, "--data", unmusical)
     assert result.returncode == 1
     problem = "class music has no segments: no usable clip is labelled music"
     assert result.stderr.splitlines()[1:] == [f"hearthlog: scenario general: {problem}"]
