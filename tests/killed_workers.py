@@ -24,7 +24,7 @@ import psutil
 from clusters import scheduler_in, worker_of
 
 from hearthlog.schemas.logs.files import is_layer
-from hearthlog.tools.home.copies import copy_logs
+from hearthlog.tools.lab.home.copies import copy_logs
 
 _DAY = 86_400  # seconds
 _COMMAND = [sys.executable, "-m", "hearthlog.tools.cli.main", "relabel"]

@@ -15,7 +15,7 @@ from hearthlog.analyzer.discover.read_speech import read_speech
 from hearthlog.analyzer.discover.sound_spans import ALL
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.tools.home.copies import copy_logs
+from hearthlog.tools.lab.home.copies import copy_logs
 
 SECONDS, FEW, MANY = 60, 4, 16
 FEATURES = SECONDS * 20 * DEFAULT.width * 4  # bytes of a log

@@ -29,7 +29,6 @@ from hearthlog.models.starter import (
 )
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.lab.starter import _write_sources
 
 
 @pytest.fixture
@@ -199,7 +198,8 @@ def test_the_card_of_a_starter_is_shown_without_a_folder_of_models(hearthlog, tm
 def test_what_was_learned_from_is_listed_with_its_credits(tmp_path):
     manifest = Path(__file__).parent / "data" / "household" / "manifest.csv"
     clips = read_manifest(manifest, LABELS)[:5]
-    _write_sources(tmp_path / "sources.csv", [manifest], clips)
+    lab = pytest.importorskip("hearthlog.tools.lab.starter", reason="the wheel leaves the lab out")
+    lab._write_sources(tmp_path / "sources.csv", [manifest], clips)
     with (tmp_path / "sources.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["path"] for row in rows] == [

@@ -10,11 +10,11 @@ from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
-from hearthlog.tools.home.microphones import NarrowRooms
 from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.routine import Habits, plan_days
 from hearthlog.tools.home.short_day import plan_short_day
 from hearthlog.tools.lab import quarter
+from hearthlog.tools.lab.home.microphones import NarrowRooms
 from hearthlog.tools.lab.quarter_picture import line_of, save_picture
 from hearthlog.tools.lab.quarter_scores import scored
 

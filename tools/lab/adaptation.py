@@ -1,8 +1,9 @@
 """`python -m hearthlog.tools.lab.adaptation HOME --model FILE`: what marks of wrong sounds teach.
 
-Of a composed home (`python -m hearthlog.tools.home`, labelled by the model) a person corrects the
-first half: the first sounds that are labelled wrongly get their label, silence is never marked. The
-model is adapted as `train --home` does it, and labels the last quarter, which it never heard.
+Of a composed home (`python -m hearthlog.tools.lab.home`, labelled by the model) a person corrects
+the first half: the first sounds that are labelled wrongly get their label, silence is never
+marked. The model is adapted as `train --home` does it, and labels the last quarter, which it never
+heard.
 """
 
 import tempfile
@@ -25,8 +26,8 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.home.person import Person, read_truth, write_review
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.person import Person, read_truth, write_review
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_scores import scored
 

@@ -32,8 +32,8 @@ from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.tools.home.person import read_truth
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.person import read_truth
 
 _DAY = 1440  # minutes
 _CHECKED = (5, 10, 30)
@@ -91,7 +91,7 @@ class Checked(NamedTuple):
 
 
 def read_simulated(folder: Path) -> Home:
-    """Read what `python -m hearthlog.tools.home DAYS -o FOLDER --model MODEL` has made.
+    """Read what `python -m hearthlog.tools.lab.home DAYS -o FOLDER --model MODEL` has made.
 
     Parameters
     ----------

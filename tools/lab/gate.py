@@ -1,6 +1,6 @@
 """`python -m hearthlog.tools.lab.gate HOME --model FILE`: which models a home lets speak.
 
-Of a composed home (`python -m hearthlog.tools.home`, labelled by the model) the first day is
+Of a composed home (`python -m hearthlog.tools.lab.home`, labelled by the model) the first day is
 learned from; minutes of the others are drawn at random and reviewed, all of it as it is true.
 Models that have learned so, and models that are harmful in known ways, are judged; beside each
 verdict stands how right the model is on other parts of those days, by their truth.
@@ -39,8 +39,8 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.home.person import read_truth
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.person import read_truth
 
 _DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS

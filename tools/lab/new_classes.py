@@ -36,13 +36,13 @@ from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.cast import LEVELS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.person import true_labelling, write_review
 from hearthlog.tools.home.plan import LIVING_ROOM, RESIDENT, Plan, PlannedSound
 from hearthlog.tools.home.record import record_composition
 from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.truth import truth_of
 from hearthlog.tools.lab.adaptation import wrong_sounds
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.person import true_labelling, write_review
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_scores import scored
 

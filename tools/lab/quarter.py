@@ -28,8 +28,6 @@ from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.microphones import NarrowRooms
-from hearthlog.tools.home.person import Person, true_labelling
 from hearthlog.tools.home.plan import LIVING_ROOM, Plan
 from hearthlog.tools.home.record import record_composition
 from hearthlog.tools.home.rooms import Rooms
@@ -38,6 +36,8 @@ from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.home.truth import truth_of
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.microphones import NarrowRooms
+from hearthlog.tools.lab.home.person import Person, true_labelling
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_picture import line_of, save_picture
 from hearthlog.tools.lab.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Week, scored

@@ -45,9 +45,9 @@ from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.messages.topics import LIVE, EmbeddingSource, topic
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED
-from hearthlog.tools.home.person import Person
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.person import Person
 
 _SCENARIO = BUILTIN["general"]
 _START = 1_772_323_200 * NANOSECONDS

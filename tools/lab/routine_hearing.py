@@ -2,7 +2,7 @@
 
 Each sound of a simulated home has the label that most of what its microphone said of it has; less
 than a quarter of it labelled is not heard. `routine_hearing.csv` was made so, from two days of
-`python -m hearthlog.tools.home 2 --seed 11`, once with `--model general` and once with `--model
+`python -m hearthlog.tools.lab.home 2 --seed 11`, once with `--model general` and once with `--model
 bathroom --room bathroom`.
 """
 
@@ -100,7 +100,7 @@ def measure(home: Path) -> Counter[tuple[str, str, str]]:
     Parameters
     ----------
     home : Path
-        Folder that `python -m hearthlog.tools.home` has made, with labels.
+        Folder that `python -m hearthlog.tools.lab.home` has made, with labels.
 
     Returns
     -------

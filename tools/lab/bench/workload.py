@@ -18,11 +18,11 @@ from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.schemas.arrays import Float32, Int16
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.home.copies import copy_logs
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS
 from hearthlog.tools.lab.bench.hours import DENSE, lay_out, read_recordings
 from hearthlog.tools.lab.bench.live_logs import LiveLogs, record_as_live, record_file
+from hearthlog.tools.lab.home.copies import copy_logs
 
 _MOST_SECONDS = 3600
 _DAY = 86_400

@@ -1,4 +1,4 @@
-"""`python -m hearthlog.tools.home.copies LOGS DAYS -o FOLDER`: a month of a home from a day."""
+"""`python -m hearthlog.tools.lab.home.copies LOGS DAYS -o FOLDER`: a month of a home from a day."""
 
 import json
 import re
@@ -29,7 +29,7 @@ from hearthlog.schemas.messages.topics import LIVE, parse_topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.prefetch import prefetch
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.home.shifted_log import Shift, ShiftedLog
+from hearthlog.tools.lab.home.shifted_log import Shift, ShiftedLog
 
 _DAY = 86_400  # seconds
 _NAME_TIME = re.compile(r"(?<=_)\d{8}T\d{6}Z")

@@ -14,11 +14,11 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.person import Person, true_labelling
 from hearthlog.tools.home.record import record_composition
 from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.short_day import plan_short_day
 from hearthlog.tools.home.truth import truth_of
+from hearthlog.tools.lab.home.person import Person, true_labelling
 
 START = 1_772_323_200_000_000_000
 SUNDAY = START + 86_400 * NANOSECONDS

@@ -23,7 +23,7 @@ from hearthlog.schemas.logs.files import active_path, find_logs, is_layer
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.salvage.thin import thin_log
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.home.copies import copy_logs
+from hearthlog.tools.lab.home.copies import copy_logs
 
 START = 1_772_323_200 * NANOSECONDS  # midnight
 MINUTE = 60
@@ -250,7 +250,7 @@ def test_what_cannot_be_copied_is_refused_in_one_line(recording, tmp_path):
     with pytest.raises(LogError, match="is one file; name the folder"):
         copy_logs(log, tmp_path / "broken", 2)
     done = subprocess.run(
-        [sys.executable, "-m", "hearthlog.tools.home.copies", recording, "2", "-o", tmp_path],
+        [sys.executable, "-m", "hearthlog.tools.lab.home.copies", recording, "2", "-o", tmp_path],
         capture_output=True,
         text=True,
         check=False,
@@ -260,7 +260,7 @@ def test_what_cannot_be_copied_is_refused_in_one_line(recording, tmp_path):
 
 
 def test_the_command_says_what_it_has_written(recording, tmp_path, capfd):
-    command = [sys.executable, "-m", "hearthlog.tools.home.copies", recording, "2"]
+    command = [sys.executable, "-m", "hearthlog.tools.lab.home.copies", recording, "2"]
     done = subprocess.run(
         [*command, "-o", tmp_path / "logs"], capture_output=True, text=True, check=False
     )

@@ -1,4 +1,4 @@
-"""`python -m hearthlog.tools.home DAYS -o FOLDER`: days of a home as logs, and what is true."""
+"""`python -m hearthlog.tools.lab.home DAYS -o FOLDER`: days of a home as logs, and what is true."""
 
 import sys
 from datetime import UTC, datetime, timedelta
@@ -9,7 +9,6 @@ import typer
 
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
@@ -21,6 +20,7 @@ from hearthlog.tools.home.routine import Habits, plan_days
 from hearthlog.tools.home.simulate import reported
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.home.truth import truth_of, write_truth
+from hearthlog.tools.lab.command import run
 
 _HOUR_FRAMES = round(3600 / FRAME_SECONDS)
 
@@ -88,7 +88,4 @@ def _say(share: float) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(home)
-    except HearthlogError as error:
-        sys.exit(f"hearthlog: {error}")
+    run(home)
