@@ -8,6 +8,10 @@ from hearthlog.models.errors import ModelError
 from hearthlog.schemas.errors import HearthlogError
 
 _OF_EXAMPLES = {  # in `examples` of a clone of hearthlog, by distribution
+    "hearthlog-classifiers": (
+        *("layers", "neighbours", "one-class", "trees"),
+        *("boosting", "extra-trees", "forest", "logistic", "perceptron"),
+    ),
     "hearthlog-example": ("octaves", "nearest-mean", "nearest-octaves"),
     "hearthlog-feature-sets": ("logmel", "plp", "rasta", "sai"),
 }

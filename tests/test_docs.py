@@ -50,7 +50,7 @@ NOT_HERE = re.compile(
     r"| models fetch yamnet| install-service| bridge|.*--start 2026-03-10 "
     r"|.* s3://|.*tcp:|.* --web"
     r"|.* --microphone USB|.* --folds collection| discover| voices|.* speakers |.* mood.toml"
-    r"|.* --live|.*octaves|.*--method (plp|speech-embedding) |.*--queue spans.csv$"
+    r"|.* --live|.*octaves|.*--method (plp|speech-embedding|logistic|forest) |.*--queue spans.csv$"
     r"| review(?!.* --save))"
 )
 

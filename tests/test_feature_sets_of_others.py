@@ -201,6 +201,14 @@ def test_what_is_not_installed_names_the_distribution_that_brings_it(name):
         method_named(name)
 
 
+def test_a_classifier_that_is_not_installed_names_the_distribution_that_brings_it(hearthlog):
+    done = hearthlog("evaluate", "method", "forest", "--data", "d", "--scenario", "bathroom")
+    assert done.returncode == 2
+    line = "method 'forest' is not installed; distribution hearthlog-classifiers, in examples "
+    assert line in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> dict[str, str]:
     """The environment of commands that find the example installed."""

@@ -1,11 +1,14 @@
 """Classifiers of other systems: as scikit-learn has them, without it, whatever the file says."""
 
 import os
+import shutil
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,24 +32,28 @@ from threadpoolctl import threadpool_limits
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.adapt import adapt_model, base_classes
 from hearthlog.analyzer.training.home_landmarks import is_moved
-from hearthlog.analyzer.training.installed import OTHERS, method_named
+from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.learned_inputs import balanced, in_whole_steps, rounded
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.tree_methods import _not_above
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.installed import classifier_kind
-from hearthlog.models.classifiers.neighbours import NeighboursMachine, NeighboursParameters
-from hearthlog.models.classifiers.shares import LEAST_SHARE
 from hearthlog.models.classifiers.svm_rbf import weakest_pairs
-from hearthlog.models.classifiers.trees import MOST_LEVELS, TREES, TreesMachine
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.progress import ignore_progress
 
+EXAMPLE = Path(__file__).parents[1] / "examples" / "classifiers"
+sys.path.insert(0, str(EXAMPLE))
+from hearthlog_classifiers.neighbours import NeighboursMachine, NeighboursParameters  # noqa: E402
+from hearthlog_classifiers.shares import LEAST_SHARE  # noqa: E402
+from hearthlog_classifiers.tree_methods import _not_above  # noqa: E402
+from hearthlog_classifiers.trees import MOST_LEVELS, TREES, TreesMachine  # noqa: E402
+
 LANDMARKS = ROOM.name
-NAMES = [LANDMARKS, *(method.name for method in OTHERS)]
+BROUGHT = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]["entry-points"]
+NAMES = [LANDMARKS, "svm", *BROUGHT["hearthlog.methods"]]
 FORGETTING = sorted(set(NAMES) - {LANDMARKS, "svm", "neighbours"})  # have no windows as they were
 SMALLER = {
     LANDMARKS: {"landmarks": 60},
@@ -56,6 +63,20 @@ SMALLER = {
     "perceptron": {"units": 16, "improvement": 0.03},
 }
 ROWS = 300
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory):
+    """Let commands, and what runs here, find the example installed."""
+    folder = tmp_path_factory.mktemp("extension")
+    source = shutil.copytree(EXAMPLE, folder / "source")  # a build leaves its traces in it
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", folder / "site", source], check=True, capture_output=True)
+    path = os.pathsep.join(filter(None, [str(folder / "site"), os.environ.get("PYTHONPATH")]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder / "site")
+        patch.setenv("PYTHONPATH", path)
+        yield
 
 
 def method_of(name):

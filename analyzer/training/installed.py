@@ -5,27 +5,14 @@ from importlib.util import find_spec
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.clip_embeddings import ClipEmbedder, network_embedder
 from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, ROOM21
-from hearthlog.analyzer.training.layer_methods import LOGISTIC, PERCEPTRON
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.svm_method import BANDS, PAPER, SVM, network_method
-from hearthlog.analyzer.training.tree_methods import BOOSTING, EXTRA_TREES, FOREST
-from hearthlog.analyzer.training.vector_methods import NEIGHBOURS_VOTE, ONE_CLASS_MACHINES
 from hearthlog.models.embedding.networks import find_network
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.installed import is_network
 
 DEFAULT: Method = ROOM
-OTHERS: tuple[Method, ...] = (
-    SVM,
-    LOGISTIC,
-    PERCEPTRON,
-    NEIGHBOURS_VOTE,
-    FOREST,
-    EXTRA_TREES,
-    BOOSTING,
-    ONE_CLASS_MACHINES,
-)
-_INSTALLED = [ROOM, EMBEDDING, ROOM21, BANDS, PAPER, *OTHERS]
+_INSTALLED = [ROOM, EMBEDDING, ROOM21, BANDS, PAPER, SVM]
 _METHODS = Extensions("hearthlog.methods", Method, "method", _INSTALLED, DataError)  # type: ignore[type-abstract]
 
 
@@ -56,8 +43,8 @@ def method_named(name: str) -> Method:
     Parameters
     ----------
     name : str
-        `embedding`, `room`, `room21`, `bands`, `paper`, one of `OTHERS`, the name of an entry point
-        in the group `hearthlog.methods`, or that of a network that has a card.
+        `embedding`, `room`, `room21`, `bands`, `paper`, `svm`, the name of an entry point in the
+        group `hearthlog.methods`, or that of a network that has a card.
 
     Raises
     ------

@@ -2,19 +2,15 @@
 
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
-from hearthlog.models.classifiers.layers import LAYERS
 from hearthlog.models.classifiers.names import NAMES
-from hearthlog.models.classifiers.neighbours import NEIGHBOURS
-from hearthlog.models.classifiers.one_class import ONE_CLASS
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
-from hearthlog.models.classifiers.trees import TREES
 from hearthlog.models.extensions import Extensions
 
 CLASSIFIERS = Extensions(
     "hearthlog.classifiers",
     ClassifierKind,  # type: ignore[type-abstract]
     "classifier kind",
-    [RBF_LANDMARKS, SVM_RBF, LAYERS, NAMES, NEIGHBOURS, ONE_CLASS, TREES],
+    [RBF_LANDMARKS, SVM_RBF, NAMES],
 )
 
 

@@ -20,8 +20,8 @@ _LAST = (1 << 63) - 1  # log time
 METHOD = "embedding where its network is, else room"
 METHODS = (
     "How to learn: embedding (as room, and by what a network hears), room, room21 (the 21 features "
-    "of auros21), bands, or paper; the inputs of room with svm, logistic, perceptron, neighbours, "
-    "forest, extra-trees, boosting, or one-class."
+    "of auros21), bands, paper, svm (the inputs of room, a support vector machine), or one that "
+    "another distribution brings: see docs/classifiers.md."
 )
 
 

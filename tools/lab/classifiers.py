@@ -32,7 +32,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import collection_folds, nested_probabilities
 from hearthlog.analyzer.training.cross_validation import Fold, cross_validate
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
-from hearthlog.analyzer.training.installed import OTHERS
+from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import Examples, Method, prepare
@@ -49,7 +49,10 @@ from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.lab.bench.timing import best_of
 
-METHODS: dict[str, Method] = {one.name: one for one in (ROOM, *OTHERS)}
+METHODS = (  # those behind svm are of examples/classifiers
+    *("room", "svm", "logistic", "perceptron", "neighbours"),
+    *("forest", "extra-trees", "boosting", "one-class"),
+)
 SCENARIOS = ("general", "bathroom")
 _TIMED_ROWS = 256
 _Line = tuple[str, ...]
@@ -109,7 +112,7 @@ def classifiers(
     if unknown := [name for name in method if name not in METHODS]:
         raise typer.BadParameter(f"{unknown[0]}: known are {', '.join(METHODS)}")
     names = [ROOM.name, *(name for name in method if name != ROOM.name)]
-    methods = [replace(METHODS[name], most_windows=windows) for name in names]  # type: ignore[call-arg]
+    methods = [replace(method_named(name), most_windows=windows) for name in names]  # type: ignore[call-arg]
     for name in scenario:
         data = _segments(manifest, name)
         examples = prepare(ROOM, data)

@@ -15,8 +15,8 @@ from sklearn.ensemble import (
 from hearthlog.analyzer.training.learned_inputs import balanced
 from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
-from hearthlog.models.classifiers.trees import TREES, TreesMachine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog_classifiers.trees import TREES, TreesMachine
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class BoostingMethod(WindowMethod):
 def forest_arrays(
     forest: RandomForestClassifier | ExtraTreesClassifier,
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `hearthlog.models.classifiers.trees.TreesKind`.
+    """Return the arrays of `hearthlog_classifiers.trees.TreesKind`.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def forest_arrays(
 
 
 def boosted_arrays(boosted: GradientBoostingClassifier) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `hearthlog.models.classifiers.trees.TreesKind`.
+    """Return the arrays of `hearthlog_classifiers.trees.TreesKind`.
 
     Parameters
     ----------

@@ -11,8 +11,8 @@ from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import RoundedDistances
 from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
-from hearthlog.models.classifiers.shares import log_shares
 from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog_classifiers.shares import log_shares
 
 _ROWS_AT_ONCE = 32  # bounds memory
 _VECTORS_AT_ONCE = 256  # a product this small no BLAS divides among threads

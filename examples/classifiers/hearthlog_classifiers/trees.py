@@ -8,8 +8,8 @@ import numpy as np
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, NoParameters
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.shares import log_shares
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
+from hearthlog_classifiers.shares import log_shares
 
 MOST_LEVELS = 64
 _TREES_AT_ONCE = 64  # bounds memory

@@ -14,17 +14,17 @@ from hearthlog.analyzer.training.learned_inputs import (
 )
 from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
-from hearthlog.models.classifiers.neighbours import (
+from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog_classifiers.neighbours import (
     NEIGHBOURS,
     NeighboursMachine,
     NeighboursParameters,
 )
-from hearthlog.models.classifiers.one_class import (
+from hearthlog_classifiers.one_class import (
     ONE_CLASS,
     OneClassMachine,
     OneClassParameters,
 )
-from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 
 @dataclass(frozen=True)

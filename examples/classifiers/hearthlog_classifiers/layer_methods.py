@@ -12,8 +12,8 @@ from sklearn.preprocessing import StandardScaler
 from hearthlog.analyzer.training.learned_inputs import balanced, fitted_scaler, scaler_arrays
 from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
-from hearthlog.models.classifiers.layers import LAYERS, LayersMachine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog_classifiers.layers import LAYERS, LayersMachine
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class PerceptronMethod(WindowMethod):
 def layer_arrays(
     scaler: StandardScaler, weights: list[Float64], biases: list[Float64]
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `hearthlog.models.classifiers.layers.LayersKind`.
+    """Return the arrays of `hearthlog_classifiers.layers.LayersKind`.
 
     Parameters
     ----------

@@ -1,0 +1,1 @@
+"""Classifiers of other systems: trees, neighbours, perceptrons, one-class machines."""
