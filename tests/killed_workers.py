@@ -24,7 +24,6 @@ import psutil
 from clusters import scheduler_in, worker_of
 
 from hearthlog.schemas.logs.files import is_layer
-from hearthlog.tools.lab.home.copies import copy_logs
 
 _DAY = 86_400  # seconds
 _COMMAND = [sys.executable, "-m", "hearthlog.tools.cli.main", "relabel"]
@@ -116,6 +115,8 @@ def layers(home: Path) -> dict[str, str]:
 
 
 def _main(logs: str, model: str, homes: str, days: str, seconds: str) -> None:
+    from hearthlog.tools.lab.home.copies import copy_logs  # noqa: PLC0415  the wheel leaves it out
+
     os.environ["SOURCE_DATE_EPOCH"] = "1772348400"
     with TemporaryDirectory() as text:
         folder = Path(text)
