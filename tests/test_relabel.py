@@ -29,7 +29,9 @@ from together import record_together
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.logs.layers import find_chains
-from hearthlog.analyzer.relabel.labels import label_logs
+from hearthlog.analyzer.relabel import labels
+from hearthlog.analyzer.relabel.jobs import Job
+from hearthlog.analyzer.relabel.labels import complete_layer, label_logs
 from hearthlog.analyzer.relabel.layer import read_layer_metadata
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
@@ -313,6 +315,32 @@ def test_a_chunk_of_a_layer_spans_a_minute_at_most(model, logs):
             if is_layer(path):
                 spans = file.chunks["end"] - file.chunks["start"]
                 assert (spans < 60 * NANOSECONDS).all()
+
+
+def test_chunks_of_a_layer_are_cut_by_time(model, logs, monkeypatch):
+    monkeypatch.setattr(labels, "_CHUNK_SPAN", 10 * NANOSECONDS)  # logs have a minute
+    relabelled(model, logs)
+    layer = relabel_path(recorded_logs(logs)[1], load_model(model).name)
+    with LogFile(layer) as file:
+        spans = file.chunks["end"] - file.chunks["start"]
+    assert (spans < 10 * NANOSECONDS).all()
+    assert len(spans) > 3
+
+
+def test_labels_that_were_written_out_of_order_give_the_same_layer(model, logs, monkeypatch):
+    monkeypatch.setattr(labels, "_PIECE_SPAN", NANOSECONDS)
+    loaded, log = load_model(model), recorded_logs(logs)[1]
+    layer = relabel_path(log, loaded.name)
+    job = Job(log, layer, (), None, model, loaded.sha256, replaces=False, continues_layer=False)
+    made = []
+    for step in (1, -1):
+        (labelled,) = label_logs([job])
+        rows = np.fromfile(labelled.part, labels._row_type(len(loaded.classes)))
+        rows[::step].tofile(labelled.part)
+        complete_layer(job, labelled)
+        made.append(layer.read_bytes())
+        layer.unlink()
+    assert made[0] == made[1]
 
 
 def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capfd):

@@ -1,4 +1,4 @@
-"""Searching for cost and gamma, and learning in threads or on a Dask cluster alike."""
+"""Learning in threads or on a Dask cluster alike, with a cost and gamma that were chosen."""
 
 import dataclasses
 import os
