@@ -75,6 +75,13 @@ def worker_of(address, *options, threads=1):
         yield process
 
 
+@contextmanager
+def two_threads_in(folder):
+    """The address of a cluster of one worker; joblib does without one that has a single thread."""
+    with scheduler_in(folder) as (address, _), worker_of(address, "--no-nanny", threads=2):
+        yield address
+
+
 def _await_nanny(address, pid):
     def state(dask_worker):
         return os.getpid(), dask_worker.status.name

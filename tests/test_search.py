@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tasks
 from blobs import blobs
-from clusters import running, scheduler_in, worker_of
+from clusters import running, scheduler_in, two_threads_in, worker_of
 from joblib import delayed
 from spliced import run
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -37,9 +37,7 @@ def hearthlog(capfd):
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cluster")
-    # joblib does without a cluster that has a single thread.
-    with scheduler_in(folder) as (address, _), worker_of(address, "--no-nanny", threads=2):
+    with two_threads_in(tmp_path_factory.mktemp("cluster")) as address:
         yield address
 
 

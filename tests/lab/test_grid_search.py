@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from blobs import blobs
-from clusters import scheduler_in, worker_of
+from clusters import two_threads_in
 from spliced import run, run_function
 
 from hearthlog.analyzer.errors import DataError
@@ -27,9 +27,7 @@ def measured(capfd, *words):
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cluster")
-    # joblib does without a cluster that has a single thread.
-    with scheduler_in(folder) as (address, _), worker_of(address, "--no-nanny", threads=2):
+    with two_threads_in(tmp_path_factory.mktemp("cluster")) as address:
         yield address
 
 

@@ -62,7 +62,7 @@ _LAB = {  # verbs and options that are modules of `hearthlog.tools.lab` now
 
 
 class _Group(TyperGroup):
-    """Names the new verb to those who use the old one."""
+    """Points users of moved verbs and options to what has them now."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the words behind `evaluate`."""

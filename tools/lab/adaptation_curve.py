@@ -1,4 +1,4 @@
-"""What some corrected seconds of a new home are worth, and what they do to all other sounds.
+"""Adaptation curves: macro F1 of a home against the number of corrected segments.
 
 Run by `python -m hearthlog.tools.lab.adaptation_curve`.
 
