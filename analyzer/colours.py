@@ -27,12 +27,6 @@ def colour(name: str) -> Colour:
 
 
 def colour_on_paper(name: str) -> Colour:
-    """Return the colour of a class on a white ground.
-
-    Returns
-    -------
-    tuple of int
-        As of `colour`; light grey instead of white.
-    """
+    """Return the colour of a class on a white ground."""
     shade = colour(name)
     return _LIGHT if shade == _WHITE else shade

@@ -51,13 +51,7 @@ def require(*modules: str) -> None:
 
 
 def missing(*modules: str) -> str:
-    """Say that modules are not installed, and what to do.
-
-    Parameters
-    ----------
-    *modules : str
-        Their import names, such as `sklearn`, or those of parts of them.
-    """
+    """Say that modules are not installed, and what to do."""
     tops = [module.partition(".")[0] for module in modules]
     names = list(dict.fromkeys(_NAMES.get(top, top) for top in tops))
     are = "is" if len(names) == 1 else "are"
@@ -65,13 +59,7 @@ def missing(*modules: str) -> str:
 
 
 def remedy(*modules: str) -> str:
-    """Say how to install the extras of modules, in the way in which hearthlog was installed.
-
-    Parameters
-    ----------
-    *modules : str
-        Their import names, such as `sklearn`, or those of parts of them.
-    """
+    """Say how to install the extras of modules, in the way in which hearthlog was installed."""
     extra = ",".join(
         dict.fromkeys(_EXTRAS.get(module.partition(".")[0], "headless") for module in modules)
     )

@@ -37,17 +37,7 @@ class _Status(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is to be said of one thing.
-
-    Attributes
-    ----------
-    level : str
-        `ok`, `warning` or `error`.
-    subject : str
-        What it is about: a microphone, `recorder`, `disk`, `clock` …
-    text : str
-        What is the case, and what to do.
-    """
+    """What is to be said of one thing."""
 
     level: Level
     subject: str
@@ -57,20 +47,7 @@ class State(NamedTuple):
 def examine_live(folder: Path) -> list[State]:
     """Look at a folder of logs, at the disk, and at what its recorders say of themselves.
 
-    Parameters
-    ----------
-    folder : Path
-        Of this machine.
-
-    Returns
-    -------
-    list of State
-        Of the recorders, one after the other, then of the folder.
-
-    Raises
-    ------
-    LogError
-        If there is no such folder.
+    Raise `LogError` if there is no such folder.
     """
     check_allowed(folder)
     if not folder.is_dir():

@@ -15,12 +15,7 @@ _LONGEST = 1 << 12  # bytes of a file
 
 
 def is_ping_address(url: str) -> bool:
-    """Tell whether an address can be asked.
-
-    Parameters
-    ----------
-    url : str
-    """
+    """Tell whether an address can be asked."""
     try:
         parts = urlsplit(url)
         is_whole = parts.scheme in {"http", "https"} and bool(parts.hostname)
@@ -38,14 +33,7 @@ def has_password(url: str) -> bool:
 def read_ping_address(file: Path) -> str:
     """Read a file of one line with an address: who knows it could ping in the place of the box.
 
-    Parameters
-    ----------
-    file : Path
-
-    Raises
-    ------
-    HearthlogError
-        If it cannot be read, or has no such address.
+    Raise `HearthlogError` if it cannot be read, or has no such address.
     """
     data = read_whole(file, "file of a ping address", _LONGEST, HearthlogError)
     url = data.decode("utf-8-sig", "replace").strip()
@@ -59,12 +47,6 @@ def read_ping_address(file: Path) -> str:
 
 def ping(url: str, *, is_well: bool) -> str:
     """Ask for an address, or for `/fail` below it if something is wrong; nothing is sent.
-
-    Parameters
-    ----------
-    url : str
-        As `is_ping_address` takes it.
-    is_well : bool
 
     Returns
     -------

@@ -14,17 +14,7 @@ HOST = "127.0.0.1"
 def listen(port: int | None = None, bind: str = HOST) -> socket.socket:
     """Open a socket that waits for connections.
 
-    Parameters
-    ----------
-    port : int, optional
-        The only one that will do; by default any.
-    bind : str, optional
-        Address to listen on, of IPv4 or IPv6.
-
-    Raises
-    ------
-    DataError
-        If nothing can listen there.
+    Raise `DataError` if nothing can listen there.
     """
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     try:
@@ -43,17 +33,7 @@ def listen(port: int | None = None, bind: str = HOST) -> socket.socket:
 def free_port(port: int | None = None, bind: str = HOST) -> int:
     """Return a port on which this machine can listen.
 
-    Parameters
-    ----------
-    port : int, optional
-        The only one that will do; by default any.
-    bind : str, optional
-        Address to listen on, of IPv4 or IPv6.
-
-    Raises
-    ------
-    DataError
-        If nothing can listen there.
+    Raise `DataError` if nothing can listen there.
     """
     with listen(port, bind) as probe:
         return int(probe.getsockname()[1])
@@ -85,13 +65,6 @@ def is_asked_in_digits(bind: str, host: str) -> bool:
 
     Whoever owns a name can let it point to any address, so that a page of that name may read what
     is there. Nobody can do so with an address in digits, or with `localhost`.
-
-    Parameters
-    ----------
-    bind : str
-        Address that is listened on, of IPv4 or IPv6.
-    host : str
-        The field `Host` of the request, with or without a port.
     """
     listening, named = ip_address(bind), host_name(f"//{host}")
     if named == "localhost":

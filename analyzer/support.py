@@ -35,15 +35,8 @@ _RELEASE = Path("/etc/os-release")
 def support_bundle(folder: Path) -> Iterator[tuple[str, bytes]]:
     """Collect what there is to know of the recorders of a folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Of logs, of this machine.
-
     Yields
     ------
-    name : str
-        Of a file.
     content : bytes
         JSON. Times at which was recorded are in it, the configuration, gaps, the health of
         microphones and machine, and what the doctor found; labels, features and levels are not.

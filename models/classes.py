@@ -22,13 +22,8 @@ class SoundClass(NamedTuple):
 
     Attributes
     ----------
-    name : str
     colour : (int, int, int)
         Red, green and blue, 0 to 255.
-    seconds : float
-        Expected duration of such a sound without a pause.
-    words : str
-        What people call the sound.
     several : str
         What people call its events where they count them; empty where they do not.
     aliases : tuple of str
@@ -110,13 +105,7 @@ def in_words(label: str) -> str:
 
 
 def class_name(label: str) -> str:
-    """Return the name of the class that a label means; the label itself if there is none.
-
-    Parameters
-    ----------
-    label : str
-        In any spelling that `find_class` knows.
-    """
+    """Return the name of the class that a label means; the label itself if there is none."""
     row = find_class(label)
     return label if row is None else row.name
 
@@ -125,13 +114,6 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
     """Return the names that a label means: the label itself in any spelling, or all of its class.
 
     Two names of one class in a collection are different things there, so a third name means both.
-
-    Parameters
-    ----------
-    label : str
-        In any spelling that `find_class` knows.
-    names : collection of str
-        Names that come into question, such as the classes of a model.
 
     Returns
     -------
@@ -147,13 +129,6 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
 
 def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
     """Translate labels to the names that they mean.
-
-    Parameters
-    ----------
-    labels : iterable of str
-        In any spelling that `find_class` knows.
-    names : collection of str
-        Names that come into question, such as the classes of a model.
 
     Returns
     -------

@@ -36,14 +36,6 @@ class Extensions(Generic[T]):
 
     Parameters
     ----------
-    group : str
-        Group of entry points, such as "hearthlog.feature_sets". Each is an object of this kind
-        whose `name` is the name of the entry point.
-    kind : type
-        Class of the objects.
-    word : str
-        What to call one in messages.
-    ours : sequence of T
     missing : type of HearthlogError
         Raised if there is none of a name.
     """
@@ -69,33 +61,17 @@ class Extensions(Generic[T]):
         return [*self._ours, *sorted(theirs - self._ours.keys())]
 
     def has(self, name: str) -> bool:
-        """Tell whether there is one of this name, without importing it.
-
-        Parameters
-        ----------
-        name : str
-        """
+        """Tell whether there is one of this name, without importing it."""
         return name in self._loaded or bool(entry_points(group=self._group, name=name))
 
     def distribution(self, name: str) -> str:
-        """Return the distribution that brings one of others, and its version; empty for ours.
-
-        Parameters
-        ----------
-        name : str
-            Of one that there is.
-        """
+        """Return the distribution that brings one of others, and its version; empty for ours."""
         points = () if name in self._ours else entry_points(group=self._group, name=name)
         names = [f"{p.dist.name} {p.dist.version}" for p in points if p.dist is not None]
         return names[0] if names else ""
 
     def get(self, name: str) -> T:
         """Return an object by its name.
-
-        Parameters
-        ----------
-        name : str
-            Name of one of ours, or of an entry point of the group.
 
         Raises
         ------

@@ -38,13 +38,7 @@ class FrameSpans:
         return type(self)(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def known_at(self, first: int, count: int) -> Self:
-        """Return those that become known with some successive frames.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
-        """
+        """Return those that become known with some successive frames."""
         begin, end = np.searchsorted(self.last_frames, [first, first + count])
         return self.rows(slice(begin, end))
 

@@ -66,16 +66,8 @@ def read_topic(address: str) -> TopicAddress:
 def check_address(address: str) -> None:
     """Check what can be known of an address without the network.
 
-    Parameters
-    ----------
-    address : str
-        Such as "rtsp://user:password@camera/stream" or "ros2:///robot/audio".
-
-    Raises
-    ------
-    SourceError
-        If it is of a kind that is not taken, has no host, or cannot be read. The message does not
-        repeat it, for it may have a password.
+    Raise `SourceError` if it is of a kind that is not taken, has no host, or cannot be read.
+    The message does not repeat it, for it may have a password.
     """
     if re.search(r"[\0-\x20\x7f]", address) or len(address) > _MOST_CHARACTERS:
         raise SourceError(
@@ -110,18 +102,7 @@ def _has_host(address: str) -> bool:
 
 
 def public_name(device: str) -> str:
-    """Name a device for the log: an address without its user, password and parameters.
-
-    Parameters
-    ----------
-    device : str
-        An address, or the name of a device at this machine.
-
-    Returns
-    -------
-    str
-        Such as "rtsp://camera/stream"; any other device as it is.
-    """
+    """Name a device for the log: an address without its user, password and parameters."""
     if not is_address(device):
         return device
     if is_topic(device):

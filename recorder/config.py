@@ -276,13 +276,7 @@ class Settings(BaseModel):
         return KeepingRules(str(self.output), self.node, limits, thinning)
 
     def settings_of(self, microphone: str) -> MicrophoneSettings:
-        """Return what is configured of a microphone.
-
-        Parameters
-        ----------
-        microphone : str
-            Its name.
-        """
+        """Return what is configured of a microphone."""
         return next(each for each in self.microphone if each.name == microphone)
 
     def scenarios_of(self, microphone: MicrophoneSettings) -> dict[str, Path]:
@@ -319,10 +313,6 @@ def load_settings(
     ----------
     file : Path or None
         The TOML file; None for no file.
-    command_line : dict
-        Values given there, by field name of `Settings`.
-    microphone : dict
-        Values given there for the microphone, by field name of `MicrophoneSettings`.
 
     Raises
     ------
@@ -353,15 +343,7 @@ def load_with_origins(
 ) -> tuple[Settings, Origins]:
     """Load settings as `load_settings` does, and tell where their values come from.
 
-    Parameters
-    ----------
-    file, command_line, microphone
-        As of `load_settings`.
-
-    Raises
-    ------
-    ConfigurationError
-        As `load_settings`.
+    Raise `ConfigurationError` as `load_settings`.
     """
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     content.pop(BRIDGE, None)

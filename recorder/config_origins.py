@@ -18,17 +18,7 @@ Key = tuple[str | int, ...]  # such as ("microphone", 1, "device")
 
 
 class Origins(NamedTuple):
-    """What values were given, and where.
-
-    Attributes
-    ----------
-    command_line, file : mapping of str to object
-        By the name of the key.
-    path : Path or None
-        Of the file.
-    lines : mapping of Key to int
-        Of the keys and tables of the file.
-    """
+    """What values were given, and where."""
 
     command_line: Mapping[str, Any]
     file: Mapping[str, Any]
@@ -36,12 +26,7 @@ class Origins(NamedTuple):
     lines: Mapping[Key, int]
 
     def origin(self, key: Key) -> str:
-        """Say where the value of a key comes from.
-
-        Parameters
-        ----------
-        key : Key
-        """
+        """Say where the value of a key comes from."""
         first = str(key[0]) if key else ""
         if first in self.command_line:
             return "command line"
@@ -53,12 +38,7 @@ class Origins(NamedTuple):
         return f"{self.path}" if line is None else f"{self.path}, line {line}"
 
     def place(self, key: Key) -> str:
-        """Say where something is wrong: a line of the file, or what else the value comes from.
-
-        Parameters
-        ----------
-        key : Key
-        """
+        """Say where something is wrong: a line of the file, or what else the value comes from."""
         every = (self.origin(key[:end]) for end in range(len(key), 0, -1))  # of what it is in
         return next((origin for origin in every if origin != DEFAULT), "configuration")
 

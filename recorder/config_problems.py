@@ -39,16 +39,10 @@ class _Place(NamedTuple):
 
     Attributes
     ----------
-    key : Key
-        As the file has it.
     about : Schema
         Of the value; empty if it is unknown.
-    table : Schema
-        Of the innermost table around it.
     name : str
         The innermost key of a table that is described; the value may be one element of its value.
-    named : Schema
-        Of that key.
     """
 
     key: Key
@@ -69,13 +63,6 @@ def configuration_error(
 
     Parameters
     ----------
-    error : ValidationError
-    origins : Origins
-        Of what was validated.
-    model : type of BaseModel
-        What it was validated as.
-    table : Key, optional
-        Where in the file that is.
     others : mapping of str to type of BaseModel, optional
         Other tables of the file, by what is written to begin them, whose keys may have been meant.
     """

@@ -50,12 +50,8 @@ class Probe(NamedTuple):
 
     Attributes
     ----------
-    seconds : float
-        That a window takes here.
     megabytes : float
         Most memory of a process that does nothing else; 0 where that is not known.
-    different_answers : list of str
-        As of `Embedder`.
     """
 
     seconds: float
@@ -71,16 +67,7 @@ class Probe(NamedTuple):
 def probe_network(name: str, path: Path) -> Probe:
     """Load a network in a process of its own, and try it.
 
-    Parameters
-    ----------
-    name : str
-    path : Path
-        Its file.
-
-    Raises
-    ------
-    ModelError
-        If it cannot be used, crashes, hangs, or takes too much memory.
+    Raise `ModelError` if it cannot be used, crashes, hangs, or takes too much memory.
     """
     network = NETWORKS.get(name)
     if missing_modules(network.suffix):
@@ -130,8 +117,6 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
     ----------
     wanted : str, optional
         Name of a network, or none; empty for yamnet if it is there.
-    microphones : int, optional
-        How many are listened to.
 
     Returns
     -------
@@ -160,11 +145,6 @@ def likely_network(wanted: str = "") -> str:
     """Name the network that a recorder will listen with, if its file and runtime are there.
 
     Whether this machine is quick enough for it, and whether the file is whole, is not tried.
-
-    Parameters
-    ----------
-    wanted : str, optional
-        As of `open_embedder`.
     """
     name = wanted or DEFAULT_NETWORK
     if wanted == NO_NETWORK or not NETWORKS.has(name) or find_network(name) is None:
@@ -181,16 +161,7 @@ def _probed(name: str, path: Path, _changed: int) -> Probe:
 def check_network(wanted: str, microphones: int = 1) -> None:
     """Check the network that is configured by its name, if one is.
 
-    Parameters
-    ----------
-    wanted : str
-        As of `open_embedder`.
-    microphones : int, optional
-
-    Raises
-    ------
-    ModelError
-        If it is not there, or cannot be used.
+    Raise `ModelError` if it is not there, or cannot be used.
     """
     if wanted not in {"", NO_NETWORK}:
         path = network_path(wanted)
@@ -200,14 +171,7 @@ def check_network(wanted: str, microphones: int = 1) -> None:
 def network_path(name: str) -> Path:
     """Return the file of a network.
 
-    Parameters
-    ----------
-    name : str
-
-    Raises
-    ------
-    ModelError
-        If there is no such network, or its file was not fetched.
+    Raise `ModelError` if there is no such network, or its file was not fetched.
     """
     path = find_network(name)
     if path is None:
@@ -220,18 +184,7 @@ def network_path(name: str) -> Path:
 def check_pace(path: Path, probe: Probe, microphones: int = 1) -> None:
     """Check whether this machine is quick enough for a network.
 
-    Parameters
-    ----------
-    path : Path
-        Its file.
-    probe : Probe
-    microphones : int, optional
-        How many are listened to.
-
-    Raises
-    ------
-    ModelError
-        If a window would take more than half of the time to the next.
+    Raise `ModelError` if a window would take more than half of the time to the next.
     """
     if microphones * probe.seconds > _MOST_SHARE * _HOP_SECONDS:
         of = f" of each of {microphones} microphones" if microphones > 1 else ""

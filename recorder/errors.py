@@ -8,13 +8,7 @@ class SourceError(HearthlogError):
 
 
 class ConfigurationError(HearthlogError):
-    """The configuration is unknown, wrong or contradicts itself.
-
-    Parameters
-    ----------
-    *lines : str
-        One for each thing that is wrong.
-    """
+    """The configuration is unknown, wrong or contradicts itself."""
 
     status = 2
 

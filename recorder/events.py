@@ -28,8 +28,6 @@ class Frames:
 
     Attributes
     ----------
-    first : int
-        Number of the first frame.
     samples : np.ndarray [shape=(n, 800)], float32
         Samples in full scale, -1 to 1.
     stamps : np.ndarray [shape=(n,)], int64
@@ -37,8 +35,6 @@ class Frames:
     channels : np.ndarray [shape=(n, 800, c)], float32, or None
         The same of all microphones of an array, of which `samples` is the first one; None of a
         single microphone.
-    reports : tuple of SourceHealth
-        The state of the source at the starts of some of the frames, in the order of time.
     """
 
     first: int
@@ -92,17 +88,7 @@ class SoundSource(Protocol):
 
 
 def event_time(event: Event) -> int:
-    """Return the last time that an event speaks of, in nanoseconds of UTC.
-
-    Parameters
-    ----------
-    event : Event
-
-    Returns
-    -------
-    int
-        Start of the last frame, end of a gap, or time of a report of health.
-    """
+    """Return the last time that an event speaks of, in nanoseconds of UTC."""
     if isinstance(event, Frames):
         return int(event.stamps[-1])
     return event.end if isinstance(event, Gap) else event.stamp

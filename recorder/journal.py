@@ -14,13 +14,7 @@ _takers: list[Callable[[str], None]] = []
 
 @contextmanager
 def lines_to(take: Callable[[str], None]) -> Iterator[None]:
-    """Give the lines of the recorder to somebody else while the block runs.
-
-    Parameters
-    ----------
-    take : callable
-        Is told each line; must not block.
-    """
+    """Give the lines of the recorder to somebody else while the block runs."""
     _takers.append(take)
     try:
         yield
@@ -29,12 +23,7 @@ def lines_to(take: Callable[[str], None]) -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """Print a line on standard error.
-
-    Parameters
-    ----------
-    text : str
-    """
+    """Print a line on standard error."""
     if _takers:
         _takers[-1](f"hearthlog: {text}")
         return
@@ -59,14 +48,7 @@ class HealthJournal:
         self._said_at: dict[str, float] = {}
 
     def add(self, microphone: str, health: SourceHealth) -> None:
-        """Say the state of a microphone, if that is news.
-
-        Parameters
-        ----------
-        microphone : str
-            Its name.
-        health : SourceHealth
-        """
+        """Say the state of a microphone, if that is news."""
         before = self._trouble.get(microphone, "")
         trouble = self._trouble[microphone] = health.summary if health.level != OK else ""
         now = time.monotonic()

@@ -22,15 +22,7 @@ _TIMESYNC = Path("/run/systemd/timesync")  # for a service, which may not ask th
 
 
 class MachineWatch:
-    """Looks at the machine every ten seconds.
-
-    Parameters
-    ----------
-    folder : Path
-        On the disk that is looked at.
-    sys : Path
-        Where Linux tells of its devices.
-    """
+    """Looks at the machine every ten seconds."""
 
     def __init__(self, folder: Path, sys: Path = _SYS) -> None:
         self._folder = folder
@@ -38,13 +30,7 @@ class MachineWatch:
         self._looked = -math.inf
 
     def tick(self, stamp: int) -> SourceHealth | None:
-        """Look if it is time; return what was seen then.
-
-        Parameters
-        ----------
-        stamp : int
-            In nanoseconds of UTC.
-        """
+        """Look if it is time; return what was seen then."""
         now = time.monotonic()
         if now - self._looked < _SECONDS:
             return None
@@ -53,22 +39,7 @@ class MachineWatch:
 
 
 def machine_health(stamp: int, folder: Path, sys: Path = _SYS) -> SourceHealth:
-    """Look at the machine.
-
-    Parameters
-    ----------
-    stamp : int
-        In nanoseconds of UTC.
-    folder : Path
-        On the disk that is looked at.
-    sys : Path
-        Where Linux tells of its devices.
-
-    Returns
-    -------
-    SourceHealth
-        With the values that this machine can tell.
-    """
+    """Look at the machine."""
     temperature, throttled = _temperature(sys), _throttled(sys)
     is_set = clock_is_synchronized()
     values = {

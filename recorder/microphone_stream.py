@@ -16,28 +16,9 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 class MicrophoneStream:
     """One microphone of a recording.
 
-    Parameters
-    ----------
-    settings : Settings
-    microphone : str
-        Its name.
-    source : SoundSource
-    models : LabellingModels
-    embedder : Embedder or None
-        Of the network whose embeddings are logged.
-
-    Attributes
-    ----------
-    pipeline : Pipeline
-    models : LabellingModels
-
-    Raises
-    ------
-    ModelError
-        If the configured feature set is not installed.
-    ConfigurationError
-        If a model is for another feature set than the configured one, or does not know what is
-        private.
+    Raise `ModelError` if the configured feature set is not installed. Raise
+    `ConfigurationError` if a model is for another feature set than the configured one, or does
+    not know what is private.
     """
 
     def __init__(
@@ -78,8 +59,6 @@ class MicrophoneStream:
 
         Parameters
         ----------
-        event : Event
-            The next one of the source.
         log_is_full : bool
             Whether the log takes no sound now; what is dropped so is a gap later.
         """
@@ -122,7 +101,6 @@ class MicrophoneStream:
 
         Parameters
         ----------
-        changes : list of Change
         frames : Frames or None
             The next ones; None if they have not come yet.
         now : int

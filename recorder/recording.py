@@ -50,14 +50,8 @@ def record_files(
 
     Parameters
     ----------
-    settings : Settings
-    source : FileSource
-    stop : threading.Event
-        Once set, the log is completed.
     reload_requests : ReloadRequests or None
         Make the recorder check at once whether a model's file has been replaced.
-    state : RecorderState or None
-        Is kept true while it records.
 
     Raises
     ------
@@ -93,13 +87,8 @@ def record_microphones(
 
     Parameters
     ----------
-    settings : Settings
-    stop : threading.Event
-        Once set, the log is completed.
     reload_requests : ReloadRequests or None
         Make the recorder check at once whether a model's file has been replaced.
-    state : RecorderState or None
-        Is kept true while it records.
 
     Raises
     ------
@@ -144,35 +133,16 @@ def record_microphones(
 def check_recording(settings: Settings) -> None:
     """Check whether microphones could be recorded so, and leave no trace.
 
-    Parameters
-    ----------
-    settings : Settings
-
-    Raises
-    ------
-    LogError
-        If the folder of the logs cannot be written to.
-    SourceError
-        If an address of a microphone cannot be one of sound, or ffmpeg is not there for it.
-    ModelError, ConfigurationError
-        As `record_files`.
+    Raise `LogError` if the folder of the logs cannot be written to. Raise `SourceError` if an
+    address of a microphone cannot be one of sound, or ffmpeg is not there for it. Raise
+    `ModelError, ConfigurationError` as `record_files`.
     """
     if problems := recording_problems(settings):
         raise problems[0]
 
 
 def recording_problems(settings: Settings) -> list[HearthlogError]:
-    """Return the errors with which microphones could not be recorded so, and leave no trace.
-
-    Parameters
-    ----------
-    settings : Settings
-
-    Returns
-    -------
-    list of HearthlogError
-        As `check_recording` raises the first one.
-    """
+    """Return the errors with which microphones could not be recorded so, and leave no trace."""
     problems: dict[str, HearthlogError] = {}  # by its words: microphones may have the same model
 
     def check(step: Callable[[], object]) -> None:
@@ -248,10 +218,6 @@ def record(
 
     Parameters
     ----------
-    settings : Settings
-    source : SoundSource
-    stop : threading.Event
-        Once set, the log is completed.
     reload_requests : ReloadRequests or None
         Make the recorder check at once whether a model's file has been replaced.
 

@@ -64,18 +64,8 @@ class RecorderState:
 
     Attributes
     ----------
-    sound : dict of str to Frames
-        Last sound of each microphone.
-    labels : dict of str to FrameLabels or None
-        Of that sound.
     trouble : dict of str to str
         Why a microphone is not heard, or not well; empty if it is.
-    clip_frames : int
-        Of sound that was kept.
-    keeps : bool
-        Whether sound is to be kept.
-    news : deque of str
-        Changes of models and of microphones that were not told yet.
     """
 
     sound: dict[str, Frames] = field(default_factory=dict)
@@ -91,21 +81,10 @@ class RecordingSession:
 
     Parameters
     ----------
-    settings : Settings
     sources : mapping of str to SoundSource
         By the name of the microphone; of audio files no log may be there already.
-    models : mapping of str to LabellingModels
-        By the name of the microphone; several may have the same.
-    lock : FolderLock or None
-        Of the folder of the logs, where microphones are recorded into it.
     state : RecorderState or None
         Is kept true; None if nobody looks at it.
-    embedder : Embedder or None
-        Of the network whose embeddings are logged.
-
-    Attributes
-    ----------
-    summary : RecordingSummary
 
     Raises
     ------
@@ -165,16 +144,7 @@ class RecordingSession:
     def add(self, microphone: str, event: Event) -> None:
         """Record one event of a source.
 
-        Parameters
-        ----------
-        microphone : str
-            Name of the one whose event it is.
-        event : Event
-
-        Raises
-        ------
-        LogError
-            As `RollingLog.write`, if audio files are recorded.
+        Raise `LogError` as `RollingLog.write`, if audio files are recorded.
         """
         stream = self._streams[microphone]
         if self._log.is_full:
@@ -261,10 +231,8 @@ class RecordingSession:
     def finish(self) -> None:
         """Complete the log and its clips.
 
-        Raises
-        ------
-        LogError
-            If the log cannot be written; what was written stays, for the next start to complete.
+        Raise `LogError` if the log cannot be written; what was written stays, for the next
+        start to complete.
         """
         last = [message for each in self._streams.values() for message in each.pipeline.finish()]
         stream = next(iter(self._streams.values()))

@@ -46,14 +46,7 @@ _DASHES = frozenset("\N{HYPHEN}\N{NON-BREAKING HYPHEN}\N{EN DASH}\N{EM DASH}\N{M
 def quiet_hours(text: str) -> QuietHours:
     """Read hours such as `22:00-06:30`.
 
-    Parameters
-    ----------
-    text : str
-
-    Raises
-    ------
-    ConfigurationError
-        If they are written otherwise.
+    Raise `ConfigurationError` if they are written otherwise.
     """
     found = _FORM.fullmatch(text)
     if found is None:
@@ -66,30 +59,14 @@ def quiet_hours(text: str) -> QuietHours:
 def check_quiet_hours(text: str) -> str:
     """Return hours as `quiet_hours` takes them.
 
-    Parameters
-    ----------
-    text : str
-
-    Raises
-    ------
-    ConfigurationError
-        If they are written otherwise.
+    Raise `ConfigurationError` if they are written otherwise.
     """
     quiet_hours(text)
     return text
 
 
 class Rest:
-    """Tells whether the microphones of a home are to be closed.
-
-    Parameters
-    ----------
-    hours : sequence of QuietHours
-    zone : tzinfo
-        Of the home.
-    folder : Path
-        Of the logs, in which `pause` leaves its file.
-    """
+    """Tells whether the microphones of a home are to be closed."""
 
     def __init__(self, hours: list[QuietHours], zone: tzinfo, folder: Path) -> None:
         self._hours = hours
@@ -128,12 +105,8 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
 
     Parameters
     ----------
-    folder : Path
-        Of their logs.
     duration : timedelta or None
         How long; None until `resume`.
-    who : str, optional
-        Who asks for it, for the log.
 
     Raises
     ------
@@ -151,15 +124,7 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
 def resume(folder: Path) -> bool:
     """End a pause; return whether there was one.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the logs.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written to.
+    Raise `OSError` if the folder cannot be written to.
     """
     was_paused = _is_paused(folder)
     (folder / _PAUSE_FILE).unlink(missing_ok=True)
@@ -167,13 +132,7 @@ def resume(folder: Path) -> bool:
 
 
 def paused_until(folder: Path) -> float | None:
-    """Return the end of a pause in seconds of UTC; None for one that somebody has to end.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the logs.
-    """
+    """Return the end of a pause in seconds of UTC; None for one that somebody has to end."""
     try:
         end = int(_read_pause(folder).partition(b"\n")[0])
     except (OSError, ValueError):  # in doubt nobody is listened to

@@ -19,11 +19,6 @@ class ServiceManager:
 
     It is told that the recorder lives once every microphone has given frames or a report of its
     health: so also while one is gone or the disk refuses the log, but not when one of them hangs.
-
-    Parameters
-    ----------
-    microphones : iterable of str
-        Their names.
     """
 
     def __init__(self, microphones: Iterable[str]) -> None:
@@ -37,14 +32,7 @@ class ServiceManager:
         self._status = ""
 
     def add(self, microphone: str, event: Event) -> None:
-        """Tell what there is to tell, after an event was recorded.
-
-        Parameters
-        ----------
-        microphone : str
-            Name of the one whose event it is.
-        event : Event
-        """
+        """Tell what there is to tell, after an event was recorded."""
         if not self._is_there:
             return
         now = time.monotonic()
@@ -68,13 +56,7 @@ class ServiceManager:
         notify(lines)
 
     def stop(self, *, restarts: bool) -> None:
-        """Tell that the recorder completes its log and ends.
-
-        Parameters
-        ----------
-        restarts : bool
-            Whether this very process starts again then.
-        """
+        """Tell that the recorder completes its log and ends."""
         now = time.monotonic_ns() // 1000
         state = [f"RELOADING=1\nMONOTONIC_USEC={now}"] if restarts else ["STOPPING=1"]
         notify([*state, "STATUS=completing the log"])

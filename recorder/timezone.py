@@ -39,15 +39,7 @@ def time_zone(name: str) -> tzinfo:
 def check_time_zone(name: str) -> str:
     """Return the name of a time zone if this machine knows it.
 
-    Parameters
-    ----------
-    name : str
-        As `time_zone` takes it.
-
-    Raises
-    ------
-    LogError
-        If this machine has no such zone.
+    Raise `LogError` if this machine has no such zone.
     """
     time_zone(name)
     return name

@@ -4,13 +4,7 @@ from hearthlog.schemas.text import printable
 
 
 class HearthlogError(Exception):
-    """Base of hearthlog's errors; the command line prints the message and ends.
-
-    Attributes
-    ----------
-    status : int
-        Exit status of the command line.
-    """
+    """Base of hearthlog's errors; the command line prints the message and ends."""
 
     status = 1
 

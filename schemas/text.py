@@ -6,18 +6,7 @@ _LONGEST = 100  # characters of a name in a list
 
 
 def printable(text: object) -> str:
-    """Return a text on one line, with spaces in the place of what would steer a terminal.
-
-    Parameters
-    ----------
-    text : object
-        A text, or what `str` makes one of.
-
-    Returns
-    -------
-    str
-        As many characters as the text has, all of them printable.
-    """
+    """Return a text on one line, with spaces in the place of what would steer a terminal."""
     return "".join(c if c.isprintable() else " " for c in str(text))
 
 
@@ -26,7 +15,6 @@ def shortened(text: str, length: int) -> str:
 
     Parameters
     ----------
-    text : str
     length : int
         Characters that are returned at most, 1 or more; the last is `…` if the text has more.
     """
@@ -34,14 +22,7 @@ def shortened(text: str, length: int) -> str:
 
 
 def abridged(names: Sequence[str], most: int = 20) -> str:
-    """List names, of many the first: `a, b and 998 more`.
-
-    Parameters
-    ----------
-    names : sequence of str
-    most : int
-        How many are listed.
-    """
+    """List names, of many the first: `a, b and 998 more`."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return ", ".join(shortened(name, _LONGEST) for name in names[:most]) + more
 
@@ -53,7 +34,5 @@ def listed(names: Sequence[str], last: str = "or") -> str:
     ----------
     names : sequence of str
         Names in the order of the list; without any the list is an empty text.
-    last : str, optional
-        Word before the last name.
     """
     return f" {last} ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))

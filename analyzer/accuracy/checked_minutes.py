@@ -36,10 +36,6 @@ class ClassCheck(NamedTuple):
 
     Attributes
     ----------
-    labelled, right : int
-        Labelled events, and those with a part that is true.
-    true, missed : int
-        True events, and those of which no part was labelled.
     in_quiet : int
         Of the missed ones, those in minutes in which nothing sounds by the labels.
     """
@@ -108,13 +104,7 @@ class CheckedMinutes:
         return len(self.models)
 
     def of_model(self, model: str) -> "CheckedMinutes":
-        """Return the minutes that a model labelled; all of them if they are too few.
-
-        Parameters
-        ----------
-        model : str
-            SHA-256 of its file.
-        """
+        """Return the minutes that a model labelled; all of them if they are too few."""
         rows = np.flatnonzero([each == model for each in self.models])
         if len(rows) < FEWEST:
             return self
@@ -133,13 +123,7 @@ class CheckedMinutes:
         )
 
     def check(self, name: str) -> ClassCheck:
-        """Return how right the labels of a class were.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        """
+        """Return how right the labels of a class were."""
         kept = self._kept(name)
         columns = (self.labelled, self.right, self.true, self.missed)
         none = np.zeros(len(self), np.int64)
@@ -152,8 +136,6 @@ class CheckedMinutes:
 
         Parameters
         ----------
-        name : str
-            Of the class.
         share : float
             Of the class among all labelled events, 0 to 1.
         """
@@ -175,26 +157,15 @@ def read_checked_minutes(
 
     Parameters
     ----------
-    logs : HomeLogs
-    labelling : str
-        `live`, or the name of the model of relabel layers.
     start, end : int
         Nanoseconds of UTC: minutes that begin before or end after them are left out.
-    losses : list of str
-        What cannot be read is appended.
     """
     reviewed = read_reviewed_labels(logs, labelling, start, end, losses, {RANDOM})
     return checked_minutes(one for one in reviewed if start <= one.span.start < end)
 
 
 def checked_minutes(reviewed: Iterable[ReviewedLabels]) -> CheckedMinutes:
-    """Count the events of the minutes that were drawn at random, and gone through by a person.
-
-    Parameters
-    ----------
-    reviewed : iterable of ReviewedLabels
-        Others are left out.
-    """
+    """Count the events of the minutes that were drawn at random, and gone through by a person."""
     minutes = [one for one in reviewed if one.span.chosen == RANDOM]
     names = {
         name for one in minutes for part in (one.labels, one.true) for name in set(part.labels)

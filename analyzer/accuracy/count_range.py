@@ -27,8 +27,6 @@ class Strata(NamedTuple):
     ----------
     quiet, sounding : int
         Minutes in which nothing sounds, and in which anything does.
-    labelled : int
-        Events of the class in them.
     """
 
     quiet: int = 0
@@ -66,10 +64,6 @@ class CheckedRates:
         Share of labelled events, drawn from its distribution.
     missed : np.ndarray [shape=(draws, 2)], float64
         True events without a labelled one, in a quiet minute and in one that sounds.
-    minutes : int
-        That were checked.
-    occurs : bool
-        Whether any event in them was true.
     """
 
     right: Float64

@@ -18,15 +18,7 @@ _CHANGES = 2  # in a minute
 
 
 def events_of(labels: Labelling, name: str) -> Spans:
-    """Return the events of a class: its spans, joined where at most ten seconds are between them.
-
-    Parameters
-    ----------
-    labels : Labelling
-        In nanoseconds of UTC.
-    name : str
-        Of the class.
-    """
+    """Return the events of a class: its spans, joined across pauses of at most ten seconds."""
     own = labels.labels == name
     return joined(labels.starts[own], labels.ends[own], _PAUSE)
 
@@ -36,8 +28,6 @@ def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
 
     Parameters
     ----------
-    labels : Labelling
-        In nanoseconds of UTC.
     edges : np.ndarray [shape=(n + 1,)], int64
         Of the minutes.
 
@@ -58,8 +48,6 @@ def television_minutes(labels: Labelling, edges: Int64) -> Bool:
 
     Parameters
     ----------
-    labels : Labelling
-        In nanoseconds of UTC.
     edges : np.ndarray [shape=(n + 1,)], int64
         Of successive minutes.
 
@@ -86,7 +74,6 @@ def events_by_minute(events: Spans, edges: Int64) -> Int64:
 
     Parameters
     ----------
-    events : Spans
     edges : np.ndarray [shape=(n + 1,)], int64
         Of the minutes.
 
@@ -100,10 +87,6 @@ def events_by_minute(events: Spans, edges: Int64) -> Int64:
 
 def overlapping(events: Spans, others: Spans) -> Bool:
     """Tell which events have a part in common with one of others.
-
-    Parameters
-    ----------
-    events, others : Spans
 
     Returns
     -------

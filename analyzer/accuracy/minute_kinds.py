@@ -28,9 +28,6 @@ def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
 
     Parameters
     ----------
-    logs : HomeLogs
-    labelling : str
-        `live`, or the name of the model of relabel layers.
     checked : np.ndarray [shape=(n,)], bool
         Whether anything sounds in each checked minute.
 

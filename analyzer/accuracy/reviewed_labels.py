@@ -36,11 +36,6 @@ class ReviewedLabels(NamedTuple):
 
     Attributes
     ----------
-    span : ReviewedSpan
-    labels : Labelling
-        As they were looked at.
-    true : Labelling
-        The same, overlaid with the marks.
     model : str
         SHA-256 of the model that labelled; empty if unknown.
     undecided : Spans
@@ -55,17 +50,7 @@ class ReviewedLabels(NamedTuple):
 
 
 def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
-    """Count the spans that a person has looked at, but not because they were drawn at random.
-
-    Parameters
-    ----------
-    reviewed : iterable of ReviewedLabels
-
-    Returns
-    -------
-    unchanged, number : int
-        Spans that marks change in less than half, and all but those that nobody could tell.
-    """
+    """Count the spans that a person has looked at, but not because they were drawn at random."""
     spans = [one for one in reviewed if one.span.chosen != RANDOM and not _is_undecided(one)]
     return sum(2 * _changed(one) < one.span.end - one.span.start for one in spans), len(spans)
 
@@ -95,15 +80,8 @@ def read_reviewed_labels(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    logs : HomeLogs
-    labelling : str
-        `live`, or the name of the model of relabel layers.
     start, end : int
         Nanoseconds of UTC, of the logs whose review layers are read.
-    losses : list of str
-        What cannot be read is appended.
-    chosen : collection of str, optional
-        How spans were chosen; others are left out, which takes less time.
     """
     found: list[tuple[Path, ReviewedSpan]] = []
     for layer in logs.between(start, end, REVIEW_LAYER):
@@ -188,13 +166,7 @@ def _marks(log: Path) -> list[Mark]:
 
 
 def labelling_of_marks(marks: Iterable[Mark]) -> Labelling:
-    """Make a labelling of marks of one microphone.
-
-    Parameters
-    ----------
-    marks : iterable of Mark
-        In any order.
-    """
+    """Make a labelling of marks of one microphone."""
     ordered = sorted(marks)
     return Labelling(
         np.array([mark.start for mark in ordered], np.int64),

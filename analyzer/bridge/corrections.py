@@ -21,27 +21,7 @@ _FIELDS = "header.stamp", "duration", "label"
 def correct_event(folder: Path, node: str, event: Event, label: str, reviewer: str) -> list[Path]:
     """Mark the segments of an event with another class, in the name of who says so.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the logs.
-    node : str
-        Name of the recorder.
-    event : Event
-    label : str
-        What it was.
-    reviewer : str
-        Who says so.
-
-    Returns
-    -------
-    list of Path
-        The review layers, of one log or of two.
-
-    Raises
-    ------
-    BridgeError
-        If no log has the event any more, or a layer cannot be written.
+    Raise `BridgeError` if no log has the event any more, or a layer cannot be written.
     """
     try:
         logs = _logs_of(folder, node, event)

@@ -12,7 +12,6 @@ class Today(NamedTuple):
 
     Attributes
     ----------
-    now : int
     midnight : int
         When the day began.
     night, morning : int
@@ -27,15 +26,7 @@ class Today(NamedTuple):
 
 
 def today(now: int, zone: tzinfo) -> Today:
-    """Return the day and the night at a time.
-
-    Parameters
-    ----------
-    now : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
-    """
+    """Return the day and the night at a time."""
     day = local_time(now, zone).date()
     last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
     night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
@@ -49,7 +40,6 @@ def iso_time(nanoseconds: int, zone: tzinfo) -> str:
     ----------
     nanoseconds : int
         Of UTC.
-    zone : tzinfo
     """
     moment = local_time(nanoseconds, zone)
     milliseconds = nanoseconds % NANOSECONDS // 1_000_000

@@ -17,13 +17,8 @@ class Event(NamedTuple):
 
     Attributes
     ----------
-    microphone, label : str
     start, end : int
         In nanoseconds of UTC; the end as far as it is known.
-    confidence : float
-        The highest of its segments.
-    seconds : float
-        That it was heard, without the pauses.
     """
 
     microphone: str
@@ -42,14 +37,8 @@ class Event(NamedTuple):
 class EventRecord:
     """The events of one class of a microphone, since a time.
 
-    Parameters
-    ----------
-    microphone, label : str
-
     Attributes
     ----------
-    events : list of Event
-        By their starts.
     current : Event or None
         With which a segment may go on: the one that the last segment is of.
     """
@@ -68,8 +57,6 @@ class EventRecord:
         ----------
         start, end : int
             In nanoseconds of UTC, in the order in which a log has segments.
-        confidence : float
-            Of the segment.
         """
         if (start, end) in self._segments:  # written again, as the disk had refused it
             return False
@@ -95,13 +82,7 @@ class EventRecord:
         return self.events[bisect_left(self.events, time, key=_start) :]
 
     def forget(self, before: int, after: int) -> None:
-        """Forget the events that began before a time, but for the last one, and after another one.
-
-        Parameters
-        ----------
-        before, after : int
-            In nanoseconds of UTC.
-        """
+        """Forget the events that began before a time, except the last, and those after another."""
         first = bisect_left(self.events, before, key=_start)
         end = bisect_right(self.events, after, key=_start)
         kept = self.events[min(first, max(end - 1, 0)) : end]

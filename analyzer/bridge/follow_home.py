@@ -31,13 +31,7 @@ _TICK_SECONDS = 0.5
 
 
 def is_of_bridge(topic: str) -> bool:
-    """Tell whether what a home is told of needs a topic.
-
-    Parameters
-    ----------
-    topic : str
-        Its name.
-    """
+    """Tell whether what a home is told of needs a topic."""
     if topic == DIAGNOSTICS:
         return True
     name = parse_topic(topic)
@@ -54,12 +48,8 @@ def follow_home(
 
     Parameters
     ----------
-    home : Home
-        Whose folder of logs may come later.
     start : int
         Log time from which on the events are to be known, in nanoseconds of UTC.
-    stop : threading.Event
-        Ends it.
     damaged : callable
         Told the error of a log of which no more can be read, and that there is no folder yet.
 
@@ -67,8 +57,6 @@ def follow_home(
     ------
     state : HomeState
         The same one each time: after whatever was written, and twice a second while nothing is.
-    begun : list of Event
-        Those that began since the last time.
     """
     state, folder = HomeState(), home.folder
     while not folder.is_dir():

@@ -20,11 +20,6 @@ class HeardNow:
     What it tells does not depend on how the labels are divided among calls, and of labels older
     than a second and the hold nothing is left.
 
-    Parameters
-    ----------
-    classes : sequence of str
-        Those of the labels.
-
     Attributes
     ----------
     time : int
@@ -42,8 +37,6 @@ class HeardNow:
 
         Parameters
         ----------
-        labels : sequence of str
-            Of successive frames.
         times : np.ndarray [shape=(n,)], int64
             When they were known, in nanoseconds of UTC.
         """
@@ -66,12 +59,6 @@ class HeardNow:
         self.time = int(times[-1])
 
     def is_heard(self, name: str) -> bool:
-        """Tell whether a class was heard in the last ten seconds before the newest label.
-
-        Parameters
-        ----------
-        name : str
-            Of a class, or `ANY_SOUND`.
-        """
+        """Tell whether a class was heard in the last ten seconds before the newest label."""
         last = self._last_heard.get(name, 0)
         return last > 0 and self.time - last <= HOLD_SECONDS * NANOSECONDS

@@ -6,16 +6,7 @@ from typing import NamedTuple
 
 
 class Home(NamedTuple):
-    """The recorder of a home, and the home's own time.
-
-    Attributes
-    ----------
-    folder : Path
-        Of the logs.
-    node : str
-        Name of the recorder.
-    zone : tzinfo
-    """
+    """The recorder of a home, and the home's own time."""
 
     folder: Path
     node: str

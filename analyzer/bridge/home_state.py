@@ -51,16 +51,11 @@ class MicrophoneState:
 
     Parameters
     ----------
-    name : str
-        Of the microphone.
     unnamed : collection of str, optional
         Classes of no events, of which none but silence is told.
 
     Attributes
     ----------
-    classes : list of str
-        Those of its newest labels, in their order.
-    heard : HeardNow
     label, confidence : str, float
         The newest label; empty before the first.
     level_dbfs : float
@@ -150,13 +145,6 @@ class MicrophoneState:
     def counts(self, label: str, today: Today, known: Known) -> tuple[int | None, int | None]:
         """Count the events of a class that began since midnight, and those of the last night.
 
-        Parameters
-        ----------
-        label : str
-        today : Today
-        known : Known
-            As `known_of` returns it.
-
         Returns
         -------
         int or None, int or None
@@ -193,15 +181,7 @@ class MicrophoneState:
         return ended
 
     def forget(self, before: int, after: int) -> None:
-        """Forget the events that began before a time, but for the last one of each class.
-
-        Parameters
-        ----------
-        before : int
-            In nanoseconds of UTC.
-        after : int
-            The same: what began later is of a clock that ran ahead, and forgotten as well.
-        """
+        """Forget the events that began before a time, but for the last one of each class."""
         for record in self._records.values():
             record.forget(before, after)
         if self.gaps and self.gaps[0][1] < before:
@@ -216,13 +196,9 @@ class HomeState:
 
     Attributes
     ----------
-    microphones : dict of str to MicrophoneState
-        By their names.
     scenarios : dict of str to MicrophoneState
         The same by the models of scenarios: by `<microphone>-<scenario>`, which is no name of a
         microphone.
-    health : dict of str to Health
-        The last word on each thing: a microphone, the recorder, its disk …
     caught_up : bool
         Whether all that was written before has been read, so that what comes is new.
     listeners : collection of str or None
@@ -251,13 +227,7 @@ class HomeState:
         return [each for each in self.microphones.values() if not self.is_left_out(each.name)]
 
     def is_left_out(self, name: str) -> bool:
-        """Return whether the recorder no longer has a microphone, or a scenario of it.
-
-        Parameters
-        ----------
-        name : str
-            Of the state.
-        """
+        """Return whether the recorder no longer has a microphone, or a scenario of it."""
         return self.listeners is not None and name not in self.listeners
 
     def begin_log(self) -> None:
@@ -275,13 +245,7 @@ class HomeState:
         return None
 
     def push(self, columns: Sequence[Columns]) -> list[Event]:
-        """Add messages with the fields of `FIELDS`; return the events that begin with them.
-
-        Parameters
-        ----------
-        columns : sequence of Columns
-            Of one log, in the order in which it was written.
-        """
+        """Add messages with the fields of `FIELDS`; return the events that begin with them."""
         begun = []
         for part in (each for each in columns if len(each)):
             seen = self._time_seen(part)

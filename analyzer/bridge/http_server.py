@@ -34,15 +34,7 @@ class HttpServer(ThreadingHTTPServer):
     Who has shown that he may read has a place that nobody else takes. The others have so many
     together; when there are more, the oldest of the address that has most of them is ended.
 
-    Parameters
-    ----------
-    bind, port : str, int
-    handler : type of HttpHandler
-
-    Raises
-    ------
-    OSError
-        If nothing can listen there.
+    Raise `OSError` if nothing can listen there.
     """
 
     daemon_threads = True

@@ -9,12 +9,7 @@ _BETWEEN = "-"
 
 
 def listener_of(topic: TopicName) -> str | None:
-    """Name who labels what a topic has; None for what no recorder labels live.
-
-    Parameters
-    ----------
-    topic : TopicName
-    """
+    """Name who labels what a topic has; None for what no recorder labels live."""
     if topic.labelling == LIVE:
         return topic.microphone
     if is_scenario(topic.labelling):
@@ -23,41 +18,20 @@ def listener_of(topic: TopicName) -> str | None:
 
 
 def listener_name(microphone: str, scenario: str) -> str:
-    """Name the model of a scenario that hears by a microphone.
-
-    Parameters
-    ----------
-    microphone, scenario : str
-        Their names.
-    """
+    """Name the model of a scenario that hears by a microphone."""
     return f"{microphone}{_BETWEEN}{scenario}"
 
 
 def microphone_of_listener(listener: str) -> str:
-    """Return the name of the microphone.
-
-    Parameters
-    ----------
-    listener : str
-    """
+    """Return the name of the microphone."""
     return listener.partition(_BETWEEN)[0]
 
 
 def scenario_of_listener(listener: str) -> str:
-    """Return the name of the scenario; empty for the model of the home.
-
-    Parameters
-    ----------
-    listener : str
-    """
+    """Return the name of the scenario; empty for the model of the home."""
     return listener.partition(_BETWEEN)[2]
 
 
 def is_of_scenario(listener: str) -> bool:
-    """Tell whether the model of a scenario hears.
-
-    Parameters
-    ----------
-    listener : str
-    """
+    """Tell whether the model of a scenario hears."""
     return _BETWEEN in listener

@@ -17,12 +17,8 @@ class News(NamedTuple):
 
     Attributes
     ----------
-    state : HomeState
     begun, ended : sequence of Event
         Those of the last minute that were not told of before, and those that are over since.
-    today : Today
-    zone : tzinfo
-        Of the home.
     """
 
     state: HomeState

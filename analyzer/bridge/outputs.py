@@ -39,13 +39,6 @@ _Output = TypeVar("_Output", bound=Output)
 class Reopened(Generic[_Output]):
     """An output that is tried again every minute while it cannot be opened.
 
-    Parameters
-    ----------
-    make : callable
-        Opens it.
-    say : callable
-        Told why it cannot be opened, in a line.
-
     Attributes
     ----------
     output : Output or None
@@ -88,19 +81,8 @@ def open_outputs(
 ) -> tuple[dict[str, Output], int]:
     """Open the outputs that are configured.
 
-    Parameters
-    ----------
-    settings : BridgeSettings
-    home : Home
-    state_folder : Path
-        Of what they have to remember.
-    say : Saying
-        Told why one cannot be opened; it is tried again.
-
     Returns
     -------
-    outputs : dict of str to Output
-        By their names.
     since : int
         From when on they have to know the events, in nanoseconds of UTC.
     """
@@ -163,14 +145,8 @@ def needed_modules(settings: BridgeSettings) -> dict[str, bool]:
 def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
     """Look for what the outputs would refuse at their start, and open nothing.
 
-    Parameters
-    ----------
-    settings : BridgeSettings
-
     Returns
     -------
-    problems : list of str
-        Why an output could not be opened, a line each.
     warnings : list of str
         Files that may be credentials of the service, which are not here, and figures that nobody
         would read.
@@ -274,9 +250,6 @@ def exposed_files(settings: BridgeSettings, file: Path | None, state: Path | Non
 
     Parameters
     ----------
-    settings : BridgeSettings
-    file : Path or None
-        That has them.
     state : Path or None
         The folder of what the bridge has to remember; None if it is not known.
     """

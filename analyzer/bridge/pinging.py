@@ -21,16 +21,7 @@ class Pinging:
     All is well while the recorder writes and says of nothing that it fails. A bridge that hangs
     pings no more.
 
-    Parameters
-    ----------
-    settings : PingSettings
-    say : callable
-        Told what is wrong, in a line.
-
-    Raises
-    ------
-    HearthlogError
-        If the file of the address cannot be used.
+    Raise `HearthlogError` if the file of the address cannot be used.
     """
 
     def __init__(self, settings: PingSettings, say: Callable[[str], None]) -> None:

@@ -46,18 +46,8 @@ class PrometheusOutput:
 
     Parameters
     ----------
-    settings : PrometheusSettings
-    home : Home
-    state_folder : Path
-        Of what the bridge remembers.
     since : int
         From when on events count the first time, in nanoseconds of UTC.
-    say : callable
-        Told what is wrong, in a line.
-
-    Attributes
-    ----------
-    totals : Totals
 
     Raises
     ------

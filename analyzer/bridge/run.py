@@ -29,13 +29,8 @@ class Bridge:
 
     Attributes
     ----------
-    home : Home
     since : int
         From when on events are to be known, in nanoseconds of UTC.
-    outputs : dict of str to Output
-        By what they are called where one of them fails.
-    say : callable
-        Told what is wrong, in a line.
     """
 
     home: Home

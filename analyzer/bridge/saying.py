@@ -11,13 +11,7 @@ _MOST = 100  # texts that are remembered
 
 
 class Saying:
-    """Passes lines on, from any thread; the same one again an hour later at the earliest.
-
-    Parameters
-    ----------
-    say : callable
-        Told each line.
-    """
+    """Passes lines on, from any thread; the same one again an hour later at the earliest."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say

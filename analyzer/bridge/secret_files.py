@@ -7,11 +7,5 @@ _CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
 
 
 def secret_path(path: Path) -> Path:
-    """Return where a file of a secret is.
-
-    Parameters
-    ----------
-    path : Path
-        A relative one is looked for among the credentials of the service, where it has some.
-    """
+    """Return where a file of a secret is."""
     return Path(os.environ.get(_CREDENTIALS, "")) / path

@@ -137,10 +137,7 @@ class MqttSettings(_Table):
 
         No validator, which would refuse the other outputs, too.
 
-        Raises
-        ------
-        BridgeError
-            If they do not.
+        Raise `BridgeError` if they do not.
         """
         files = ("ca_file", "certificate_file", "key_file")
         if not self.tls and (name := next((name for name in files if getattr(self, name)), "")):
@@ -177,10 +174,7 @@ class PrometheusSettings(_Table):
     def check_readers(self) -> None:
         """Check whether anybody is given the figures; no validator, as `MqttSettings.check_files`.
 
-        Raises
-        ------
-        BridgeError
-            If nobody is.
+        Raise `BridgeError` if nobody is.
         """
         if self.text_file is None and self.port is None:
             raise BridgeError(

@@ -12,13 +12,6 @@ _OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between th
 def state_folder(configured: Path | None, logs: Path) -> Path:
     """Return the folder of the state, which is made where it is missing.
 
-    Parameters
-    ----------
-    configured : Path or None
-        `state` of the table `bridge`.
-    logs : Path
-        Folder of the logs.
-
     Returns
     -------
     Path

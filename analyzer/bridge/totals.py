@@ -40,15 +40,8 @@ class Totals:
 
     Parameters
     ----------
-    path : Path
-        Of the file.
     time : int
         When the first event that counts may begin if there is no file; in nanoseconds of UTC.
-
-    Attributes
-    ----------
-    time : int
-        What began before is in the file.
 
     Raises
     ------
@@ -67,8 +60,6 @@ class Totals:
 
         Parameters
         ----------
-        state : HomeState
-            That has all events since `self.time`.
         end : int, optional
             Before which events begin that count, in nanoseconds of UTC; by default all do.
         """
@@ -91,17 +82,7 @@ class Totals:
     def keep(self, state: HomeState, time: int) -> None:
         """Put what began before a time into the file, unless it is there already.
 
-        Parameters
-        ----------
-        state : HomeState
-            That has all events since `self.time`.
-        time : int
-            In nanoseconds of UTC.
-
-        Raises
-        ------
-        BridgeError
-            If the file cannot be written.
+        Raise `BridgeError` if the file cannot be written.
         """
         if time <= self.time:
             return
@@ -119,8 +100,6 @@ def kept_until(path: Path, default: int) -> int:
 
     Parameters
     ----------
-    path : Path
-        Of the file.
     default : int
         What is returned if there is none of use.
     """

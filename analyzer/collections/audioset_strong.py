@@ -30,15 +30,7 @@ _NAMES_LIMIT = 1 << 20
 def read(folder: Path) -> Iterator[CollectionClip]:
     """Yield the segments of the collection.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds the tables, and audio.
-
-    Raises
-    ------
-    DataError
-        If a table of the collection cannot be read, or there is none with times.
+    Raise `DataError` if a table of the collection cannot be read, or there is none with times.
     """
     names = _names(folder / "mid_to_display_name.tsv")
     tables = sorted(folder.glob("*_strong.tsv"))

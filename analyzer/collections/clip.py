@@ -10,8 +10,6 @@ class Sound(NamedTuple):
 
     Attributes
     ----------
-    categories : tuple of str
-        In the words of the collection; several are heard together.
     start, end : float
         Seconds; `end` is infinite for the rest of the file.
     """
@@ -26,16 +24,9 @@ class CollectionClip(NamedTuple):
 
     Attributes
     ----------
-    path : Path
-        Need not exist, where a collection was not downloaded completely.
-    sounds : tuple of Sound
-        All that the collection says to be in it.
     source_group : str
         The original recording or speaker, with a prefix for where its number is from: groups of
         two collections are the same only if their recordings are.
-    licence : str
-    seconds : float
-        Length of the file, where the collection says it.
     left_out : str
         Why the clip is of no use; empty if it is.
     """

@@ -30,15 +30,7 @@ _TABLE_LIMIT = 128 << 20
 def read(folder: Path) -> Iterator[CollectionClip]:
     """Yield the files of the collection.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds `metadata` and `audio`.
-
-    Raises
-    ------
-    DataError
-        If a table of the collection cannot be read, or there is none with times.
+    Raise `DataError` if a table of the collection cannot be read, or there is none with times.
     """
     sounds: dict[str, dict[Sound, None]] = {}
     wheres: dict[str, str] = {}

@@ -25,13 +25,7 @@ _EMOTIONS = {
 
 
 def read(folder: Path) -> Iterator[CollectionClip]:
-    """Yield the clips of the collection; the category is the emotion.
-
-    Parameters
-    ----------
-    folder : Path
-        Holds `wav`.
-    """
+    """Yield the clips of the collection; the category is the emotion."""
     for path in sorted((folder / "wav").iterdir()):
         if is_audio(path.name):
             found = _NAME.fullmatch(path.name)

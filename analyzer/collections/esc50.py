@@ -16,15 +16,7 @@ from hearthlog.analyzer.collections.files import inside, read_table
 def read(folder: Path) -> Iterator[CollectionClip]:
     """Yield the clips of the collection.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds `meta` and `audio`.
-
-    Raises
-    ------
-    DataError
-        If the table of the collection cannot be read.
+    Raise `DataError` if the table of the collection cannot be read.
     """
     columns = "filename", "category", "esc10", "src_file"
     for where, row in read_table(folder / "meta" / "esc50.csv", columns):

@@ -21,18 +21,8 @@ def read_table(
 
     Parameters
     ----------
-    path : Path
-        CSV in UTF-8.
-    columns : sequence of str
     delimiter : str
         Between fields.
-
-    Yields
-    ------
-    where : str
-        File and line, for messages.
-    values : list of str
-        One for each of `columns`.
 
     Raises
     ------
@@ -60,14 +50,8 @@ def read_table(
 def read_json(path: Path) -> dict[str, object]:
     """Read an object of JSON.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is larger than 256 MB, or is no object of JSON.
+    Raise `DataError` if the file cannot be read, is larger than 256 MB, or is no object of
+    JSON.
     """
     try:
         content = json.loads(read_whole(path, "file of the collection", _JSON_LIMIT, DataError))
@@ -81,18 +65,7 @@ def read_json(path: Path) -> dict[str, object]:
 def inside(where: str, folder: Path, name: str) -> Path:
     """Return the path of a file that a table names.
 
-    Parameters
-    ----------
-    where : str
-        File and line of the table, for the message.
-    folder : Path
-    name : str
-        Relative to the folder.
-
-    Raises
-    ------
-    DataError
-        If the name leads out of the folder, or none can be called so.
+    Raise `DataError` if the name leads out of the folder, or none can be called so.
     """
     pure = PurePosixPath(name)
     if not name or pure.is_absolute() or ".." in pure.parts or "\0" in name:
@@ -101,17 +74,7 @@ def inside(where: str, folder: Path, name: str) -> Path:
 
 
 def audio_by_name(folder: Path) -> dict[str, Path]:
-    """Find audio files by their names, wherever they are in a folder.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    dict of str to Path
-        The first one, where several have a name.
-    """
+    """Find audio files by their names, wherever they are in a folder."""
     found: dict[str, Path] = {}
     for path in files_below(folder):
         if is_audio(path.name):
@@ -122,16 +85,7 @@ def audio_by_name(folder: Path) -> dict[str, Path]:
 def seconds(where: str, *texts: str) -> list[float]:
     """Read times in seconds.
 
-    Parameters
-    ----------
-    where : str
-        File and line, for the message.
-    *texts : str
-
-    Raises
-    ------
-    DataError
-        If one is no number from 0 to 1e9.
+    Raise `DataError` if one is no number from 0 to 1e9.
     """
     try:
         values = [float(text) for text in texts]

@@ -18,12 +18,7 @@ _TAKE = re.compile(r"(?:[ _.-]\d{1,3}| ?\(\d{1,3}\))$")
 
 
 def read(folder: Path) -> Iterator[CollectionClip]:
-    """Yield the audio files in the sub-folders of a folder; the name of each is the category.
-
-    Parameters
-    ----------
-    folder : Path
-    """
+    """Yield the audio files in the sub-folders of a folder; the name of each is the category."""
     for path in files_below(folder):
         inner = path.relative_to(folder).parts
         if len(inner) > 1:

@@ -26,15 +26,7 @@ _ZERO = re.compile(r"https?://creativecommons\.org/publicdomain/zero/[\d.]+/?")
 def read(folder: Path) -> Iterator[CollectionClip]:
     """Yield the clips of the collection.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds `FSD50K.ground_truth`, `FSD50K.metadata` and the folders of audio.
-
-    Raises
-    ------
-    DataError
-        If a table of the collection cannot be read.
+    Raise `DataError` if a table of the collection cannot be read.
     """
     truth = folder / "FSD50K.ground_truth"
     parts = [part for part in _PARTS if (truth / f"{part}.csv").exists()]

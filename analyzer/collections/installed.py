@@ -19,10 +19,6 @@ class Collection(NamedTuple):
 
     Attributes
     ----------
-    name : str
-        On the command line.
-    title : str
-        In manifests and on cards of models.
     markers : tuple of str
         Files or folders, or patterns of them, of which one is in every folder of the collection;
         empty for any folder.
@@ -56,27 +52,15 @@ NAMES = tuple(collection.name for collection in COLLECTIONS)
 
 
 def find_collection(name: str) -> Collection | None:
-    """Return the collection of a name; None if there is none.
-
-    Parameters
-    ----------
-    name : str
-    """
+    """Return the collection of a name; None if there is none."""
     return next((each for each in COLLECTIONS if each.name == name), None)
 
 
 def check_folder(folder: Path, collection: Collection) -> None:
     """Check that a folder looks as that of a collection.
 
-    Parameters
-    ----------
-    folder : Path
-    collection : Collection
-
-    Raises
-    ------
-    DataError
-        If there is no such folder, or it looks as another, or another version of it.
+    Raise `DataError` if there is no such folder, or it looks as another, or another version of
+    it.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")

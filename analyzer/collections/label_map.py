@@ -25,8 +25,6 @@ class Decision(NamedTuple):
     ----------
     label : str
         Empty if they are left out.
-    detail : str
-        The categories that say so; of those that the map skips, the first.
     reason : str
         Why they are left out; empty if they are not.
     """
@@ -38,19 +36,7 @@ class Decision(NamedTuple):
 
 @dataclass(frozen=True)
 class LabelMap:
-    """A map from categories to labels.
-
-    Attributes
-    ----------
-    label_of : mapping of str to str
-        Label of each category that has one.
-    broad : frozenset of str
-        Categories that say nothing beside others, such as the parents of others.
-    skip : frozenset of str
-        Categories in which one of the labels may be heard.
-    keep : bool
-        Whether a category that is named nowhere is a label itself.
-    """
+    """A map from categories to labels."""
 
     label_of: Mapping[str, str]
     broad: frozenset[str]
@@ -62,10 +48,6 @@ class LabelMap:
 
         Broad ones are passed over. The others must all have one label; without one in the map it
         is `other_negative`, or the category itself.
-
-        Parameters
-        ----------
-        categories : iterable of str
         """
         told = [name for name in categories if name not in self.broad]
         detail = " + ".join(sorted(set(told)))
@@ -82,17 +64,7 @@ class LabelMap:
     def with_classes(self, folder: Path, names: Iterable[str]) -> "LabelMap":
         """Return this map, with names of categories that are names of classes, too.
 
-        Parameters
-        ----------
-        folder : Path
-            That has categories as folders, for the message.
-        names : iterable of str
-            All categories.
-
-        Raises
-        ------
-        DataError
-            If one of them is in this map nowhere, and is no name of a class.
+        Raise `DataError` if one of them is in this map nowhere, and is no name of a class.
         """
         known = self.label_of.keys() | self.broad | self.skip
         classes = {name: find_class(name) for name in sorted(set(names) - known)}
@@ -111,30 +83,14 @@ class LabelMap:
 
 
 def shipped_map(name: str) -> str:
-    """Return the map of a collection that comes with hearthlog, as TOML.
-
-    Parameters
-    ----------
-    name : str
-        Of the collection, on the command line.
-    """
+    """Return the map of a collection that comes with hearthlog, as TOML."""
     return _shipped(name).read_text("utf-8")
 
 
 def read_map(name: str, path: Path | None = None) -> LabelMap:
     """Read a map.
 
-    Parameters
-    ----------
-    name : str
-        Of the collection, on the command line.
-    path : Path, optional
-        A map instead of the one that comes with hearthlog.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or is no map.
+    Raise `DataError` if the file cannot be read, or is no map.
     """
     path = path or _shipped(name)
     content = read_toml(path, "map", DataError)

@@ -33,21 +33,8 @@ class Summary:
 
     Attributes
     ----------
-    clips : Counter of str
-        Number of lines with each label.
-    groups : dict of str to set of str
-        Source groups of each label.
-    licences : Counter of str
-        Number of lines with each licence.
-    negatives : Counter of str
-        Number of lines of `other_negative` with each detail.
-    left_out : Counter of str
-        Number of sounds, or of files of several, by the reason.
-    skipped : Counter of str
-        Number of those that the map leaves out, by the category.
     files, missing : int
         Number of files that the collection lists, and of those that are not there.
-    first_missing : Path or None
     """
 
     clips: Counter[str] = field(default_factory=Counter)
@@ -74,21 +61,12 @@ def make_manifest(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    collection : Collection
-    folder : Path
-        Of the collection.
     output : Path
         The manifest; must not exist. Paths in it are relative to its folder.
     progress : callable
         Is told the share of the files that was looked at, 0 to 1.
-    map_file : Path, optional
-        A map instead of the one that comes with hearthlog.
     source, licence : str
         Of a folder of one's own; the source is the folder's name if it is empty.
-
-    Returns
-    -------
-    Summary
 
     Raises
     ------

@@ -21,13 +21,7 @@ _EMOTIONS = (
 
 
 def read(folder: Path) -> Iterator[CollectionClip]:
-    """Yield the clips of the collection; the category is the emotion.
-
-    Parameters
-    ----------
-    folder : Path
-        Holds folders of actors, or folders that hold them.
-    """
+    """Yield the clips of the collection; the category is the emotion."""
     for path in files_below(folder):
         if is_audio(path.name):
             found = _NAME.fullmatch(path.name)

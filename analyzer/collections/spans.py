@@ -34,18 +34,8 @@ def labelled_parts(
 
     Parameters
     ----------
-    sounds : sequence of Sound
-        All that is heard in the file.
     seconds : float
         Length of the file; infinite if it is not known.
-    label_map : LabelMap
-
-    Returns
-    -------
-    parts : list of Part
-        By label and time.
-    left_out : Counter of (str, str)
-        Number of sounds, by the reason and the categories.
     """
     decided = [(sound, label_map.decide(sound.categories)) for sound in sounds]
     told = [(sound, what) for sound, what in decided if what.reason != BROAD]

@@ -18,15 +18,7 @@ _FOREGROUND = "1"
 def read(folder: Path) -> Iterator[CollectionClip]:
     """Yield the clips of the collection.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds `metadata` and `audio`.
-
-    Raises
-    ------
-    DataError
-        If the table of the collection cannot be read.
+    Raise `DataError` if the table of the collection cannot be read.
     """
     columns = "slice_file_name", "fsID", "salience", "fold", "class"
     for where, row in read_table(folder / "metadata" / "UrbanSound8K.csv", columns):

@@ -20,15 +20,7 @@ _NAME = re.compile(r"([fm]\d+)_\d+_([a-z]+)\.wav")
 def read(folder: Path) -> Iterator[CollectionClip]:
     """Yield the clips of the collection.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds `audio_16k` or `audio_44k`.
-
-    Raises
-    ------
-    DataError
-        If the list of clips is there and cannot be read.
+    Raise `DataError` if the list of clips is there and cannot be read.
     """
     audio = folder / "audio_16k"
     if not audio.is_dir():

@@ -19,13 +19,7 @@ _PLACE = 3  # of the person in a path, from its end
 
 
 def read(folder: Path) -> Iterator[CollectionClip]:
-    """Yield the clips of the collection; the category is the person, the source the video.
-
-    Parameters
-    ----------
-    folder : Path
-        Holds `wav` or `aac`.
-    """
+    """Yield the clips of the collection; the category is the person, the source the video."""
     for name in ("wav", "aac"):
         for path in files_below(folder / name):
             person, video = path.parts[-_PLACE:-1]

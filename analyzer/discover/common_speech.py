@@ -60,11 +60,6 @@ def louder_elsewhere(speech: Sequence[SpeechFrames]) -> list[Bool]:
     and theirs correlate by more than 0.7; for a turn of less than half a second the first is
     enough. Of what is as loud the first microphone's is kept.
 
-    Parameters
-    ----------
-    speech : sequence of SpeechFrames
-        Of each microphone.
-
     Returns
     -------
     list of np.ndarray [shape=(turns,)], bool

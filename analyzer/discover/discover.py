@@ -26,7 +26,6 @@ def discover(
 
     Parameters
     ----------
-    sounds : HomeSounds
     groups : Groups or None
         Those of an earlier time, which are not changed; None if there are none.
     least : int, optional
@@ -35,8 +34,6 @@ def discover(
 
     Returns
     -------
-    groups : Groups
-        With the new ones.
     of : np.ndarray [shape=(n,)], int64
         The row of the group of each sound; `NO_GROUP` for one that is of none.
     points : np.ndarray [shape=(n, d)], float64
@@ -78,14 +75,7 @@ def discover(
 
 
 def unembedded_note(sounds: HomeSounds, groups: Groups) -> str:
-    """Say whose sounds are known by their features alone, though there are networks; else nothing.
-
-    Parameters
-    ----------
-    sounds : HomeSounds
-    groups : Groups
-        By which they are known.
-    """
+    """Return a note on sounds that were grouped by features alone; empty if there are none."""
     others = sorted({space.network for space in sounds.other_embeddings})
     if groups.embedding is None:
         others = sorted({*others, sounds.embedding.network} if sounds.embedding else others)

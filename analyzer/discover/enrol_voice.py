@@ -23,18 +23,8 @@ def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list
 
     Parameters
     ----------
-    home : Path
-        Folder of the training set.
-    label : str
-        Name of the voice.
-    speech : HomeSpeech
     rows : np.ndarray [shape=(n,)], int64
         Its turns.
-
-    Returns
-    -------
-    list of Enrolled
-        With those that are there already.
 
     Raises
     ------

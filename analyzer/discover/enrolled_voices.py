@@ -22,17 +22,7 @@ _SURELY = 2.0  # the logarithm by which two voices are likelier than one
 def check_voices(recordings: Iterable[Recording], features: FeatureSet) -> None:
     """Check that nobody is enrolled with two voices.
 
-    Parameters
-    ----------
-    recordings : iterable of Recording
-        Those of voices have names that are no classes of sound.
-    features : FeatureSet
-        Of the recordings; voices cannot be checked in every one.
-
-    Raises
-    ------
-    DataError
-        If two voices are heard in what is enrolled as one.
+    Raise `DataError` if two voices are heard in what is enrolled as one.
     """
     if not has_voices(features.feature_names):
         return

@@ -41,19 +41,8 @@ def group_spans(
 
     Parameters
     ----------
-    home : HomeLogs
-    groups : Groups
-    start, end : int, optional
-        In nanoseconds of UTC.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
-
-    Returns
-    -------
-    spans : dict of str to GroupSpans
-        By microphone.
-    losses : list of str
-        What cannot be read, a log in a line.
 
     Raises
     ------

@@ -81,8 +81,6 @@ class Groups(Space):
 
     Attributes
     ----------
-    features : tuple of str
-        The names of the features that the sounds are described by.
     numbers : np.ndarray [shape=(g,)], int64
         Of the groups; a number is never used again.
     names : list of str
@@ -91,8 +89,6 @@ class Groups(Space):
         What no other groups have: of which file a mark has its group.
     embedding : EmbeddingSpace or None
         Of the embeddings that sounds are described by, too; None for none.
-    embedded : Space or None
-        Of features and embeddings.
     """
 
     features: tuple[str, ...]
@@ -112,8 +108,6 @@ class Groups(Space):
         descriptors : np.ndarray [shape=(n, width)], float32
         embeddings : np.ndarray [shape=(n, k)], float32
             NaN for a sound without any.
-        embedding : EmbeddingSpace or None
-            Theirs; with another one than that of the groups sounds are known by their features.
         """
         of, heard = np.empty(len(descriptors), np.int64), self.are_comparable(embeddings)
         heard &= embedding == self.embedding
@@ -170,12 +164,8 @@ def new_groups(
 
     Parameters
     ----------
-    features : sequence of str
-        Their names.
     descriptors : np.ndarray [shape=(n, width)], float32
         At least two, of which some differ.
-    embedding : EmbeddingSpace, optional
-        Of the embeddings; they are left out where few sounds have one.
     embeddings : np.ndarray [shape=(n, k)], float32, optional
     """
     embedded = None
@@ -207,7 +197,6 @@ def add_groups(
 
     Parameters
     ----------
-    groups : Groups
     points : np.ndarray [shape=(n, d)], float64
         In the order of time.
     of : np.ndarray [shape=(n,)], int64

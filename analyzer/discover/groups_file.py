@@ -67,10 +67,7 @@ class _Head(BaseModel):
 def locked_groups(path: Path) -> Iterator[None]:
     """Keep others from the file of groups, who wait.
 
-    Raises
-    ------
-    DataError
-        If its folder cannot be written.
+    Raise `DataError` if its folder cannot be written.
     """
     lock_file = path.with_name(f".{path.name}.lock")
     try:
@@ -85,10 +82,7 @@ def locked_groups(path: Path) -> Iterator[None]:
 def save_groups(groups: Groups, path: Path) -> None:
     """Write the file of groups, in place of the one that is there.
 
-    Raises
-    ------
-    LogError
-        If it cannot be written.
+    Raise `LogError` if it cannot be written.
     """
     head = _Head(format=_FORMAT, id=groups.id, features=list(groups.features), names=groups.names)
     arrays = {"numbers": groups.numbers, **{name: getattr(groups, name) for name in _ARRAYS}}
@@ -105,10 +99,7 @@ def save_groups(groups: Groups, path: Path) -> None:
 def load_groups(path: Path) -> Groups | None:
     """Read the file of groups; None if there is none.
 
-    Raises
-    ------
-    DataError
-        If it is no such file, or damaged.
+    Raise `DataError` if it is no such file, or damaged.
     """
     if not path.exists():
         return None

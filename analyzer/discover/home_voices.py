@@ -27,12 +27,8 @@ class Voices:
     ----------
     numbers : np.ndarray [shape=(g,)], int64
         A number is never used again.
-    evidence : Evidence
-        What was known of each when it was found.
     names : list of str
         That a person gave; empty where nobody did.
-    id : str
-        What no other file of voices has.
     """
 
     numbers: Int64
@@ -46,14 +42,11 @@ def find_voices(speech: HomeSpeech, known: Voices | None) -> tuple[Voices, Int64
 
     Parameters
     ----------
-    speech : HomeSpeech
     known : Voices or None
         Those of an earlier time, which are not changed; None if there are none.
 
     Returns
     -------
-    voices : Voices
-        With new ones, that with most speech first.
     of : np.ndarray [shape=(n,)], int64
         The row of the voice of each voice of a conversation; `NO_VOICE` for one that is of none.
 

@@ -22,15 +22,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 
 
 class Looked(NamedTuple):
-    """In which sounds names are looked for.
-
-    Attributes
-    ----------
-    choice : str
-        One of `hearthlog.analyzer.discover.sound_spans.CHOICES`.
-    start, end : int or None
-        In nanoseconds of UTC.
-    """
+    """In which sounds names are looked for."""
 
     choice: str
     start: int | None = None
@@ -38,15 +30,7 @@ class Looked(NamedTuple):
 
 
 class Marked(NamedTuple):
-    """What a name of a group has changed.
-
-    Attributes
-    ----------
-    made : int
-        Marks that were made, or got another label.
-    left : int
-        Sounds that were left as they are, because somebody has marked them, or looked at them.
-    """
+    """What a name of a group has changed."""
 
     made: int = 0
     left: int = 0
@@ -66,22 +50,8 @@ def name_groups(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    home : HomeLogs
-    groups : Groups
-    names : mapping of int to str
-        Classes, by the numbers of groups that there are.
-    looked : Looked
-    reviewer : str
-        Who says so.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
-
-    Returns
-    -------
-    marked : dict of int to Marked
-        By the numbers of the groups.
-    losses : list of str
-        What cannot be read, a log in a line.
 
     Raises
     ------
@@ -151,16 +121,7 @@ def _mark(
 def unmark_group(logs: Iterable[Path], reason: str) -> int:
     """Take back the marks of a group; return how many there were.
 
-    Parameters
-    ----------
-    logs : iterable of Path
-    reason : str
-        `reason_of` the group.
-
-    Raises
-    ------
-    LogError
-        If a review layer cannot be read or written.
+    Raise `LogError` if a review layer cannot be read or written.
     """
     count = 0
     for log in logs:

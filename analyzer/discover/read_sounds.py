@@ -32,10 +32,6 @@ class LogSounds(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
-    features : tuple of str
-        Names of the features that they are described by.
-    spans : SoundSpans
     descriptors : np.ndarray [shape=(n, width)], float32
     embedding : EmbeddingSpace or None
         Of the embeddings; None if the log has none.
@@ -60,29 +56,12 @@ class HomeSounds:
 
     Attributes
     ----------
-    features : tuple of str
-        Names of the features that they are described by.
-    logs : list of Path
-        The last one first; once for each of its microphones.
-    microphones : list of str
     log, microphone : np.ndarray [shape=(n,)], int64
         Of each sound: where it is in these lists.
-    spans : SoundSpans
-        Its rows of features are those of its log.
     descriptors : np.ndarray [shape=(n, width)], float32
         On the disk.
-    embedding : EmbeddingSpace or None
-        Of the embeddings that they are described by, too.
     embeddings : np.ndarray [shape=(n, k)], float32
         On the disk; NaN for a sound without any, or with one of another network or projection.
-    without_embedding : int
-        Logs, once for each microphone, of which that is so.
-    other_embeddings : set of EmbeddingSpace
-        That logs have, and that are not read.
-    losses : list of str
-        What cannot be read, a log in a line.
-    without : int
-        Logs that have no features, or no labels: they were thinned.
     """
 
     features: tuple[str, ...]
@@ -113,20 +92,11 @@ def read_sounds(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    home : HomeLogs
-    choice : str
-        One of `hearthlog.analyzer.discover.sound_spans.CHOICES`.
-    start, end : int, optional
-        In nanoseconds of UTC.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
     groups : Groups, optional
         By which they are to be known: only their embeddings are read. Without groups those of the
         last log that has any.
-
-    Yields
-    ------
-    HomeSounds
 
     Raises
     ------
@@ -154,23 +124,7 @@ def read_log_sounds(
 ) -> Iterator[LogSounds]:
     """Read the sounds of a log.
 
-    Parameters
-    ----------
-    log : Path
-    choice : str
-        One of `hearthlog.analyzer.discover.sound_spans.CHOICES`.
-    start, end : int, optional
-        In nanoseconds of UTC.
-
-    Yields
-    ------
-    LogSounds
-        Of each microphone that has features and labels.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read.
+    Raise `LogError` if the log cannot be read.
     """
     columns = read_columns([log], None, start, end, fields=_FIELDS)
     for features in columns.values():
@@ -196,17 +150,7 @@ def lost_text(log: Path, lost: int) -> str:
 
 
 class _Reader:
-    """Reads logs, the last one first: as its sounds are described, all have to be.
-
-    Parameters
-    ----------
-    choice : str
-    span : (int or None, int or None)
-    groups : Groups or None
-        By which sounds are to be known.
-    store, embedded : file
-        For what describes them.
-    """
+    """Reads logs, the last one first: as its sounds are described, all have to be."""
 
     def __init__(
         self,

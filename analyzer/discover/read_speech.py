@@ -69,14 +69,6 @@ class HomeSpeech:
 
     Attributes
     ----------
-    logs : list of Path
-        In the order of time.
-    microphones : list of str
-    turns : Turns
-    voices : Evidence
-        Of each voice of each conversation.
-    losses : list of str
-        What cannot be read, a log in a line.
     without : int
         Logs that have no segments, or speech without features by which voices are told apart.
     """
@@ -104,9 +96,6 @@ def read_speech(
 
     Parameters
     ----------
-    home : HomeLogs
-    start, end : int, optional
-        In nanoseconds of UTC.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
     """
@@ -255,8 +244,6 @@ def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:
     ----------
     values : np.ndarray [shape=(frames, f)], float32
         Of speech.
-    names : sequence of str
-        Of the features.
 
     Returns
     -------
@@ -280,8 +267,6 @@ def speech_voices(
     stamps : np.ndarray [shape=(frames,)], int64
         Of frames of speech, in nanoseconds, ascending.
     values : np.ndarray [shape=(frames, f)], float32
-    names : sequence of str
-        Of the features.
     """
     of, _ = voices_of(values, names)
     return _turns(stamps, _of_frames(of, len(stamps)))

@@ -88,8 +88,6 @@ def find_sounds(stamps: Int64, labels: FrameLabels) -> SoundSpans:
     ----------
     stamps : np.ndarray [shape=(m,)], int64
         Of the frames that have features, ascending.
-    labels : FrameLabels
-        Those of frames without features are left out.
     """
     heard = labels.rows(labels.labels != SILENCE)
     rows = np.minimum(np.searchsorted(stamps, heard.stamps), max(len(stamps) - 1, 0))

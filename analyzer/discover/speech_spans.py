@@ -14,12 +14,7 @@ _LIKELY = 0.3
 
 
 def is_doubtful(segments: Columns) -> Bool:
-    """Tell which segments are of a sound that is not labelled speech, and may be.
-
-    Parameters
-    ----------
-    segments : Columns
-    """
+    """Tell which segments are of a sound that is not labelled speech, and may be."""
     return ~_is_of(segments, SPEECH) & ~_is_of(segments, SILENCE)
 
 
@@ -28,8 +23,6 @@ def speech_spans(segments: Columns, labels: Columns | None = None) -> Spans:
 
     Parameters
     ----------
-    segments : Columns
-        Of a labelling. What it calls speech is speech.
     labels : Columns, optional
         Of the frames. A sound to which they give a probability of speech of 0.3, in the mean, is
         speech as well, whatever it is called: somebody who reads may pass for one who coughs.

@@ -25,17 +25,7 @@ _SHOWN = 3
 def summarise(
     sounds: HomeSounds, groups: Groups, of: Int64, points: Float64, zone: tzinfo
 ) -> list[GroupSummary]:
-    """Summarise the groups that some sounds are of, the largest first.
-
-    Parameters
-    ----------
-    sounds : HomeSounds
-    groups : Groups
-    of, points : np.ndarray
-        As `discover` returns them.
-    zone : tzinfo
-        Of the home.
-    """
+    """Summarise the groups that some sounds are of, the largest first."""
     apart = _typical_distance(points)
     found = []
     for row, number in enumerate(groups.numbers.tolist()):

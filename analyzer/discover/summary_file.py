@@ -54,25 +54,16 @@ class GroupSummary(_Part):
 
     Attributes
     ----------
-    number : int
     name : str
         The class that a person named it; empty where nobody did.
-    times : int
-        How many sounds there are of it.
     days : int
         On how many days, at home.
     hours : list of int
         How many of them began in each hour of the day, at home.
-    seconds : float
-        Their median length.
     alike : float
         0: they differ as any sounds of the home do; 1: they are all the same.
     labels : dict of str to float
         What share of them each of their most frequent labels has, the most frequent first.
-    microphones : list of str
-        Which heard them.
-    examples : list of Example
-        Those in the middle of the group.
     """
 
     number: Annotated[int, Field(ge=1, le=_MOST_COUNT)]
@@ -88,21 +79,7 @@ class GroupSummary(_Part):
 
 
 class HomeSummary(_Part):
-    """The groups of a home, the largest first, as they were found last.
-
-    Attributes
-    ----------
-    format : int
-    id : str
-        Of the groups, as in the reason of their marks.
-    sounds : int
-        How many there are, of groups or not.
-    timezone : str
-        Of the home.
-    groups_file : str
-    groups : list of GroupSummary
-        Without those that no sound was of.
-    """
+    """The groups of a home, the largest first, as they were found last."""
 
     format: Annotated[int, Field(ge=1, le=_FORMAT)] = _FORMAT
     id: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
@@ -128,10 +105,7 @@ def summary_path(groups_file: Path) -> Path:
 def save_summary(summary: HomeSummary, path: Path) -> None:
     """Write a summary, in place of the one that is there.
 
-    Raises
-    ------
-    LogError
-        If it cannot be written.
+    Raise `LogError` if it cannot be written.
     """
     with replaced_file(path, readers=log_readers(path.parent)) as temporary:
         temporary.write_text(f"{json.dumps(summary.model_dump(), allow_nan=False)}\n", "utf-8")
@@ -140,10 +114,7 @@ def save_summary(summary: HomeSummary, path: Path) -> None:
 def load_summary(path: Path) -> HomeSummary:
     """Read a summary.
 
-    Raises
-    ------
-    DataError
-        If there is none, or it is no such file, or damaged.
+    Raise `DataError` if there is none, or it is no such file, or damaged.
     """
     if not path.exists():
         raise DataError(f"{path}: no such summary of groups; `hearthlog discover` writes it")

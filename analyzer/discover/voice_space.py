@@ -72,8 +72,6 @@ def describe_speech(values: Float32, names: Sequence[str]) -> Float64:
     ----------
     values : np.ndarray [shape=(frames, f)], float32
         Features of speech, at least one frame.
-    names : sequence of str
-        Those of the features, for which `has_voices`.
 
     Returns
     -------

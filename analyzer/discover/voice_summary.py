@@ -33,19 +33,12 @@ class VoiceSummary:
 
     Attributes
     ----------
-    number : int
     name : str
         That a person gave; empty where nobody did.
-    minutes : float
-        How long it speaks.
-    turns : int
-        How often it speaks without a pause.
     days : int
         On how many days, at home.
     hours : list of int
         How many of its turns began in each hour of the day, at home.
-    examples : list of VoiceTurn
-        Its longest turns.
     """
 
     number: int
@@ -78,12 +71,8 @@ def summarise(speech: HomeSpeech, voices: Voices, of: Int64, zone: tzinfo) -> li
 
     Parameters
     ----------
-    speech : HomeSpeech
-    voices : Voices
     of : np.ndarray [shape=(n,)], int64
         As `find_voices` returns it.
-    zone : tzinfo
-        Of the home.
     """
     found = []
     for row in range(len(voices.numbers)):
@@ -133,8 +122,6 @@ def spoken_spans(speech: HomeSpeech, voices: Voices, of: Int64) -> dict[str, Spo
 
     Parameters
     ----------
-    speech : HomeSpeech
-    voices : Voices
     of : np.ndarray [shape=(n,)], int64
         As `find_voices` returns it.
     """

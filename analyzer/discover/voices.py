@@ -39,7 +39,6 @@ def summed(points: Float64, of: Int64, count: int) -> Evidence:
     points : np.ndarray [shape=(n, d)], float64
     of : np.ndarray [shape=(n,)], int64
         What each is of, from 0 to `count`, which is left out.
-    count : int
     """
     own = (of == np.arange(count)[:, np.newaxis]).astype(np.float64)
     return Evidence(own.sum(axis=1), own @ points)
@@ -54,9 +53,6 @@ def same_voice(one: Evidence, others: Evidence, spread: Float64) -> Float64:
 
     Parameters
     ----------
-    one : Evidence
-        Of one row, or of as many as the others.
-    others : Evidence
     spread : np.ndarray [shape=(d,)], float64
 
     Returns
@@ -104,8 +100,6 @@ def joined(evidence: Evidence, spread: Float64) -> Int64:
 
     Parameters
     ----------
-    evidence : Evidence
-        The time that it takes grows with the square of its rows.
     spread : np.ndarray [shape=(d,)], float64
 
     Returns
@@ -151,8 +145,6 @@ def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
     points : np.ndarray [shape=(n, d)], float64
         Of its windows, in the order of time.
     spread : np.ndarray [shape=(d,)], float64
-    least : int
-        Windows of a voice; what has fewer goes to other voices, if there are any.
 
     Returns
     -------

@@ -41,12 +41,8 @@ class _Head(BaseModel):
 def save_voices(voices: Voices, path: Path) -> None:
     """Write the file of voices, in place of the one that is there.
 
-    Raises
-    ------
-    DataError
-        If it could not be read again, for the features of the voices are too large.
-    LogError
-        If it cannot be written.
+    Raise `DataError` if it could not be read again, for the features of the voices are too
+    large. Raise `LogError` if it cannot be written.
     """
     head = _Head(format=_FORMAT, id=voices.id, names=voices.names)
     arrays = {"numbers": voices.numbers, **voices.evidence._asdict()}
@@ -64,10 +60,7 @@ def save_voices(voices: Voices, path: Path) -> None:
 def load_voices(path: Path) -> Voices | None:
     """Read the file of voices; None if there is none.
 
-    Raises
-    ------
-    DataError
-        If it is no such file, or damaged.
+    Raise `DataError` if it is no such file, or damaged.
     """
     if not path.exists():
         return None

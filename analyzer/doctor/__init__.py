@@ -22,8 +22,6 @@ def examine(
 
     Parameters
     ----------
-    paths : Path or sequence of Path
-        Logs, or folders of logs.
     progress : callable, optional
         Is told the share of the bytes that is done, 0 to 1.
     missing : list of str, optional

@@ -43,16 +43,8 @@ def check_stamps(
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    kind : str
-        Last part of the topic, such as `features`; `/rosout` and `/diagnostics` are kinds, too.
-    columns : Columns
-        Messages of this kind.
     microphone : str
         Its name; empty for a topic of no microphone.
-    named : bool
-        Whether the file bears the name of a recorder's log.
 
     Raises
     ------
@@ -91,13 +83,8 @@ def check_values(findings: Findings, columns: Columns, field: str, width: int) -
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    columns : Columns
     field : str
         Path of the array; the values of `std` must not be negative, either.
-    width : int
-        Number of names.
 
     Raises
     ------
@@ -130,10 +117,6 @@ def check_labels(findings: Findings, columns: Columns, classes: list[str]) -> No
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    columns : Columns
-        Messages of type `AudioLabel`.
     classes : list of str
         Of the model, in the order of the probabilities.
 
@@ -187,10 +170,6 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    columns : Columns
-        Messages of type `AudioSegment`.
     classes : list of str or None
         Of the model; None allows any.
 
@@ -215,17 +194,7 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
 def check_directions(findings: Findings, columns: Columns) -> None:
     """Check that directions are angles, and how sure they are a share.
 
-    Parameters
-    ----------
-    findings : Findings
-        Is added to.
-    columns : Columns
-        Messages of type `AudioDirection`.
-
-    Raises
-    ------
-    LogError
-        If a field of the type is missing.
+    Raise `LogError` if a field of the type is missing.
     """
     times, azimuths, confidence = columns.log_times, columns["azimuth"], columns["confidence"]
     findings.rows(
@@ -245,17 +214,7 @@ def check_directions(findings: Findings, columns: Columns) -> None:
 def check_embeddings(findings: Findings, columns: Columns) -> None:
     """Check that embeddings are of whole windows, and have a value for each name.
 
-    Parameters
-    ----------
-    findings : Findings
-        Is added to.
-    columns : Columns
-        Messages of type `AudioEmbedding`.
-
-    Raises
-    ------
-    LogError
-        If a field of the type is missing.
+    Raise `LogError` if a field of the type is missing.
     """
     times, frames, lengths = columns.log_times, columns["frame"], columns["frames"]
     findings.rows(
@@ -278,17 +237,7 @@ def check_gaps(findings: Findings, columns: Columns) -> None:
 
     What a damaged log has lost may have had gaps in which the clock was set.
 
-    Parameters
-    ----------
-    findings : Findings
-        Is added to.
-    columns : Columns
-        Messages of type `AudioGap`.
-
-    Raises
-    ------
-    LogError
-        If a field of the type is missing.
+    Raise `LogError` if a field of the type is missing.
     """
     times, durations = columns.log_times, columns["duration"]
     lost, reasons = columns["frames_lost"], columns["reason"]

@@ -59,14 +59,8 @@ def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFi
 
     Parameters
     ----------
-    path : Path
     progress : callable, optional
         Is told the share of the bytes that is done, 0 to 1.
-
-    Returns
-    -------
-    ExaminedFile
-        If the file cannot be read, its findings say so.
     """
     examined = ExaminedFile(Findings(path))
     try:
@@ -237,15 +231,7 @@ def _report_unfinished(findings: Findings, *, active: bool) -> None:
 
 
 class ForeignMessages:
-    """Checks that the messages of a file that is not ours are of the types that it names.
-
-    Parameters
-    ----------
-    data : DataSection
-        Of the file; its definitions grow as it is read.
-    findings : Findings
-        Is added to.
-    """
+    """Checks that the messages of a file that is not ours are of the types that it names."""
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
         self._data = data
@@ -253,13 +239,7 @@ class ForeignMessages:
         self._wrong: Counter[int] = Counter()  # faults that are unlike, by channel
 
     def add(self, batch: MessageBatch) -> None:
-        """Decode the next messages of the file, and report what cannot be decoded.
-
-        Parameters
-        ----------
-        batch : MessageBatch
-            Messages behind those before them.
-        """
+        """Decode the next messages of the file, and report what cannot be decoded."""
         definitions = self._data.definitions
         for raw in batch.by_channel(definitions.channels, definitions.schemas):
             if self._wrong[raw.channel.id] > _MOST_WRONG:

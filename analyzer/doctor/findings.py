@@ -64,10 +64,6 @@ class Findings:
 
         Parameters
         ----------
-        rule : str
-            Name of the rule in docs/doctor.md.
-        what : str
-            What is wrong.
         advice : str
             What to do; empty where `what` says it all.
         offset : int, optional
@@ -90,10 +86,6 @@ class Findings:
 
         Parameters
         ----------
-        rule : str
-            Name of the rule in docs/doctor.md.
-        what : str
-            What is incomplete.
         advice : str
             What to do; empty where `what` says it all.
         offset : int, optional
@@ -117,8 +109,6 @@ class Findings:
 
         Parameters
         ----------
-        rule : str
-            Name of the rule in docs/doctor.md.
         wrong : np.ndarray [shape=(n,)], bool
             Which rows break it.
         times : np.ndarray [shape=(n,)], int64
@@ -126,10 +116,6 @@ class Findings:
         what : callable
             Is told the number of a row, from 0, and says what is wrong with it; is called for the
             first five of them.
-        level : str
-            `error` or `warning`.
-        advice : str
-            What to do about an error.
         """
         places = np.flatnonzero(wrong)
         advice = advice if level == "error" else ""

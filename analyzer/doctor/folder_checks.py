@@ -25,18 +25,7 @@ _LEFT = {
 
 
 def check_leftovers(folder: Path) -> Iterator[Findings]:
-    """Find the files that killed recorders and commands have left behind.
-
-    Parameters
-    ----------
-    folder : Path
-        Is searched with all folders in it.
-
-    Yields
-    ------
-    Findings
-        One for each such file, in the order of their paths.
-    """
+    """Find the files that killed recorders and commands have left behind."""
     for path in sorted(folder.rglob("*")):
         for suffix, what in _LEFT.items():
             if path.name.endswith(suffix) and SUFFIX in path.name:

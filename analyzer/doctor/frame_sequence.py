@@ -35,16 +35,8 @@ class FrameSequence:
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    microphone : str
-        Its name.
-    statistics_every : int or None
-        Frames from one statistics message to the next, if the file has that.
     timing : LabelTiming or None
         Of the labels; None if there are none, or it is not known.
-    thinned : collection of str
-        Kinds of messages that were dropped when the log grew old.
     """
 
     def __init__(
@@ -80,8 +72,6 @@ class FrameSequence:
 
         Parameters
         ----------
-        kind : str
-            `features`, `statistics`, `direction`, `embedding`, `label`, `segment` or `gap`.
         rows : np.ndarray [shape=(n, 3)], int64
             As the class describes them (times in nanoseconds of UTC), in the order of their log
             times, behind those of this kind that were added before.
@@ -108,13 +98,7 @@ class FrameSequence:
         self._heard = _NONE
 
     def begin_anew(self, time: int) -> None:
-        """Note that from a log time on this is another recording, or its next log.
-
-        Parameters
-        ----------
-        time : int
-            Nanoseconds of UTC.
-        """
+        """Note that from a log time on this is another recording, or its next log."""
         self.settle(time)
         self._previous = self._run = self._segment = None
         self._heard = _NONE

@@ -41,14 +41,7 @@ class Steps(NamedTuple):
 
 
 def check_steps(report: Report, steps: Steps) -> None:
-    """Check that frame numbers and stamps go on, and that a gap explains every jump.
-
-    Parameters
-    ----------
-    report : callable
-        Is told the rows that break a rule, as `Report` says.
-    steps : Steps
-    """
+    """Check that frame numbers and stamps go on, and that a gap explains every jump."""
     rows, has_previous, numbers, elapsed, gaps, lost = steps
     times, frames, _ = rows.T
     report(
@@ -83,9 +76,6 @@ def check_gaps(report: Report, steps: Steps, gaps: Int64, following: NDArray[np.
 
     Parameters
     ----------
-    report : callable
-        Is told the gaps that break a rule, as `Report` says.
-    steps : Steps
     gaps : np.ndarray [shape=(m, 3)], int64
         End and start (nanoseconds of UTC), and the number of frames that were lost.
     following : np.ndarray [shape=(m,)], int

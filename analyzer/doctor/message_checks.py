@@ -54,28 +54,14 @@ _LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
 
 
 def allowed_delay(data: DataSection) -> int:
-    """Return by how much messages of one microphone may come behind those of another, in ns.
-
-    Parameters
-    ----------
-    data : DataSection
-        Of a log.
-    """
+    """Return by how much messages of one microphone may come behind those of another, in ns."""
     channels = data.definitions.channels.values()
     infos = [channel for channel in channels if split_topic(channel.topic)[1] == "info"]
     return ALLOWED_DELAY if len(infos) > 1 else 0
 
 
 class MessageChecks:
-    """Follows the messages of one file.
-
-    Parameters
-    ----------
-    data : DataSection
-        Of the file; its definitions grow as it is read.
-    findings : Findings
-        Is added to.
-    """
+    """Follows the messages of one file."""
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
         self.infos: dict[str, dict[str, Any]] = {}  # the `AudioStreamInfo` of each microphone
@@ -90,13 +76,7 @@ class MessageChecks:
         self._named = LOG_NAME.fullmatch(findings.path.name) is not None
 
     def add(self, batch: MessageBatch) -> None:
-        """Check the next messages of the file.
-
-        Parameters
-        ----------
-        batch : MessageBatch
-            Messages behind those before them.
-        """
+        """Check the next messages of the file."""
         self._check_times(batch)
         definitions = self._data.definitions
         by_kind: dict[str, list[Columns]] = {}
@@ -278,11 +258,6 @@ class MessageChecks:
 
 def statistics_every(data: DataSection) -> int | None:
     """Read from the configuration in a file how often statistics are logged.
-
-    Parameters
-    ----------
-    data : DataSection
-        With the attachment `configuration.json`, if the file has it.
 
     Returns
     -------

@@ -53,14 +53,6 @@ class MetadataChecks:
 
     Parameters
     ----------
-    data : DataSection
-        The whole data section of the file.
-    messages : MessageChecks
-        The checks of its messages, which are over.
-    findings : Findings
-        Is added to.
-    finished : bool
-        Whether the file was completed.
     whole : bool
         Whether all of it could be read: only then counts are compared.
     """

@@ -37,11 +37,6 @@ SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
 def split_topic(topic: str) -> tuple[str, str]:
     """Split a topic of a recorder into microphone and kind.
 
-    Parameters
-    ----------
-    topic : str
-        Such as `/mic/features`.
-
     Returns
     -------
     microphone, kind : str
@@ -60,11 +55,6 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 def topic_type(topic: str) -> str | None:
     """Return the message type that docs/log.md gives to a topic.
-
-    Parameters
-    ----------
-    topic : str
-        Such as `/mic/features`.
 
     Returns
     -------

@@ -139,14 +139,7 @@ def compare_models(
 def check_features(a: Model, b: Model) -> None:
     """Check that two models can be compared on the same features.
 
-    Parameters
-    ----------
-    a, b : Model
-
-    Raises
-    ------
-    DataError
-        If they are for different feature sets.
+    Raise `DataError` if they are for different feature sets.
     """
     own, theirs = (one.description.feature_set for one in (a, b))
     if own != theirs:

@@ -81,11 +81,6 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> Difference:
 
     What b has by another name (see `hearthlog.models.classes`) is called as a calls it.
 
-    Parameters
-    ----------
-    a, b : NamedLabelling
-        Each has one label at a time.
-
     Returns
     -------
     Difference
@@ -133,11 +128,6 @@ def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
         apart.
     a, b : Events
         The spans behind its rows, labels as indices of the same classes.
-
-    Returns
-    -------
-    LabelRuns
-        In the order of time.
     """
     label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
     new = np.ones(len(pieces.starts), bool)

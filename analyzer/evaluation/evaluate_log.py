@@ -59,21 +59,9 @@ def evaluate_labelling(
 ) -> LogEvaluation:
     """Compare labels where both the reference and the log have some.
 
-    Parameters
-    ----------
-    reference : Labelling
-        May have several labels at a time, and other names for the classes (see
-        `hearthlog.models.classes`).
-    predicted : Labelling
-        Has one at a time, each of `classes`.
-    classes : sequence of str
-        What the log may be labelled with.
-
-    Raises
-    ------
-    DataError
-        If the two have no time in common; if the reference has no label that the log knows, or no
-        frame with a single one; or if so many events start together that this is no labelling.
+    Raise `DataError` if the two have no time in common; if the reference has no label that the
+    log knows, or no frame with a single one; or if so many events start together that this is
+    no labelling.
     """
     covered = joined(reference.starts, reference.ends, FRAME_NANOSECONDS)
     spans = common(covered, joined(predicted.starts, predicted.ends, FRAME_NANOSECONDS))
@@ -194,15 +182,8 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
 
     Parameters
     ----------
-    path : Path
-        The log, or folder of logs.
     topic : str, optional
         The topic of the segments, such as `/mic/segment`; by default that of the only microphone.
-
-    Returns
-    -------
-    TopicLabelling
-        Its segments are in the order of time.
 
     Raises
     ------
@@ -241,19 +222,8 @@ def read_reference(source: str, path: Path, microphone: str, scenario: str = "")
 
     Parameters
     ----------
-    source : str
-        Path of a label file, or `review` for the review layers.
-    path : Path
-        The log, or folder of logs.
-    microphone : str
-        Labels of other microphones are left out.
     scenario : str, optional
         Whose marks in the review layers are meant; empty for those of the sounds of the home.
-
-    Returns
-    -------
-    Labelling
-        In the order of the file or the layers.
 
     Raises
     ------

@@ -40,8 +40,6 @@ def evaluate_method(
 
     Parameters
     ----------
-    data : Dataset
-    method : Method
     kind : str
         What is never on both sides of a fold: a `segment` (the paper's folds, which flatter, since
         segments of one recording are alike), a `source`, or a `collection`, which is what a new
@@ -83,14 +81,8 @@ def divide(data: Dataset, kind: Kind) -> list[Fold]:
 
     Parameters
     ----------
-    data : Dataset
     kind : str
         What is never on both sides of a fold: a `segment`, a `source` or a `collection`.
-
-    Returns
-    -------
-    list of Fold
-        For each the rows that are learned from, and those that are tried; each row is tried once.
 
     Raises
     ------

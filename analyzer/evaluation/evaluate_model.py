@@ -67,10 +67,6 @@ def evaluate_model(
 
     Parameters
     ----------
-    model : Model
-    clips : sequence of LabelledClip
-    scenario : Scenario
-        With the classes of the model, in any order.
     progress : callable
         Told the share of the clips that is done, 0 to 1.
 
@@ -114,7 +110,6 @@ def fitted(scenario: Scenario, model: Model) -> Scenario:
 
     Parameters
     ----------
-    scenario : Scenario
     model : Model
         Its class `unknown` is added where the scenario has none.
 
@@ -132,15 +127,7 @@ def fitted(scenario: Scenario, model: Model) -> Scenario:
 def check_classes(model: Model, scenario: Scenario) -> None:
     """Raise DataError unless a model has the classes of a scenario, in any order.
 
-    Parameters
-    ----------
-    model : Model
-    scenario : Scenario
-
-    Raises
-    ------
-    DataError
-        If one of the two has a class that the other lacks.
+    Raise `DataError` if one of the two has a class that the other lacks.
     """
     lacking = [name for name in scenario.classes if name not in {*model.classes, UNKNOWN}]
     other = [name for name in model.classes if name not in {*scenario.classes, UNKNOWN}]
@@ -158,12 +145,6 @@ def check_classes(model: Model, scenario: Scenario) -> None:
 
 def heads_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
     """Return what the heads of a classifier say of segments, as `Classifier.classify` takes it.
-
-    Parameters
-    ----------
-    classifier : Classifier
-    data : Dataset
-        Of n segments.
 
     Returns
     -------
@@ -188,7 +169,6 @@ def segment_probabilities(
 
     Parameters
     ----------
-    classifier : Classifier
     inputs : np.ndarray [shape=(n, places, width)], float32
         As of `of_segments`.
     evidence, by_heads : np.ndarray [shape=(n, C)], float64, optional

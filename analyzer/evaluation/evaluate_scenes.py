@@ -62,18 +62,10 @@ class SceneOptions:
 
     Attributes
     ----------
-    scenes : int
-        How many.
-    seconds : float
-        Length of each.
     floor : float
         Level of the noise in dBFS.
-    colour : str
-        `white`, `pink` or `brown`.
     gain : float
         Of the clips, in dB.
-    seed : int
-        Of the first scene; the next one has the next number.
     """
 
     scenes: int = 3
@@ -100,13 +92,8 @@ class SingleCoughs:
 
     Attributes
     ----------
-    coughs : int
     found : float
         Share of them that a label of coughing overlaps.
-    median_seconds : float or None
-        Of the first such label of each that was found.
-    others : float
-        Labels a cough that are neither coughing nor silence.
     """
 
     coughs: int
@@ -123,21 +110,8 @@ class ScenesEvaluation:
     ----------
     scores : Scores
         Of frames of 50 ms in all scenes; the groups are blocks of five minutes.
-    detections : Detections
-    scenes : list of SceneScores
     coughs : SingleCoughs or None
         None where the model has no such class, or there is no clip of it.
-    evaluated_seconds : float
-    sounds, clips : int
-        How many sounds were laid, and of how many clips they were chosen.
-    sources, sources_learned : int
-        Of how many source groups these clips are, and of how many of them the model has learned.
-    lacking : tuple of str
-        Classes without a clip.
-    skipped : dict of str to int
-        How many clips were left out, by the reason.
-    left_out : sequence of LeftOut
-        Those that could not be read.
     truth, found : Labelling
         Of the first scene, for pictures; in nanoseconds from its start.
     """
@@ -170,13 +144,6 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    path : Path
-        The file of the model.
-    model : Model
-    clips : sequence of LabelledClip
-    scenario : Scenario
-        With the classes of the model, in any order.
-    options : SceneOptions
     progress : callable
         Told the share of the scenes that is done, 0 to 1.
 

@@ -37,13 +37,7 @@ class Events:
         return len(self.starts)
 
     def of(self, label: int) -> "Events":
-        """Return the spans of one label.
-
-        Parameters
-        ----------
-        label : int
-            Index of the class.
-        """
+        """Return the spans of one label."""
         return self.taken(np.flatnonzero(self.labels == label))
 
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
@@ -58,14 +52,7 @@ class Events:
 
 
 def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
-    """Return the spans of a labelling, with their labels as indices.
-
-    Parameters
-    ----------
-    labelling : Labelling
-    classes : sequence of str
-        With every label of the labelling.
-    """
+    """Return the spans of a labelling, with their labels as indices."""
     indices = {name: i for i, name in enumerate(classes)}
     labels = np.fromiter(map(indices.__getitem__, labelling.labels), np.int64, len(labelling))
     return Events(labelling.starts, labelling.ends, labels)
@@ -112,8 +99,6 @@ def detect(
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
-    classes : sequence of str
-        The names behind their labels.
     duration : int
         Evaluated time in nanoseconds.
 
@@ -134,13 +119,6 @@ def laid_out(events: Events, spans: Spans) -> Events:
 
     Every span begins on a whole second, and at least one second after the end of the last: no event
     is compared with one of another span.
-
-    Parameters
-    ----------
-    events : Events
-        In nanoseconds of UTC.
-    spans : Spans
-        In nanoseconds of UTC.
 
     Returns
     -------
@@ -163,8 +141,6 @@ def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) 
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
-    classes : sequence of str
-        The names behind their labels.
     """
     counts = []
     for label in range(len(classes)):
@@ -189,8 +165,6 @@ def event_based(reference: Events, predicted: Events, classes: Sequence[str]) ->
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
-    classes : sequence of str
-        The names behind their labels.
 
     Raises
     ------
@@ -233,8 +207,6 @@ def false_alarms_per_day(
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
-    classes : sequence of str
-        The names behind their labels.
     duration : int
         Evaluated time in nanoseconds, more than 0.
 

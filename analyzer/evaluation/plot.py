@@ -18,19 +18,7 @@ _NAME_WIDTH = 16
 def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) -> None:
     """Draw the confusion matrix, F1 by class and, if there are bins, the reliability diagram.
 
-    Parameters
-    ----------
-    path : Path
-        Of a PNG file, which must not exist.
-    title : str
-    scores : Scores
-    bins : sequence of Bin, optional
-        From `reliability`.
-
-    Raises
-    ------
-    LogError
-        If the file exists, or cannot be written.
+    Raise `LogError` if the file exists, or cannot be written.
     """
     count = len(scores.classes)
     names = plot_names(scores.classes)
@@ -56,10 +44,7 @@ def new_figure(inches: tuple[float, float], title: str) -> Figure:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure to a new PNG file.
 
-    Raises
-    ------
-    LogError
-        If the file exists, or cannot be written.
+    Raise `LogError` if the file exists, or cannot be written.
     """
     with new_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

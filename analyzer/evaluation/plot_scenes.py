@@ -20,17 +20,7 @@ _MOST_ROWS = 3
 def save_scenes(path: Path, title: str, found: ScenesEvaluation) -> None:
     """Draw F1 and false alarms by class, and the first scene: the truth above its labels.
 
-    Parameters
-    ----------
-    path : Path
-        Of a PNG file, which must not exist.
-    title : str
-    found : ScenesEvaluation
-
-    Raises
-    ------
-    LogError
-        If the file exists, or cannot be written.
+    Raise `LogError` if the file exists, or cannot be written.
     """
     names = plot_names(found.scores.classes)
     minutes = found.truth.ends.max() / NANOSECONDS / 60

@@ -66,8 +66,6 @@ def background(seconds: float, level: float, colour: Colour, seed: int) -> Float
         More than 0.
     level : float
         In dBFS.
-    colour : str
-        `white`, `pink` or `brown`.
     seed : int
         Not negative.
 
@@ -116,8 +114,6 @@ def compose(
         Gives the samples of a clip at 16 kHz, not none; one clip is held at a time.
     noise : np.ndarray [shape=(n,)], float32
         As of `background`; it is overwritten.
-    seed : int
-        The same arguments give the same scene.
     gain : float
         Of the clips, in dB.
 
@@ -152,11 +148,8 @@ def compose_single(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    label : str
     clips : sequence
         At least one.
-    read, noise, seed, gain
-        As of `compose`.
 
     Raises
     ------
@@ -181,8 +174,6 @@ def loudest(sound: Float32, seconds: float) -> Float32:
     ----------
     sound : np.ndarray [shape=(n,)], float32
         Samples at 16 kHz.
-    seconds : float
-        A sound that is not longer is returned as it is.
     """
     count = int(seconds * SAMPLE_RATE)
     if len(sound) <= count:

@@ -46,13 +46,7 @@ def schema_of(table: Table, selection: Selection) -> pa.Schema:
 
 
 def column_name(path: str) -> str:
-    """Name the column of a field: by its path, after `message.` where a time has that name.
-
-    Parameters
-    ----------
-    path : str
-        Of the field, such as `header.stamp`.
-    """
+    """Name the column of a field: by its path, after `message.` where a time has that name."""
     return f"message.{path}" if path in _HEADS else path
 
 
@@ -137,13 +131,6 @@ def array_of(values: NDArray[Any], field: Field) -> pa.Array:
     values : np.ndarray [shape=(n, ...)]
         As `Columns` has them: times as int64 nanoseconds; arrays as one row each, or as objects
         where their lengths differ.
-    field : Field
-        What the values are.
-
-    Returns
-    -------
-    pa.Array
-        Of length n and of the type that `type_of` returns.
     """
     kind = type_of(field)
     if not field.type:

@@ -18,15 +18,6 @@ class LabelTrack:
 
     Times are seconds since the first frame of the microphone in the span or, without frames, since
     the first segment. A segment that began before is cut.
-
-    Parameters
-    ----------
-    stream : binary file
-        Is written to.
-    table : Table
-        Such as that of `/mic/segment`.
-    selection : Selection
-        Has the topic.
     """
 
     def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:
@@ -36,15 +27,7 @@ class LabelTrack:
     def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append segments.
 
-        Parameters
-        ----------
-        pieces : sequence of TypedColumns
-            Messages with the fields `header.stamp`, `duration` and `label`.
-
-        Raises
-        ------
-        LogError
-            If one of these fields is missing.
+        Raise `LogError` if one of these fields is missing.
         """
         for piece in pieces:
             self._write(piece.columns)

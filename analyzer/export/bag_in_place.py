@@ -32,14 +32,8 @@ def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagIn
 
     Parameters
     ----------
-    folder : Path
-        Logs may lie at any depth.
     progress : callable
         Is told the share that is done, 0 to 1.
-
-    Returns
-    -------
-    BagInPlace
 
     Raises
     ------

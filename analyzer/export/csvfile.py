@@ -38,14 +38,6 @@ class CsvFile:
     elements, otherwise `values[0]`; arrays of messages and very long ones are JSON, and bytes are
     in base64. Stamps are UTC, durations are in seconds. Control characters of texts become U+FFFD,
     and an apostrophe stands before a text that a spreadsheet would take for a formula.
-
-    Parameters
-    ----------
-    stream : binary file
-        Is written to.
-    table : Table
-    selection : Selection
-        Not used.
     """
 
     def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:  # noqa: ARG002

@@ -142,13 +142,7 @@ def with_numbers(columns: Columns, table: Table, paths: Collection[str]) -> Colu
 
 
 def warn_of_changes(tables: Sequence[Table]) -> None:
-    """Warn where definitions differ between the messages of a topic, and say what becomes of it.
-
-    Parameters
-    ----------
-    tables : sequence of Table
-        Those of the topic.
-    """
+    """Warn where definitions differ between the messages of a topic, and say what becomes of it."""
     for table in tables:
         optional = optional_fields(table.definitions)
         if optional:
@@ -194,19 +188,6 @@ class OutputFiles:
     ----------
     path : Path
         The only file, which does not exist, or an empty folder.
-    output : Path
-        The name that it gets.
-    suffix : str
-        Of the files in a folder, without a dot.
-
-    Attributes
-    ----------
-    path : Path
-        The only file, or the folder.
-    output : Path
-        The name that it gets.
-    made : list of Path
-        The files of which `new` has made the names.
     """
 
     def __init__(self, path: Path, output: Path, suffix: str) -> None:
@@ -255,8 +236,6 @@ class Exporter(NamedTuple):
         format has no place for.
     type : str
         The only message type that it takes; empty for any.
-    fields : collection of str
-        Paths of the fields that messages must have.
     """
 
     save: Callable[[Selection, OutputFiles, Progress], int | None]
@@ -301,13 +280,8 @@ def write_tables(
 
     Parameters
     ----------
-    selection : Selection
-    files : OutputFiles
-        What is written to.
     progress : callable
         Is told the share that is done, 0 to 1.
-    opened : callable
-        Is called with a table, at its first message, and returns its writer.
     type_ : str
         Name of the only message type that is written; empty for any.
 
@@ -461,12 +435,8 @@ def table_exporter(
 
     Parameters
     ----------
-    writer : callable
-        Is called with a stream, a table and the selection, and returns the writer of the table.
     type_ : str
         Name of the only message type that the format takes; empty for any.
-    fields : collection of str
-        Paths of the fields that messages must have.
     """
 
     def save(selection: Selection, files: OutputFiles, progress: Progress) -> None:

@@ -8,11 +8,6 @@ _LENGTH = 100  # characters
 def file_stem(topic: str) -> str:
     """Make a part of a file name from a topic: `mic_features` from `/mic/features`.
 
-    Parameters
-    ----------
-    topic : str
-        Any text.
-
     Returns
     -------
     str
@@ -28,8 +23,6 @@ def unused_name(name: str, taken: dict[str, int]) -> str:
     ----------
     name : str
         The name that is wanted; becomes `name-2.suffix` and so on.
-    taken : dict of str to int
-        Names that are taken, and the number to try next; the returned one is added.
     """
     stem, dot, suffix = name.rpartition(".")
     before, behind = (stem, dot + suffix) if stem else (name, "")

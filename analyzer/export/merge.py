@@ -69,20 +69,12 @@ def merge_logs(
 
     Parameters
     ----------
-    selection : Selection
-    output : Path
-        Must not exist.
     progress : callable
         Is told the share that is done, 0 to 1.
     latched : bool
         Begin with what a late subscriber would still receive: of each channel that is transient
         local without end, as many of its last messages before the span as it keeps, with the log
         time of the first message in the span, and their own publish times.
-
-    Returns
-    -------
-    int
-        How many messages were left out because they are there already.
 
     Raises
     ------
@@ -102,8 +94,6 @@ class WrittenLog(NamedTuple):
     record : mapping of str to str, or None
         Its `rosbag2` record; None, and no record, if a topic has channels that rosbag2 cannot tell
         apart, or no ROS 2 messages.
-    repeated : int
-        How many messages were left out because they are there already.
     """
 
     record: Mapping[str, str] | None
@@ -122,15 +112,8 @@ def write_log(
 
     Parameters
     ----------
-    selection : Selection
-    stream : binary file
-        Is written to, from where it is.
-    name : str
-        Name of the file, for the `rosbag2` record.
     progress : callable
         Is told the share that is done, 0 to 1.
-    latched : bool
-        As of `merge_logs`.
 
     Raises
     ------
@@ -294,12 +277,7 @@ class _Log:
 
 
 def is_for_rosbag2(channels: Sequence[Described]) -> bool:
-    """Return whether rosbag2 has one description for the channels of a topic.
-
-    Parameters
-    ----------
-    channels : sequence of (Channel, Schema or None)
-    """
+    """Return whether rosbag2 has one description for the channels of a topic."""
     described = [
         ("" if schema is None else schema.name, bag_metadata(channel))
         for channel, schema in channels
@@ -489,11 +467,6 @@ def _held_by(profile: Mapping[str, Any]) -> float:
 
 def bag_metadata(channel: Channel) -> dict[str, str]:
     """Return what rosbag2 wants to know of a channel, as a recorder writes it.
-
-    Parameters
-    ----------
-    channel : Channel
-        Of a recorder, or of `ros2 bag record`, which writes YAML in blocks.
 
     Returns
     -------

@@ -40,9 +40,6 @@ class NpzFile:
 
     Parameters
     ----------
-    table : Table
-    files : OutputFiles
-        In which it is written.
     sizes : Counter
         Bytes of the tables that are in memory, which it joins, and under None of all.
     """
@@ -54,13 +51,7 @@ class NpzFile:
         self._pieces: list[Columns] | None = []  # None if it is put off
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
-        """Append messages; put off the largest table if all are too large.
-
-        Parameters
-        ----------
-        pieces : sequence of TypedColumns
-            Messages of the table.
-        """
+        """Append messages; put off the largest table if all are too large."""
         if self._pieces is None:
             return
         self._pieces += [piece.columns for piece in pieces]

@@ -18,14 +18,6 @@ class ParquetFile:
     """A Parquet file being written, row group by row group.
 
     Stamps are of type timestamp[ns, UTC]; the metadata are those of `schema_of`.
-
-    Parameters
-    ----------
-    stream : binary file
-        Is written to.
-    table : Table
-    selection : Selection
-        Has the topic of the table.
     """
 
     def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:
@@ -37,13 +29,7 @@ class ParquetFile:
         self._size = 0
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
-        """Append messages.
-
-        Parameters
-        ----------
-        pieces : sequence of TypedColumns
-            Messages of the table.
-        """
+        """Append messages."""
         batch = batch_of(pieces, self._table, self._schema)
         self._batches.append(batch)
         self._size += batch.nbytes

@@ -17,20 +17,7 @@ from hearthlog.schemas.text import abridged
 def exportable(selection: Selection, format_: ExportFormat) -> Selection:
     """Leave out the topics that a format is not for, as WAV is for clips of sound.
 
-    Parameters
-    ----------
-    selection : Selection
-    format_ : ExportFormat
-
-    Returns
-    -------
-    Selection
-        The same one if the format takes any topic.
-
-    Raises
-    ------
-    LogError
-        If the selection has logs, and no topic is left.
+    Raise `LogError` if the selection has logs, and no topic is left.
     """
     exporter = _exporter(format_)
     if not exporter.type:
@@ -58,21 +45,11 @@ def export(
 
     Parameters
     ----------
-    selection : Selection
-        As `exportable` returns it.
-    output : Path
-        Must not exist.
-    format_ : ExportFormat
     progress : callable
         Is told the share that is done, 0 to 1.
     folder : bool
         Make a folder with one file for each topic (WAV: for each clip); otherwise one file, of one
         topic if the format is `by_topic`.
-
-    Returns
-    -------
-    int
-        How many messages were left out because several logs hold them.
 
     Raises
     ------

@@ -30,8 +30,6 @@ def in_order(
     ----------
     pieces : iterable of TypedColumns
         None where no message could be decoded.
-    lines : callable
-        Makes a line of every message of a piece, in their order: `json_lines` or `text_lines`.
     """
     texts: list[str] = []
     times: list[Int64] = []
@@ -46,15 +44,6 @@ def json_lines(piece: TypedColumns) -> list[str]:
     """Make a JSON object of every message, in the form of `mcap cat --json`.
 
     Times are seconds with nine decimals, bytes are in base64, and what is not finite is null.
-
-    Parameters
-    ----------
-    piece : TypedColumns
-
-    Returns
-    -------
-    list of str
-        One line for each message, in their order.
     """
     columns = piece.columns
     texts = [
@@ -71,10 +60,6 @@ def json_lines(piece: TypedColumns) -> list[str]:
 
 def text_lines(piece: TypedColumns) -> list[str]:
     """Make a short line of every message: time, topic, fields.
-
-    Parameters
-    ----------
-    piece : TypedColumns
 
     Returns
     -------
@@ -96,13 +81,7 @@ def text_lines(piece: TypedColumns) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Put a text in quotes if it is empty, has spaces or quotes, or could steer a terminal.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-    """
+    """Put a text in quotes if it is empty, has spaces or quotes, or could steer a terminal."""
     harmless = text.isprintable()
     plain = harmless and text and not set(text) & set(' "')
     return text if plain else json.dumps(text, ensure_ascii=not harmless)
@@ -116,8 +95,6 @@ def json_texts(values: NDArray[Any], field: Field) -> list[str]:
     values : np.ndarray [shape=(n, ...)]
         As `Columns` has them: times as int64 nanoseconds; arrays as one row each, or as objects
         where their lengths differ.
-    field : Field
-        What the values are.
 
     Returns
     -------

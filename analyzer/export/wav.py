@@ -37,15 +37,8 @@ class WavFiles:
     def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append the clips of messages; begin a new file after a hole, or where the format changes.
 
-        Parameters
-        ----------
-        pieces : sequence of TypedColumns
-            Messages of type `RawAudio`.
-
-        Raises
-        ------
-        LogError
-            If the messages hold no sound that WAV can hold; the callable `name` may raise it too.
+        Raise `LogError` if the messages hold no sound that WAV can hold; the callable `name`
+        may raise it too.
         """
         try:
             for piece in pieces:

@@ -29,10 +29,6 @@ class Admission:
 
     Attributes
     ----------
-    bind : str
-        Address that is listened on, of IPv4 or IPv6.
-    token : str
-        That the address has behind `/?token=`.
     origins : frozenset of str
         Pages that may look, as `https://lichtblick.example`, beside Foxglove's own and those that
         this machine serves. What is no page names none, and needs the token only.

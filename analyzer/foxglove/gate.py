@@ -29,16 +29,6 @@ class Gate:
 
     So many may ask at a time: another one takes the place of the oldest of the address that has
     most of them, so that nobody keeps out who has the token by connections that say nothing.
-
-    Parameters
-    ----------
-    listener : socket.socket
-        Where viewers connect; closed at the end.
-    behind : (str, int)
-        Address and port of the server.
-    admission : Admission
-    refused : callable
-        Told why somebody was refused, in the thread of the gate.
     """
 
     def __init__(

@@ -20,11 +20,6 @@ def publish_live(folder: Path, publisher: Publisher, stop: Event, damaged: Damag
 
     Parameters
     ----------
-    folder : Path
-        That recorders write to.
-    publisher : Publisher
-    stop : threading.Event
-        Ends it when it is set.
     damaged : callable
         Told the error of a log of which no more can be read.
     """

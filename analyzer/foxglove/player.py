@@ -28,15 +28,7 @@ _SETTLE_SECONDS = 0.1
 
 
 class Player:
-    """Publishes a recording; all viewers share one state of it.
-
-    Parameters
-    ----------
-    recording : Recording
-    publisher : Publisher
-    stop : threading.Event
-        Ends the playing when it is set.
-    """
+    """Publishes a recording; all viewers share one state of it."""
 
     def __init__(self, recording: Recording, publisher: Publisher, stop: Event) -> None:
         self._recording = recording
@@ -56,17 +48,7 @@ class Player:
         return self._recording.start, self._recording.end
 
     def obey(self, request: PlaybackControlRequest) -> PlaybackState:
-        """Do what a viewer asks for.
-
-        Parameters
-        ----------
-        request : PlaybackControlRequest
-
-        Returns
-        -------
-        PlaybackState
-            What comes of it.
-        """
+        """Do what a viewer asks for."""
         with self._changed:
             self._position, self._since = self._now(), time.monotonic()
             if math.isfinite(request.playback_speed):
@@ -83,13 +65,7 @@ class Player:
             return self._state(did_seek=request.seek_time is not None)
 
     def play(self, server: WebSocketServer) -> None:
-        """Publish what is to be seen, until `stop` is set.
-
-        Parameters
-        ----------
-        server : WebSocketServer
-            Of the viewers.
-        """
+        """Publish what is to be seen, until `stop` is set."""
         while not self._stop.is_set():
             with self._changed:
                 seeks, start = self._seeks, self._position

@@ -8,13 +8,7 @@ from hearthlog.schemas.messages.message_types import STREAM_INFO
 
 
 class Publisher:
-    """Publishes messages, and repeats the last description of each stream when it is asked to.
-
-    Attributes
-    ----------
-    context : foxglove.Context
-        Of the server whose channels these are.
-    """
+    """Publishes messages, and repeats the last description of each stream when it is asked to."""
 
     def __init__(self) -> None:
         self.context = Context()
@@ -22,18 +16,7 @@ class Publisher:
         self._descriptions: dict[int, tuple[bytes, int]] = {}  # by the number of the channel
 
     def advertise(self, channel: records.Channel, schema: records.Schema | None) -> bool:
-        """Tell viewers of a topic; one whose type grew is told anew.
-
-        Parameters
-        ----------
-        channel : mcap.records.Channel
-        schema : mcap.records.Schema or None
-
-        Returns
-        -------
-        bool
-            Whether viewers did not know it.
-        """
+        """Tell viewers of a topic; one whose type grew is told anew."""
         known = self._channels.get(channel.topic)
         if known is not None:
             if _is_of(known, channel, schema):
@@ -50,15 +33,7 @@ class Publisher:
         return True
 
     def publish(self, messages: RawMessages, row: int) -> None:
-        """Send a message to those who subscribed to its topic.
-
-        Parameters
-        ----------
-        messages : RawMessages
-            Of its channel.
-        row : int
-            Its place among them.
-        """
+        """Send a message to those who subscribed to its topic."""
         self.advertise(messages.channel, messages.schema)
         channel = self._channels[messages.channel.topic]
         describes = messages.schema is not None and messages.schema.name == STREAM_INFO
@@ -69,15 +44,7 @@ class Publisher:
             channel.log(payload, log_time=time)
 
     def repeat(self, number: int, topic: str) -> None:
-        """Send the last description of a stream again, for one who came after it.
-
-        Parameters
-        ----------
-        number : int
-            Of the channel.
-        topic : str
-            Its topic.
-        """
+        """Send the last description of a stream again, for one who came after it."""
         last = self._descriptions.get(number)
         channel = self._channels.get(topic)
         if last is not None and channel is not None:

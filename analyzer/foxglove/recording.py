@@ -25,19 +25,7 @@ ChannelType = tuple[records.Channel, records.Schema | None]
 def channels_of(log: Path) -> list[ChannelType]:
     """List the channels of a log with their schemas.
 
-    Parameters
-    ----------
-    log : Path
-        It may be unfinished.
-
-    Returns
-    -------
-    list of (mcap.records.Channel, mcap.records.Schema or None)
-
-    Raises
-    ------
-    LogError
-        If it cannot be read, is not an MCAP file, or is damaged.
+    Raise `LogError` if it cannot be read, is not an MCAP file, or is damaged.
     """
     with LogFile(log) as file:
         read_definitions(file)
@@ -49,19 +37,8 @@ class Recording:
 
     Parameters
     ----------
-    logs : sequence of Path
-        Of one or more microphones, with their layers.
     start, end : int or None
         Nanoseconds of UTC: from `start` on, before `end`; None for all there is.
-    damaged : callable
-        Told the error of a log that cannot be read, which is passed over from there on.
-
-    Attributes
-    ----------
-    start, end : int
-        Nanoseconds of UTC.
-    channels : dict of str to (mcap.records.Channel, mcap.records.Schema or None)
-        By topic, as the first log has it.
 
     Raises
     ------
@@ -106,11 +83,6 @@ class Recording:
     def messages(self, start: int) -> Generator[list[RawMessages], None, None]:
         """Read the messages from a moment on.
 
-        Parameters
-        ----------
-        start : int
-            Nanoseconds of UTC.
-
         Yields
         ------
         list of RawMessages
@@ -125,11 +97,6 @@ class Recording:
 
     def before(self, moment: int) -> list[tuple[RawMessages, int]]:
         """Read what is known at a moment.
-
-        Parameters
-        ----------
-        moment : int
-            Nanoseconds of UTC.
 
         Returns
         -------

@@ -51,26 +51,7 @@ def serve(
     publisher: Publisher,
     player: Player | None = None,
 ) -> Iterator[WebSocketServer]:
-    """Let viewers connect that may look.
-
-    Parameters
-    ----------
-    listener : socket.socket
-        Where they connect; closed at the end.
-    admission : Admission
-        Who may look.
-    refused : callable
-        Told why somebody was refused, in a thread of its own.
-    publisher : Publisher
-        Of what they see.
-    player : Player, optional
-        Of a recording; without one, what is published is live.
-
-    Yields
-    ------
-    WebSocketServer
-        Behind the gate. It takes nothing from viewers but their wish what to see.
-    """
+    """Let viewers connect that may look."""
     logging.getLogger("foxglove").addHandler(logging.NullHandler())  # it tells who hung up
     address = hidden_address()
     server = foxglove.start_server(

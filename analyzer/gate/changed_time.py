@@ -30,10 +30,6 @@ class ChangedTime:
     spans : Events
         In the order of time; the label is the row of the first model's class in `changes` times
         their number, and the column of the second one's.
-    changes : Changes
-        As of `Evidence`.
-    losses : list of str
-        Logs and layers that cannot be used, and why.
     """
 
     spans: Events
@@ -52,11 +48,6 @@ def find_changed_time(
 
     Parameters
     ----------
-    before, after : Model
-        Of the same feature set.
-    logs : sequence of RecentLog
-    microphone : str
-        Whose sound is labelled.
     progress : callable, optional
         Is told the share of the sound that is done, 0 to 1.
 

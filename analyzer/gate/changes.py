@@ -34,7 +34,6 @@ class Changes:
 
     Attributes
     ----------
-    classes : sequence of str
     minutes : np.ndarray [shape=(C, C)], float64
         That have the class of the row in the first labelling and that of the column in the second.
     each : str, optional
@@ -81,13 +80,10 @@ def changes_of_frames(
 
     Parameters
     ----------
-    classes : sequence of str
     before, after : np.ndarray [shape=(n,)], int
         Indices of the classes of the same frames in both labellings.
     minutes : np.ndarray [shape=(n,)], float64
         That each frame stands for.
-    each : str, optional
-        As of `Changes`.
     """
     counts = np.bincount(before * len(classes) + after, minutes, len(classes) ** 2)
     table = counts.reshape(len(classes), len(classes)).astype(np.float64)

@@ -44,8 +44,6 @@ class Right(NamedTuple):
 
     Attributes
     ----------
-    sounds : int
-        A model that lacks the class of one is wrong about it.
     before, after : int
         Right in the first model, in the second.
     gained, lost : int
@@ -59,12 +57,7 @@ class Right(NamedTuple):
     lost: int = 0
 
     def plus(self, other: "Right") -> "Right":
-        """Return the sums.
-
-        Parameters
-        ----------
-        other : Right
-        """
+        """Return the sums."""
         return Right(*(a + b for a, b in zip(self, other, strict=True)))
 
 
@@ -77,8 +70,6 @@ class Evidence:
 
     Attributes
     ----------
-    minutes : float
-        Of the time that both have labelled.
     recorded : float
         Minutes that there are in all.
     changes : Changes
@@ -88,8 +79,6 @@ class Evidence:
     random, marks : Right
         Sounds of the minutes that were drawn at random; of other marks that neither has learned
         from.
-    losses : list of str
-        Logs and layers that cannot be used, and why.
     quiet : Right
         The silences of the minutes that were drawn at random.
     taught : frozenset of str
@@ -123,7 +112,6 @@ def gather_evidence(
     ----------
     before, after : Model
         Of the same feature set; the second would take the place of the first.
-    logs : sequence of RecentLog
     progress : callable, optional
         Is told the share of the sound that is done, 0 to 1.
 
@@ -173,16 +161,7 @@ def gather_evidence(
 def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> Right:
     """Run two models over the sounds of the minutes that were drawn at random alone.
 
-    Parameters
-    ----------
-    before, after : Model
-        Of the same feature set.
-    logs : sequence of RecentLog
-
-    Raises
-    ------
-    ModelError
-        As `gather_evidence`.
+    Raise `ModelError` as `gather_evidence`.
     """
     losses: list[str] = []
     known = known_sounds(logs, losses)

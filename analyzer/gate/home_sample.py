@@ -27,14 +27,7 @@ KnownSounds = list[tuple[RecentLog, list[Sound]]]
 
 
 def known_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
-    """Read the sounds of each log whose labels are known.
-
-    Parameters
-    ----------
-    logs : sequence of RecentLog
-    losses : list of str
-        Why some logs are left out is appended.
-    """
+    """Read the sounds of each log whose labels are known."""
     known, paths = [], [log.path for log in logs]
     for place, log in enumerate(logs, 1):
         try:
@@ -45,14 +38,7 @@ def known_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
 
 
 def learned_by(before: Model, after: Model, known: KnownSounds) -> Spans:
-    """Return the time that one of two models has learned from.
-
-    Parameters
-    ----------
-    before, after : Model
-    known : list of (RecentLog, list of Sound)
-        As `known_sounds` returns them.
-    """
+    """Return the time that one of two models has learned from."""
     chosen = [(s.start, s.end) for _, sounds in known for s in sounds if not s.random]
     marked = spans_of(chosen)
     both = [learned_time(model, marked) for model in (before, after)]
@@ -61,14 +47,7 @@ def learned_by(before: Model, after: Model, known: KnownSounds) -> Spans:
 
 
 def unlearned_sample(logs: Sequence[RecentLog], learned: Spans) -> list[WeightedPart]:
-    """Choose parts of the time that no model has learned from.
-
-    Parameters
-    ----------
-    logs : sequence of RecentLog
-    learned : Spans
-        As `learned_by` returns them.
-    """
+    """Choose parts of the time that no model has learned from."""
     return choose(unlearned_time(logs, learned), sounding_time(logs))
 
 
@@ -79,10 +58,6 @@ def label_parts(
 
     Parameters
     ----------
-    models : TwoModels
-    parts : sequence of WeightedPart
-    losses : list of str
-        Why a part cannot be read is appended.
     progress : callable
         Is told the share of the parts that is done, 0 to 1.
     """
@@ -103,11 +78,6 @@ def changes_of_sample(
 
     Parameters
     ----------
-    classes : sequence of str
-    frames : LabelledFrames
-        Of the sample.
-    logs : sequence of RecentLog
-        That the sample is of.
     sure : float, optional
         Probability: only frames count of which the first model is as sure.
     """

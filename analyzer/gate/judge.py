@@ -27,7 +27,6 @@ class Verdict:
 
     Attributes
     ----------
-    judgement : Judgement
     model, champion : str
         Names; that of the champion is empty if nothing labels yet.
     evidence : Evidence or None
@@ -49,9 +48,6 @@ def judge(
     ----------
     folder : Path
         Of the model; its champion labels now, or else the model that labelled the latest logs.
-    model : Model
-    home : sequence of Path
-        Folders of the home's logs; need not exist.
     progress : callable, optional
         Is told the share that is done, 0 to 1.
 
@@ -84,12 +80,7 @@ def judge(
 
 
 def other_features(champion: Model, model: Model) -> str:
-    """Say that two models cannot be compared, if they are of different feature sets.
-
-    Parameters
-    ----------
-    champion, model : Model
-    """
+    """Say that two models cannot be compared, if they are of different feature sets."""
     mine, theirs = (one.description.feature_set for one in (model, champion))
     if mine == theirs:
         return ""
@@ -107,8 +98,6 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
     home : sequence of Path
         Folders of logs, the latest of which it else has labelled; of several such models the one
         that the model was adapted from goes first.
-    model : Model
-        The one that is judged.
 
     Returns
     -------
@@ -166,18 +155,7 @@ def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgemen
     It does if the model labels now, or was compared with the model that does. A refusal does not:
     there may be more to judge by since.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the model.
-    model : Model
-    home : sequence of Path
-        As of `judge`.
-
-    Raises
-    ------
-    ModelError
-        As `find_champion`.
+    Raise `ModelError` as `find_champion`.
     """
     judgement = read_judgement(folder, model.sha256)
     if judgement is None or not judgement.may_label:

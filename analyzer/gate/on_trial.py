@@ -32,17 +32,8 @@ class Trial:
 
     Attributes
     ----------
-    champion, candidate : str
-        Names of the models.
-    candidate_sha256 : str
-    minutes : float
-        In which both labelled.
-    changes : Changes
-        From the champion's labels to the candidate's.
     random, marks : Right
         Known sounds of the minutes that were drawn at random, and other marks.
-    losses : list of str
-        What could not be read, and why.
     quiet : Right
         The silences of the minutes that were drawn at random.
     """
@@ -61,20 +52,8 @@ class Trial:
 def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> Trial:
     """Compare the latest candidate with the champion beside which it labelled last.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        Logs, or folders of logs.
-    microphone : str, optional
-        Needed if there are several.
-
-    Raises
-    ------
-    DataError
-        If no candidate labelled in these logs, or both models not long enough for a segment, or
-        there are several microphones.
-    LogError
-        If there is no log.
+    Raise `DataError` if no candidate labelled in these logs, or both models not long enough for
+    a segment, or there are several microphones. Raise `LogError` if there is no log.
     """
     losses: list[str] = []
     records = list(_records(folders, losses))
@@ -122,10 +101,6 @@ def gain_interval(right: Right) -> tuple[float, float]:
 
     Of the sounds on which one model alone is right; by a beta distribution with the prior of
     Jeffreys. 0.5 is no difference.
-
-    Parameters
-    ----------
-    right : Right
     """
     low, high = (beta_quantile(right.gained + 0.5, right.lost + 0.5, share) for share in _ENDS)
     return low, high

@@ -54,13 +54,7 @@ class WeightedPart(NamedTuple):
 
 
 def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
-    """Find the logs of the last two weeks of a home, in the order of time.
-
-    Parameters
-    ----------
-    folders : iterable of Path
-        Logs, or folders of logs. What cannot be read is left out.
-    """
+    """Find the logs of the last two weeks of a home, in the order of time."""
     try:
         entries = find_home_logs(folders).between()
     except LogError:  # no log at all
@@ -77,13 +71,7 @@ def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
 
 
 def sounding_time(logs: Sequence[RecentLog]) -> Spans:
-    """Return when something else than silence was labelled by who recorded the logs.
-
-    Parameters
-    ----------
-    logs : sequence of RecentLog
-        What cannot be read is left out.
-    """
+    """Return when something else than silence was labelled by who recorded the logs."""
     starts, ends = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for log in logs:
         with suppress(LogError):
@@ -101,7 +89,6 @@ def learned_time(model: Model, marked: Spans) -> Spans:
 
     Parameters
     ----------
-    model : Model
     marked : Spans
         Marks of the home, from all of which an adapted model that says no time is taken to have
         learned.
@@ -114,13 +101,7 @@ def learned_time(model: Model, marked: Spans) -> Spans:
 
 
 def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[Part]:
-    """Return the time of logs that nothing was learned from, in the order of the logs.
-
-    Parameters
-    ----------
-    logs : sequence of RecentLog
-    learned : Spans
-    """
+    """Return the time of logs that nothing was learned from, in the order of the logs."""
     parts = []
     for log in logs:
         whole = Spans(np.array([log.start]), np.array([log.end]))
@@ -131,21 +112,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[Part]:
 
 
 def choose(parts: Sequence[Part], sounding: Spans, seed: int = _SEED) -> list[WeightedPart]:
-    """Choose parts of the time to judge by: 45 minutes with sound at most, and 32 without.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        In the order of time.
-    sounding : Spans
-        Where something was heard; it is a small part of the time of many homes.
-    seed : int, optional
-        Of what is drawn.
-
-    Returns
-    -------
-    list of WeightedPart
-    """
+    """Choose parts of the time to judge by: 45 minutes with sound at most, and 32 without."""
     near = joined(sounding.starts - _AROUND, sounding.ends + _AROUND, _AROUND)
     loud: list[Part] = []
     quiet: list[Part] = []
@@ -166,12 +133,8 @@ def sample(parts: Sequence[Part], count: int, longest: int, seed: int = _SEED) -
 
     Parameters
     ----------
-    parts : sequence of Part
-        In the order of time.
-    count : int
     longest : int
         Nanoseconds of each; one ends earlier where its part does.
-    seed : int, optional
     """
     lengths = np.array([part.end - part.start for part in parts], np.int64)
     total = int(lengths.sum())

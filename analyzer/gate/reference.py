@@ -28,12 +28,8 @@ class Sound(NamedTuple):
 
     Attributes
     ----------
-    start, end : int
-        Nanoseconds of UTC.
-    label : str
     random : bool
         Whether it is of time that was drawn at random, and not chosen.
-    microphone : str
     """
 
     start: int
@@ -45,12 +41,6 @@ class Sound(NamedTuple):
 
 def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
     """Return the sounds of a log whose labels are known.
-
-    Parameters
-    ----------
-    log : Path
-    following : sequence of Path, optional
-        The logs after it, in the order of time: what goes on in the next one is labelled there.
 
     Returns
     -------
@@ -76,10 +66,6 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
 
 def left_alone(log: Path) -> list[Sound]:
     """Return the sounds of a log that a person looked at, not by chance, and did not mark.
-
-    Parameters
-    ----------
-    log : Path
 
     Returns
     -------
@@ -146,13 +132,6 @@ def _inside(mark: Mark, span: ReviewedSpan) -> bool:
 
 
 def spans_of(times: Sequence[tuple[int, int]], pause: int = 0) -> Spans:
-    """Join spans of time that overlap or are no more than a pause apart.
-
-    Parameters
-    ----------
-    times : sequence of (int, int)
-        Start and end of each, in any order.
-    pause : int, optional
-    """
+    """Join spans of time that overlap or are no more than a pause apart."""
     array = np.array(times, np.int64).reshape(-1, 2)
     return joined(array[:, 0], array[:, 1], pause)

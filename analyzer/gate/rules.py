@@ -29,12 +29,6 @@ _MARKS_ALONE = 3  # that say a class was wrong, where no sound of that class is 
 def damages(evidence: Evidence, champion: str) -> list[str]:
     """Say what a model would spoil.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    champion : str
-        Name of the model that labels now.
-
     Returns
     -------
     list of str
@@ -76,8 +70,6 @@ def less_right(right: Right, name: str) -> str:
     ----------
     right : Right
         Of the sounds of minutes that were drawn at random.
-    name : str
-        Of the first model.
     """
     return (
         f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "

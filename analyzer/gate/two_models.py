@@ -63,16 +63,10 @@ def joined_frames(several: Sequence[LabelledFrames]) -> LabelledFrames:
 class TwoModels:
     """Two models of the same feature set, ready to label.
 
-    Parameters
-    ----------
-    before, after : Model
-
     Attributes
     ----------
     classes : list of str
         Those of the first model, then others of the second.
-    before : int
-        Number of classes of the first model.
     """
 
     def __init__(self, before: Model, after: Model) -> None:
@@ -86,21 +80,7 @@ class TwoModels:
     def label(self, part: Part, weight: float = 1.0) -> LabelledFrames:
         """Label a part of a log with both models, each as a recorder would.
 
-        Parameters
-        ----------
-        part : Part
-        weight : float, optional
-            Of its frames.
-
-        Returns
-        -------
-        LabelledFrames
-            Those that both models label, with indices of `classes`: one microphone after the other.
-
-        Raises
-        ------
-        LogError
-            If the log cannot be read, or has no features of the set of the models.
+        Raise `LogError` if the log cannot be read, or has no features of the set of the models.
         """
         infos, _ = infos_for_model(part.log, self._model, part.log)
         wanted = [info for info in infos if part.microphone in {None, info.microphone}]

@@ -37,17 +37,8 @@ def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, 
 
     Parameters
     ----------
-    path : Path
-        Of the log, for the message.
-    columns : Columns
-        Messages of the channel.
     field : str
         Path of the array in the message, such as `values`.
-
-    Returns
-    -------
-    tuple of str
-        In the order of the elements.
 
     Raises
     ------

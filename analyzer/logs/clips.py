@@ -43,16 +43,9 @@ class Clip(NamedTuple):
 def clips_of(columns: Columns) -> Iterator[Clip]:
     """Yield the clips of messages, in their order.
 
-    Parameters
-    ----------
-    columns : Columns
-        Messages of type `RawAudio`, with the fields `CLIP_FIELDS`.
-
-    Raises
-    ------
-    LogError
-        If a field is missing, or if a clip is not `pcm-s16`, has fewer than 1000 or more than
-        1,000,000 samples a second, has no channel or more than 256, or ends within a sample.
+    Raise `LogError` if a field is missing, or if a clip is not `pcm-s16`, has fewer than 1000
+    or more than 1,000,000 samples a second, has no channel or more than 256, or ends within a
+    sample.
     """
     fields = (columns[path].tolist() for path in ("format", "sample_rate", "number_of_channels"))
     for start, data, form, rate, channels in zip(
@@ -79,9 +72,6 @@ def read_clips(
 
     Parameters
     ----------
-    path : Path
-    name : str
-        The topic, such as `/mic/audio`.
     start, end : int, optional
         Log times in nanoseconds of UTC: messages from `start` on, before `end`. By default there
         is no limit.
@@ -120,19 +110,7 @@ def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterato
 def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
     """Return the time of which sound was kept.
 
-    Parameters
-    ----------
-    layers : iterable of Path
-        Layers of sound.
-    name : str
-        The topic, such as `/mic/audio`.
-    start, end : int
-        In nanoseconds of UTC.
-
-    Raises
-    ------
-    LogError
-        As `read_clips`.
+    Raise `LogError` as `read_clips`.
     """
     times = [
         (clip.start, clip.end)
@@ -145,15 +123,6 @@ def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
 
 def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple[int, Float32]:
     """Return the kept sound of a span of time, with silence where none was kept.
-
-    Parameters
-    ----------
-    layers : sequence of Path
-        Layers of sound.
-    name : str
-        The topic, such as `/mic/audio`.
-    start, end : int
-        In nanoseconds of UTC.
 
     Returns
     -------

@@ -32,11 +32,6 @@ class Coverage:
     def split(self, start: int, end: int) -> list[tuple[Path, int, int]]:
         """Divide a span of time among the logs.
 
-        Parameters
-        ----------
-        start, end : int
-            Nanoseconds of UTC.
-
         Returns
         -------
         list of (Path, int, int)
@@ -58,17 +53,8 @@ class Coverage:
 def find_coverage(path: Path) -> dict[str, Coverage]:
     """Find when each microphone of a log, or of a folder of logs, was recording.
 
-    Returns
-    -------
-    dict of str to Coverage
-        By name of the microphone.
-
-    Raises
-    ------
-    DataError
-        If there are no features of a microphone.
-    LogError
-        If there is no log, or one is damaged.
+    Raise `DataError` if there are no features of a microphone. Raise `LogError` if there is no
+    log, or one is damaged.
     """
     selection = select([path])
     coverage: dict[str, Coverage] = {}

@@ -13,15 +13,7 @@ DIRECTION_FIELDS = ("header.stamp", "frame", "azimuth", "confidence")
 def directions_of(columns: Columns) -> Directions:
     """Return the directions that a log has.
 
-    Parameters
-    ----------
-    columns : Columns
-        Of the type `AudioDirection`, with `DIRECTION_FIELDS`.
-
-    Raises
-    ------
-    LogError
-        If no array has such directions.
+    Raise `LogError` if no array has such directions.
     """
     stamps, numbers, azimuths, confidences = (columns[path] for path in DIRECTION_FIELDS)
     possible = (numbers <= LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)

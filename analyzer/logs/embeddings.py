@@ -20,15 +20,7 @@ EMBEDDING_FIELDS = ("header.stamp", "frame", "frames", "values")
 def embeddings_of(columns: Columns) -> Embeddings:
     """Return the embeddings that a log has.
 
-    Parameters
-    ----------
-    columns : Columns
-        Of the type `AudioEmbedding`, with `EMBEDDING_FIELDS`.
-
-    Raises
-    ------
-    LogError
-        If no recorder writes such embeddings.
+    Raise `LogError` if no recorder writes such embeddings.
     """
     stamps, numbers, frames, values = (columns[path] for path in EMBEDDING_FIELDS)
     possible = (numbers <= LARGEST_FRAME) & (numbers % HOP_FRAMES == 0) & (frames == WINDOW_FRAMES)

@@ -38,22 +38,7 @@ class MicrophoneState(NamedTuple):
 def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
     """Yield the gaps of messages, without those of no length.
 
-    Parameters
-    ----------
-    node : str
-        Name of the recorder; the source of a gap is `<node>/<topic>`.
-    columns : Columns
-        Messages of type `AudioGap`, with the fields `header.stamp`, `duration` and `reason`.
-
-    Yields
-    ------
-    Trouble
-        In the order of the messages.
-
-    Raises
-    ------
-    LogError
-        If one of these fields is missing.
+    Raise `LogError` if one of these fields is missing.
     """
     starts, durations = columns["header.stamp"], columns["duration"]
     rows = zip(starts.tolist(), durations.tolist(), columns["reason"].tolist(), strict=True)
@@ -65,21 +50,7 @@ def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
 def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:
     """Yield the state of a microphone for each diagnostic message that is about one.
 
-    Parameters
-    ----------
-    columns : Columns
-        Messages of type `diagnostic_msgs/DiagnosticArray`, with the fields `header.stamp`,
-        `header.frame_id` (the microphone) and `status`.
-
-    Yields
-    ------
-    MicrophoneState
-        In the order of the messages, at their stamps.
-
-    Raises
-    ------
-    LogError
-        If one of these fields is missing.
+    Raise `LogError` if one of these fields is missing.
     """
     times, names = columns["header.stamp"].tolist(), columns["header.frame_id"].tolist()
     for time, name, statuses in zip(times, names, columns["status"], strict=True):
@@ -105,16 +76,9 @@ def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
 
     Parameters
     ----------
-    statuses : iterable of Status
-        In any order.
     end : int
         Nanoseconds of UTC. The last trouble of a name ends with the last status of that name, or
         here if that is earlier.
-
-    Yields
-    ------
-    Trouble
-        By name, then in the order of time.
     """
     for name, same in groupby(sorted(statuses), lambda status: status.name):
         own = list(same)
@@ -131,14 +95,6 @@ def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple
     texts : sequence of (int, str or None)
         When something was said (nanoseconds of UTC), in the order of time; None where there is
         nothing to say.
-    end : int
-        Nanoseconds of UTC.
-
-    Yields
-    ------
-    start, end : int
-        Nanoseconds of UTC.
-    text : str
     """
     changes = [(next(same)[0], text) for text, same in groupby(texts, lambda pair: pair[1])]
     ends = [*(time for time, _ in changes[1:]), end]

@@ -49,11 +49,6 @@ class HomeLogs:
             Nanoseconds of UTC: from `start` on, before `end`; None for no limit.
         layer : str
             `review` or `relabel-<model>`; empty for logs.
-
-        Returns
-        -------
-        list of HomeLog
-            In the order of time.
         """
         return [
             entry
@@ -81,18 +76,7 @@ class HomeLogs:
         return list(found)
 
     def latest_scenario_models(self, scenario: str) -> list[LabelledBy]:
-        """List the models that labelled for a scenario, each of them once.
-
-        Parameters
-        ----------
-        scenario : str
-            Its name.
-
-        Returns
-        -------
-        list of LabelledBy
-            Those of the latest log of each recorder that has the scenario.
-        """
+        """List the models that labelled for a scenario, each of them once."""
         found: dict[str, dict[LabelledBy, None]] = {}
         for record in self.records():
             own = [one for one in recorded_scenarios(record) if one.name == scenario]
@@ -120,11 +104,6 @@ class HomeLogs:
     def days(self, zone: tzinfo) -> list[date]:
         """List the days on which there are logs.
 
-        Parameters
-        ----------
-        zone : tzinfo
-            Of the home.
-
         Returns
         -------
         list of date
@@ -141,15 +120,8 @@ class HomeLogs:
 
         A day counts as whole if no more than its last minute is missing.
 
-        Parameters
-        ----------
-        zone : tzinfo
-            Of the home.
-
-        Raises
-        ------
-        LogError
-            If there are only layers, and logs that cannot be read or have no message.
+        Raise `LogError` if there are only layers, and logs that cannot be read or have no
+        message.
         """
         days = self.days(zone)
         if not days:
@@ -179,20 +151,7 @@ class HomeLogs:
 def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
     """Find the logs and layers of a home by their names; only files of other names are opened.
 
-    Parameters
-    ----------
-    paths : iterable of Path
-        Logs, or folders of logs.
-
-    Returns
-    -------
-    HomeLogs
-        Without layers of sound; its `losses` name the files that cannot be read.
-
-    Raises
-    ------
-    LogError
-        If there is no such log, or none in a folder.
+    Raise `LogError` if there is no such log, or none in a folder.
     """
     losses: list[str] = []
     entries = []
@@ -228,11 +187,8 @@ def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
 
     Parameters
     ----------
-    logs : HomeLogs
     first, last : date
         The days from `first` to `last`, both of them included.
-    zone : tzinfo
-        Of the home.
 
     Raises
     ------

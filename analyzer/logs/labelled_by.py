@@ -29,11 +29,6 @@ NO_MODEL = LabelledBy("", "")
 def models_of(log: Path) -> Mapping[str, LabelledBy]:
     """Read which models labelled the microphones of a log.
 
-    Parameters
-    ----------
-    log : Path
-        A log; or a layer, which is by one model.
-
     Returns
     -------
     mapping of str to LabelledBy
@@ -59,9 +54,6 @@ def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
 
     Parameters
     ----------
-    log : Path
-    microphone : str
-        Its name.
     scenario : str, optional
         For which it labelled; empty for the sounds of the home.
     """
@@ -73,10 +65,6 @@ def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
 
 def scenario_models(log: Path) -> Mapping[tuple[str, str], LabelledBy]:
     """Read which models labelled for the scenarios of a log.
-
-    Parameters
-    ----------
-    log : Path
 
     Returns
     -------

@@ -47,18 +47,7 @@ class Labelling:
 
 
 def overlaid(labels: Labelling, above: Labelling) -> Labelling:
-    """Lay a labelling over another one.
-
-    Parameters
-    ----------
-    labels, above : Labelling
-        In the order of time, one label at a time.
-
-    Returns
-    -------
-    Labelling
-        All of `above`, and the parts of `labels` outside of it, in the order of time.
-    """
+    """Lay a labelling over another one."""
     left, rows = remains(labels, joined(above.starts, above.ends))
     starts = np.concatenate([left.starts, above.starts])
     order = np.argsort(starts, kind="stable")
@@ -70,12 +59,7 @@ def overlaid(labels: Labelling, above: Labelling) -> Labelling:
 
 
 def unified(labels: Labelling) -> Labelling:
-    """Give each label the name of its class.
-
-    Parameters
-    ----------
-    labels : Labelling
-    """
+    """Give each label the name of its class."""
     names = {label: class_name(label) for label in set(labels.labels)}
     unique = np.array([names[label] for label in labels.labels], object)
     return replace(labels, labels=unique)
@@ -84,15 +68,7 @@ def unified(labels: Labelling) -> Labelling:
 def labelling_of(segments: Columns) -> Labelling:
     """Make a labelling of segments.
 
-    Parameters
-    ----------
-    segments : Columns
-        Messages of type `AudioSegment`, with the fields `SEGMENT_FIELDS`.
-
-    Raises
-    ------
-    LogError
-        If a field is missing, or if segments overlap.
+    Raise `LogError` if a field is missing, or if segments overlap.
     """
     segments = segments_in_order(segments)
     starts = segments["header.stamp"]
@@ -102,15 +78,7 @@ def labelling_of(segments: Columns) -> Labelling:
 def segments_in_order(segments: Columns) -> Columns:
     """Sort segments by their stamps, and leave out those without a duration.
 
-    Parameters
-    ----------
-    segments : Columns
-        Messages of type `AudioSegment`, with the fields `header.stamp` and `duration`.
-
-    Raises
-    ------
-    LogError
-        If a field is missing, or if segments overlap.
+    Raise `LogError` if a field is missing, or if segments overlap.
     """
     segments = segments.take(np.flatnonzero(segments["duration"] > 0))
     segments = segments.take(np.argsort(segments["header.stamp"], kind="stable"))
@@ -130,17 +98,8 @@ def all_classes(
 
     Parameters
     ----------
-    topic : str
-        Of the segments, for the message.
     named : iterable of sequence of str
         The names that channels of labels have for their probabilities.
-    labels : iterable of str
-        Those of the segments.
-
-    Returns
-    -------
-    tuple of str
-        Each once: the named ones first, in their order.
 
     Raises
     ------
@@ -158,11 +117,8 @@ def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
 
     Parameters
     ----------
-    topic : str
-        Of the segments, for the message.
     starts : np.ndarray [shape=(n,)], int64
         Nanoseconds of UTC, ascending.
-    labels : iterable of str
 
     Raises
     ------

@@ -57,13 +57,7 @@ class NamedLabelling(NamedTuple):
     labelling: Labelling  # in the order of time, one label at a time
 
     def called_as(self, classes: Sequence[str]) -> "NamedLabelling":
-        """Give each label the name that its class has among some classes.
-
-        Parameters
-        ----------
-        classes : sequence of str
-            A label that means exactly one of these, by another name, gets its name; others stay.
-        """
+        """Give each label the name that its class has among some classes."""
         names = translation(self.classes, classes)
         own = tuple(dict.fromkeys(names.values()))
         return NamedLabelling(self.name, own, self.labelling.called_as(classes))

@@ -67,20 +67,7 @@ def with_layers(path: Path) -> list[Path]:
 def find_with_layers(paths: Iterable[Path]) -> list[Path]:
     """List logs with the layers beside them, and all logs and layers in folders.
 
-    Parameters
-    ----------
-    paths : iterable of Path
-        Logs, or folders of logs.
-
-    Returns
-    -------
-    list of Path
-        Each file once, in the order of `paths`.
-
-    Raises
-    ------
-    LogError
-        If there is no such log, or none in a folder.
+    Raise `LogError` if there is no such log, or none in a folder.
     """
     files = (file for path in paths for each in with_layers(path) for file in find_logs(each))
     return list({file.resolve(): file for file in files}.values())
@@ -93,18 +80,9 @@ def find_timed_files(
 
     Parameters
     ----------
-    paths : iterable of Path
-        As `find_with_layers` takes them.
     start, end : int, optional
         Nanoseconds of UTC: what may speak of the time from `start` on, before `end`. None for no
         limit.
-    losses : list of str
-        Is appended to: what cannot be read, and why.
-
-    Returns
-    -------
-    list of TimedFile
-        In the order of time.
 
     Raises
     ------
@@ -145,11 +123,6 @@ def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:
     """Yield the first `hearthlog` record of each log that has one, the last log first.
 
     Layers, and logs that cannot be read, are passed over.
-
-    Parameters
-    ----------
-    logs : iterable of Path
-        In the order of time.
     """
     for path in reversed(list(logs)):
         if is_layer(path):
@@ -163,8 +136,6 @@ def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
 
     Parameters
     ----------
-    paths : iterable of Path
-        Logs, or folders of logs.
     name : str or None
         IANA name of the zone, such as `Europe/Vienna`; None for that of the latest log that names
         one, or UTC.
@@ -182,20 +153,7 @@ def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
 def find_chains(paths: Iterable[Path]) -> list[Chain]:
     """Find all logs of the nodes that wrote some logs.
 
-    Parameters
-    ----------
-    paths : iterable of Path
-        Logs, or folders of logs; layers in folders are passed over.
-
-    Returns
-    -------
-    list of Chain
-        One for each node of a home that has one of the logs.
-
-    Raises
-    ------
-    LogError
-        If there is no such log, or it is a layer.
+    Raise `LogError` if there is no such log, or it is a layer.
     """
     asked: dict[str, Path] = {}
     for path in paths:

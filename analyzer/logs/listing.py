@@ -49,16 +49,9 @@ def list_logs(folder: Path, known: Mapping[str, KnownFolder] = MappingProxyType(
 
     Parameters
     ----------
-    folder : Path
-        On this machine, or a `upath.UPath` of a store.
     known : mapping of str to KnownFolder
         By name, as in `Listing`; of this machine only. Logs of those that did not change are not
         listed.
-
-    Returns
-    -------
-    Listing
-        Of the logs that `find_logs` finds.
 
     Raises
     ------
@@ -119,10 +112,7 @@ def _list_stored(folder: Any) -> Listing:
 def size_and_time(path: Path) -> tuple[int, int]:
     """Return bytes and time of change (ns) of a file, by which a changed one is known.
 
-    Raises
-    ------
-    LogError
-        If there is no such file, or its store cannot be used.
+    Raise `LogError` if there is no such file, or its store cannot be used.
     """
     with store_errors(path):
         if is_local(path):

@@ -18,8 +18,6 @@ def home_zone(name: str | None, records: Iterable[Mapping[str, str]] = ()) -> tz
 
     Parameters
     ----------
-    name : str or None
-        Its IANA name, where the user gives it.
     records : iterable of mapping of str to str
         The `hearthlog` records of logs; the first that names a zone counts. Without one it is UTC.
 
@@ -60,17 +58,8 @@ def at_hour(day: date, hour: int, zone: tzinfo) -> int:
 
     Parameters
     ----------
-    day : date
-        In the time of the home.
     hour : int
         0 to 23.
-    zone : tzinfo
-        Of the home.
-
-    Returns
-    -------
-    int
-        Nanoseconds of UTC.
     """
     local = datetime(day.year, day.month, day.day, hour, tzinfo=zone)
     return int(local.timestamp()) * NANOSECONDS
@@ -83,8 +72,6 @@ def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
     ----------
     nanoseconds : int
         Of UTC.
-    zone : tzinfo
-        Of the home.
 
     Returns
     -------

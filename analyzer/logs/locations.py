@@ -28,21 +28,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 def location(text: str) -> Path:
     """Read the name of a log or a folder, on this machine or in a store that fsspec knows.
 
-    Parameters
-    ----------
-    text : str
-        A path, or a URL as `s3://bucket/home`. Credentials, endpoints and other options of a store
-        are those of its package and of the configuration of fsspec.
-
-    Returns
-    -------
-    Path
-        Of a URL, a `upath.UPath`. A `file://` URL is a plain path.
-
-    Raises
-    ------
-    LogError
-        If there is no such kind of store, or its package is not installed.
+    Raise `LogError` if there is no such kind of store, or its package is not installed.
     """
     url = _URL.fullmatch(text)
     if url is None:

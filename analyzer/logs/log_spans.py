@@ -30,15 +30,7 @@ class _Known(NamedTuple):
 
 
 class LogSpans:
-    """The spans of many logs: a path costs more than all else here, so few are made.
-
-    Parameters
-    ----------
-    opened : sequence of (int, int, Path)
-        Logs that were asked, each once.
-    known : sequence of _Known
-        Logs that were not.
-    """
+    """The spans of many logs: a path costs more than all else here, so few are made."""
 
     def __init__(self, opened: Sequence[LogSpan], known: Sequence[_Known]) -> None:
         self._opened = opened
@@ -92,8 +84,6 @@ def find_spans(
 
     Parameters
     ----------
-    paths : iterable of Path
-        Logs, or folders of logs.
     span_of : callable
         Returns first and last log time of a log of which no catalogue knows them as it is now; None
         leaves it out.

@@ -18,13 +18,6 @@ _MOST = 4  # changes that are named
 def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
     """Say when a home began to be heard with a network, with another one, or without any.
 
-    Parameters
-    ----------
-    logs : iterable of HomeLog
-        In the order of time.
-    zone : tzinfo
-        Of the home.
-
     Returns
     -------
     list of str

@@ -97,12 +97,6 @@ class RecorderInfo:
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
     """Read what a log says of its recorder, for each of its microphones.
 
-    Parameters
-    ----------
-    path : Path
-    kind : str
-        A key of `TYPES`, `features` or `audio`: the topic by which microphones are known.
-
     Returns
     -------
     list of RecorderInfo
@@ -179,15 +173,7 @@ def _set_of_names(file: LogFile, name: str) -> str:
 
 
 def embedding_source(file: LogFile, microphone: str) -> EmbeddingSource | None:
-    """Return of which network and projection a log has embeddings; None if it has none.
-
-    Parameters
-    ----------
-    file : LogFile
-        Open.
-    microphone : str
-        Its name.
-    """
+    """Return of which network and projection a log has embeddings; None if it has none."""
     name = topic(microphone, "embedding")
     channels = (channel for channel in file.channels.values() if channel.topic == name)
     return next((EmbeddingSource.from_metadata(channel.metadata) for channel in channels), None)
@@ -200,14 +186,7 @@ def _has_topic(file: LogFile, name: str) -> bool:
 def first_embedding_source(path: Path) -> EmbeddingSource | None:
     """Read of which network and projection the embeddings of a log are; None if it has none.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    LogError
-        If it is damaged.
+    Raise `LogError` if it is damaged.
     """
     with LogFile(path) as file:
         if not file.channels:
@@ -219,15 +198,7 @@ def first_embedding_source(path: Path) -> EmbeddingSource | None:
 def attachments_of(file: LogFile) -> list[Attachment]:
     """Read the attachments of a log, in the order of its index.
 
-    Parameters
-    ----------
-    file : LogFile
-        Open.
-
-    Raises
-    ------
-    LogError
-        If one is too large, or damaged.
+    Raise `LogError` if one is too large, or damaged.
     """
     locations = [each for each in file.record_locations if each.opcode == Opcode.ATTACHMENT]
     attached = [r for r in map(file.record, locations) if isinstance(r, records.Attachment)]
@@ -235,13 +206,7 @@ def attachments_of(file: LogFile) -> list[Attachment]:
 
 
 def models_for(features: str) -> str:
-    """Say which models a feature set needs, as advice in a message.
-
-    Parameters
-    ----------
-    features : str
-        Name of the set.
-    """
+    """Say which models a feature set needs, as advice in a message."""
     method = _METHODS.get(features)
     how = f"; `hearthlog train --method {method}` learns one" if method else ""
     return f"take a model for {features[:64]}{how}"
@@ -250,10 +215,8 @@ def models_for(features: str) -> str:
 def check_model(origin: RecorderInfo, model: Model) -> None:
     """Check that a model is for the features of a log.
 
-    Raises
-    ------
-    LogError
-        If it is for others, or the log's are not installed, or installed in another version.
+    Raise `LogError` if it is for others, or the log's are not installed, or installed in
+    another version.
     """
     features, wanted = features_of(origin), model.description.feature_set
     if features.name != wanted:
@@ -266,10 +229,8 @@ def check_model(origin: RecorderInfo, model: Model) -> None:
 def features_of(origin: RecorderInfo) -> FeatureSet:
     """Return the feature set of a log; `auros21` where the log names none, as there was no other.
 
-    Raises
-    ------
-    LogError
-        If the set is not installed, cannot be imported, or is installed in another version.
+    Raise `LogError` if the set is not installed, cannot be imported, or is installed in another
+    version.
     """
     name = origin.feature_set or AUROS21.name
     if name == _UNNAMED:
@@ -296,15 +257,7 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
 
 
 def microphones_of(file: LogFile, kind: str) -> set[str]:
-    """Return the names of the microphones that have a topic in a log.
-
-    Parameters
-    ----------
-    file : LogFile
-        Open.
-    kind : str
-        A key of `TYPES`.
-    """
+    """Return the names of the microphones that have a topic in a log."""
     names = set()
     for channel in file.channels.values():
         schema = file.schemas.get(channel.schema_id)
@@ -317,19 +270,7 @@ def microphones_of(file: LogFile, kind: str) -> set[str]:
 def first_message(file: LogFile, name: str, kind: str) -> dict[str, Any]:
     """Return some fields of the first message of a topic; nothing if it has none.
 
-    Parameters
-    ----------
-    file : LogFile
-        Open.
-    name : str
-        Of the topic.
-    kind : str
-        Its type: that of features, or of the info of a microphone.
-
-    Raises
-    ------
-    LogError
-        If the message is damaged.
+    Raise `LogError` if the message is damaged.
     """
     ids = {i for i, channel in file.channels.items() if channel.topic == name}
     chunks = file.with_channels(file.chunks, ids)

@@ -315,14 +315,8 @@ def identity(channel: Channel, schema: Schema | None) -> Hashable:
 
     Parameters
     ----------
-    channel : Channel
     schema : Schema or None
         Of the channel; None if it has none.
-
-    Returns
-    -------
-    hashable
-        Of topic, encoding, metadata and definition.
     """
     definition = None if schema is None else (schema.name, schema.encoding, schema.data)
     metadata = frozenset(channel.metadata.items())

@@ -36,10 +36,6 @@ class SpanIndex:
 
     Parameters
     ----------
-    folders : mapping of str to KnownFolder
-        By name, in the order of their logs.
-    spans : np.ndarray, of dtype `SPAN`
-        Of each log.
     names : bytes
         Names of the logs, each with a zero behind it.
     """
@@ -96,18 +92,7 @@ def _ends(names: bytes) -> Int64:
 def write_index(folder: Path, listing: Listing, spans: NDArray[np.void]) -> None:
     """Write the index of a catalogue, beside it.
 
-    Parameters
-    ----------
-    folder : Path
-    listing : Listing
-        Of all that is in the folder.
-    spans : np.ndarray, of dtype `SPAN`
-        Of the logs of the listing.
-
-    Raises
-    ------
-    LogError
-        If it cannot be written.
+    Raise `LogError` if it cannot be written.
     """
     logs_of: dict[str, list[int]] = {name: [] for name in listing.folders}
     names = []

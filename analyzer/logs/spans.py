@@ -71,8 +71,6 @@ def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
         Nanoseconds; the starts ascend.
-    pause : int
-        Nanoseconds.
 
     Returns
     -------
@@ -122,17 +120,8 @@ def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Ro
 def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
     """Cut spans to the parts that lie in other spans.
 
-    Parameters
-    ----------
-    a : Timed
-        They may overlap.
-    b : Spans
-        They do not overlap.
-
     Returns
     -------
-    spans : Spans
-        What is in both, in the order of `a`.
     of_a, of_b : np.ndarray [shape=(n,)], intp
         The rows of `a` and of `b` that each piece lies in.
     """
@@ -144,24 +133,12 @@ def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
 
 
 def common(a: Spans, b: Spans) -> Spans:
-    """Return the time that is in both.
-
-    Parameters
-    ----------
-    a, b : Spans
-    """
+    """Return the time that is in both."""
     return pieces(a, b)[0]
 
 
 def cut(spans: Spans, start: int, end: int) -> Spans:
-    """Return the time of spans between two times, without a look at all the other spans.
-
-    Parameters
-    ----------
-    spans : Spans
-    start, end : int
-        Nanoseconds of UTC.
-    """
+    """Return the time of spans between two times, without a look at all the other spans."""
     first = np.searchsorted(spans.ends, start, side="right")
     last = max(np.searchsorted(spans.starts, end), first)
     rows = slice(first, last)
@@ -169,12 +146,7 @@ def cut(spans: Spans, start: int, end: int) -> Spans:
 
 
 def without(a: Spans, b: Spans) -> Spans:
-    """Return the time that is in the first spans and not in the second.
-
-    Parameters
-    ----------
-    a, b : Spans
-    """
+    """Return the time that is in the first spans and not in the second."""
     return remains(a, b)[0]
 
 
@@ -185,8 +157,6 @@ def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
     ----------
     a : Timed
         Ascending by their starts and by their ends.
-    b : Spans
-        They do not overlap.
 
     Returns
     -------
@@ -209,8 +179,6 @@ def rows_at(spans: Timed, times: Int64) -> Int64:
 
     Parameters
     ----------
-    spans : Timed
-        They do not overlap.
     times : np.ndarray [shape=(n,)], int64
         Nanoseconds of UTC, in any order.
 
@@ -235,11 +203,6 @@ def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
     every : int, optional
         Nanoseconds: cut the time also at the multiples of this, where it is not 0; every layer
         then has a span.
-
-    Returns
-    -------
-    Overlay
-        From the first edge to the last, in the order of time; `rows` has a row for each layer.
     """
     edges = [times for spans in layers for times in (spans.starts, spans.ends)]
     if every:
@@ -255,7 +218,6 @@ def lengths(spans: Spans, edges: Int64) -> Int64:
 
     Parameters
     ----------
-    spans : Spans
     edges : np.ndarray [shape=(n + 1,)], int64
         Nanoseconds of UTC, ascending.
 

@@ -29,18 +29,7 @@ _TIMES = 16  # bytes of an attachment before its name
 
 
 def summarise(paths: Iterable[Path]) -> Summary:
-    """Count what is in some logs.
-
-    Parameters
-    ----------
-    paths : iterable of Path
-        Logs and layers, not folders.
-
-    Returns
-    -------
-    Summary
-        Of all of them; `damaged` names those that cannot be read.
-    """
+    """Count what is in some logs."""
     total = Summary()
     for path in paths:
         try:

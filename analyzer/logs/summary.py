@@ -35,8 +35,6 @@ class TopicSummary:
 
         Parameters
         ----------
-        count : int
-            How many there are.
         size : int or None
             Bytes of their payloads before compression; None if that is not known.
         span : (int, int) or None

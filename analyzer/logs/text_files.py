@@ -19,25 +19,13 @@ _LONGEST = 1 << 20  # characters of a record: fields take fifty times as much me
 
 
 def disarmed(text: str) -> str:
-    """Put an apostrophe before a text that a spreadsheet would take for a formula.
-
-    Parameters
-    ----------
-    text : str
-        A field of CSV.
-    """
+    """Put an apostrophe before a text that a spreadsheet would take for a formula."""
     is_formula = re.match(FORMULA, text) and not re.fullmatch(NUMBER, text)
     return f"'{text}" if is_formula else text
 
 
 def without_disarming(text: str) -> str:
-    """Return a text as it was before `disarmed`.
-
-    Parameters
-    ----------
-    text : str
-        A field of CSV.
-    """
+    """Return a text as it was before `disarmed`."""
     return text[1:] if text.startswith("'") and re.match(FORMULA, text) else text
 
 
@@ -46,9 +34,6 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
 
     Parameters
     ----------
-    path : Path
-    what : str
-        What the file should be, such as `manifest`, for the message.
     size_limit : int
         Bytes that the file may have at most.
 
@@ -69,17 +54,7 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
 def numbered_lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
     """Yield the lines that are not blank, and their numbers from 1.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for the message.
-    text : str
-        All of it.
-
-    Raises
-    ------
-    DataError
-        If the text has more than a million lines.
+    Raise `DataError` if the text has more than a million lines.
     """
     _check_lines(path, text)
     for number, line in enumerate(text.split("\n"), 1):
@@ -92,10 +67,6 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
 
     Parameters
     ----------
-    path : Path
-        Of the file, for the message.
-    text : str
-        All of it.
     delimiter : str
         Between fields.
 
@@ -103,8 +74,6 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
     ------
     line : int
         The line in which the record begins, from 1.
-    record : list of str
-        Its fields.
 
     Raises
     ------
@@ -124,21 +93,13 @@ def csv_rows(
 
     Parameters
     ----------
-    path : Path
-        Of the file, for the message.
-    text : str
-        All of it.
     delimiter : str
         Between fields.
-    quoted : bool
-        Whether fields may be in quotation marks.
 
     Yields
     ------
     line : int
         The line in which the record begins, from 1.
-    record : list of str or csv.Error
-        Its fields; after an error, the next record begins in the next line.
 
     Raises
     ------

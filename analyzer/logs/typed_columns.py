@@ -29,18 +29,9 @@ def decode_types(
 
     Parameters
     ----------
-    path : Path
-        The log they are from.
-    batch : iterable of RawMessages
-        Messages, still encoded; iterated once for each type.
     types : mapping of str to collection of str
         Paths of the fields to decode, by name of the type; `is_compatible` says which fields a
         type may have.
-
-    Returns
-    -------
-    list of Columns
-        By type in the order of `types`; messages of one topic and definition are together.
 
     Raises
     ------
@@ -95,13 +86,8 @@ def is_compatible(
 
     Parameters
     ----------
-    channel : Channel
     schema : Schema or None
         Of the channel; None if it has none.
-    type_ : str
-        Name of a message type, such as those in `message_types`.
-    fields : collection of str
-        Paths of the fields that the reader needs.
 
     Returns
     -------

@@ -64,18 +64,8 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
 
     Parameters
     ----------
-    home : Path
-        Folder of the training set; the log goes to its folder `enrolled`.
-    label : str
-        Class of the sound: lower-case letters, digits and `_`.
-    audio : Path
     seconds : float, optional
         How much of it; at least 1. All of it by default.
-
-    Returns
-    -------
-    list of Enrolled
-        One, or two where the times cross midnight.
 
     Raises
     ------
@@ -113,21 +103,10 @@ def enrol_microphone(
 
     Parameters
     ----------
-    home : Path
-        Folder of the training set; the log goes to its folder `enrolled`.
-    label : str
-        Class of the sound: lower-case letters, digits and `_`.
     device : str
         As `hearthlog devices` lists it; empty for the default one.
     seconds : float
         How long to listen; at least 1.
-    listening : callable
-        Is called without arguments when the microphone is open.
-
-    Returns
-    -------
-    list of Enrolled
-        One, or two where the times cross midnight.
 
     Raises
     ------
@@ -159,11 +138,6 @@ def enrol_log(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    home : Path
-        Folder of the training set; the log goes to its folder `enrolled`.
-    label : str
-        Class of the sound: lower-case letters, digits and `_`.
-    log : Path
     start, end : int
         Nanoseconds of UTC: the frames from `start` on, before `end`.
     microphone : str, optional

@@ -17,18 +17,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 
 class ImportOptions(NamedTuple):
-    """How a label file is read.
-
-    Attributes
-    ----------
-    microphone : str, optional
-        That all labels are of, whatever the file says.
-    class_map : mapping of str to str, optional
-        As `class_names.read_class_map` returns it.
-    choice : Choice
-    strict : bool
-        Whether a label that cannot be taken is an error.
-    """
+    """How a label file is read."""
 
     microphone: str | None = None
     class_map: Mapping[str, str] | None = None
@@ -45,16 +34,7 @@ class Folded(NamedTuple):
 
 
 class Imported(NamedTuple):
-    """The marks of a label file.
-
-    Attributes
-    ----------
-    by_log : dict of Path to list of Mark
-        What crosses from one log to the next is split.
-    left_out : LeftOut
-    moved : mapping of str to int
-        How many labels the file says are of another microphone of the logs than they are taken as.
-    """
+    """The marks of a label file."""
 
     by_log: dict[Path, list[Mark]]
     left_out: LeftOut
@@ -71,11 +51,6 @@ def import_labels(
 
     Parameters
     ----------
-    path : Path
-        As of `label_files.read_rows`.
-    coverage : mapping of str to Coverage
-        By microphone.
-    options : ImportOptions
     agree : callable
         Is called once if labels are taken as names of classes that are only spelt like them; raises
         if that is not wanted.
@@ -106,15 +81,6 @@ def import_labels(
 
 def read_lines(path: Path, coverage: Mapping[str, Coverage], microphone: str) -> list[PlacedMark]:
     """Read a label file whose labels may overlap, and may lie where nothing was recorded.
-
-    Parameters
-    ----------
-    path : Path
-        As of `label_files.read_rows`.
-    coverage : mapping of str to Coverage
-        By microphone.
-    microphone : str
-        The microphone of labels that do not name theirs.
 
     Returns
     -------

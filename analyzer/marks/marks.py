@@ -74,15 +74,10 @@ class ReviewedSpan(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
-    start, end : int
-        In nanoseconds of UTC.
     reviewer : str
         Empty if unknown.
     made : int
         When it was looked at, in nanoseconds of UTC; 0 if unknown.
-    corrects : str
-        The labelling that was looked at: `live`, or the name of a model.
     chosen : str
         How the span was chosen: `person`, `queue`, or `random`. What was drawn at random is kept to
         measure how right labels are, and not learned from.
@@ -98,15 +93,7 @@ class ReviewedSpan(NamedTuple):
 
 
 class Reviewed(NamedTuple):
-    """What reviewers have said of a log, or of one of its scenarios.
-
-    Attributes
-    ----------
-    marks : list of Mark
-        By microphone and time, without overlaps.
-    reviewed : list of ReviewedSpan
-        By microphone and time; they may overlap.
-    """
+    """What reviewers have said of a log, or of one of its scenarios."""
 
     marks: list[Mark]
     reviewed: list[ReviewedSpan]
@@ -114,10 +101,6 @@ class Reviewed(NamedTuple):
 
 def read_review(log: Path) -> dict[str, Reviewed]:
     """Read all that reviewers have said of a log.
-
-    Parameters
-    ----------
-    log : Path
 
     Returns
     -------
@@ -158,12 +141,6 @@ def read_marks(log: Path, scenario: str = "") -> list[Mark]:
 
 def read_reviewed(log: Path, scenario: str = "") -> list[ReviewedSpan]:
     """Read the spans of a log that a reviewer has looked at.
-
-    Parameters
-    ----------
-    log : Path
-    scenario : str, optional
-        As of `read_marks`.
 
     Returns
     -------
@@ -238,16 +215,10 @@ def write_marks(  # noqa: PLR0913
 
     Parameters
     ----------
-    log : Path
-    marks : iterable of Mark
     deleted : iterable of MarkedSpan
         Where older marks are deleted, or cut off; before the new marks are added.
-    reviewed : iterable of ReviewedSpan
-        What a reviewer has looked at; added to what the layer has.
     not_reviewed : iterable of ReviewedSpan
         Spans of the layer that are taken out of it, before those are added.
-    scenario : str, optional
-        The name of the scenario that all of it is said of.
 
     Returns
     -------

@@ -12,18 +12,6 @@ def new_marks(marks: Iterable[Mark], existing: Sequence[Mark]) -> list[Mark]:
 
     A mark without reviewer, time or labelling equals one that has them: so a file that has no
     place for them does not make marks anonymous, nor one with rounded times move them.
-
-    Parameters
-    ----------
-    marks : iterable of Mark
-        Of a file.
-    existing : sequence of Mark
-        In any order.
-
-    Returns
-    -------
-    list of Mark
-        In the order of `marks`.
     """
     ordered = sorted(existing)
     keys = [mark[:2] for mark in ordered]

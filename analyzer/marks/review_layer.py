@@ -39,10 +39,6 @@ Row = tuple[Any, ...]
 def read_rows(path: Path) -> dict[Key, list[Row]]:
     """Read a review layer.
 
-    Parameters
-    ----------
-    path : Path
-
     Returns
     -------
     dict of (str, str) to list of tuple
@@ -77,18 +73,7 @@ def read_rows(path: Path) -> dict[Key, list[Row]]:
 
 
 def layer_bytes(name: str, spans: Mapping[Key, Sequence[Any]], metadata: dict[str, str]) -> bytes:
-    """Return the content of a review layer.
-
-    Parameters
-    ----------
-    name : str
-        Of the file.
-    spans : mapping of (str, str) to sequence of NamedTuple
-        By labelling and type: with the attributes `microphone`, `start` and `end`, and those of the
-        rows of `read_rows`.
-    metadata : dict of str to str
-        Its record `hearthlog`.
-    """
+    """Return the content of a review layer."""
     batches = [
         (
             Topic(labelling_topic(microphone, labelling, _KINDS[type_]), type_),

@@ -33,12 +33,6 @@ def make_job(
 
     Parameters
     ----------
-    chain : Chain
-    place : int
-        Index of the log in the chain.
-    model : Model
-    model_path : Path
-        Where workers find the model.
     continues_layer : bool
         Whether the open segment at the start is taken from the layer before.
     """
@@ -59,23 +53,7 @@ def make_job(
 def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
     """Tell whether a layer need not be made again; its open segment at the start is not compared.
 
-    Parameters
-    ----------
-    job : Job
-    metadata : LayerMetadata
-        Of the layer.
-    log_sha256 : str
-        `log_digest` of the log.
-
-    Returns
-    -------
-    bool
-        False if its neighbours are others now, or a part of the log was lost when it was made.
-
-    Raises
-    ------
-    LogError
-        If the layer is of another model, or of another log.
+    Raise `LogError` if the layer is of another model, or of another log.
     """
     inputs = metadata.inputs
     if inputs.model_sha256 != job.model_sha256:

@@ -203,7 +203,6 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
 
     Parameters
     ----------
-    job : Job
     labelled : UnfinishedLayer
         That lacks no starts any more. Its file `part` is deleted once the layer is complete.
 

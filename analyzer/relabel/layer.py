@@ -47,16 +47,8 @@ def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[T
 
     Parameters
     ----------
-    microphone, model : str
-        Their names.
     classes : sequence of str
         In the order of the model's probabilities.
-
-    Returns
-    -------
-    labels, segments : Topic
-        `/<microphone>/relabel/<model>/label` and `…/segment`; what a topic cannot hold of the
-        model's name is `_` there.
     """
     return label_topics(microphone, relabelling(model), classes)
 
@@ -64,14 +56,7 @@ def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[T
 def read_layer_metadata(layer: Path) -> LayerMetadata | None:
     """Read what a layer says of itself; None if there is no layer.
 
-    Parameters
-    ----------
-    layer : Path
-
-    Raises
-    ------
-    LogError
-        If the layer is damaged, or `relabel` has not made it.
+    Raise `LogError` if the layer is damaged, or `relabel` has not made it.
     """
     if not layer.exists():
         return None
@@ -91,22 +76,12 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
 
 
 def part_path(layer: Path) -> Path:
-    """Return a path for an unfinished layer: hidden beside the layer, and new each time.
-
-    Parameters
-    ----------
-    layer : Path
-    """
+    """Return a path for an unfinished layer: hidden beside the layer, and new each time."""
     return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
 
 
 def delete_parts(layer: Path) -> None:
-    """Delete the unfinished files that this and other runs have left of a layer.
-
-    Parameters
-    ----------
-    layer : Path
-    """
+    """Delete the unfinished files that this and other runs have left of a layer."""
     for part in layer.parent.glob(f".{glob.escape(layer.name)}.*"):
         with suppress(OSError):
             part.unlink()
@@ -115,23 +90,7 @@ def delete_parts(layer: Path) -> None:
 def layer_record(
     metadata: LayerMetadata, log: str, node: str, more: Mapping[str, str]
 ) -> dict[str, str]:
-    """Make the `hearthlog` record of a layer.
-
-    Parameters
-    ----------
-    metadata : LayerMetadata
-    log : str
-        Name of the log's file.
-    node : str
-        Name of the recorder's node.
-    more : mapping of str to str
-        Further entries.
-
-    Returns
-    -------
-    dict of str to str
-        Key and text of each entry, with `made`: the time now, or that of SOURCE_DATE_EPOCH.
-    """
+    """Make the `hearthlog` record of a layer."""
     return provenance(
         node,
         log=log,

@@ -43,20 +43,10 @@ def infos_for_model(
 ) -> tuple[list[RecorderInfo], dict[str, str]]:
     """Find the microphones of a log whose features a model is for.
 
-    Parameters
-    ----------
-    path : Path
-        The log, or a copy of it.
-    model : Model
-    log : Path
-        What errors call it.
-
     Returns
     -------
     infos : list of RecorderInfo
         At least one, in the order of the names of the microphones.
-    left_out : dict of str to str
-        The feature sets of the other microphones.
 
     Raises
     ------
@@ -86,17 +76,8 @@ def read_sound(
 
     Parameters
     ----------
-    info : RecorderInfo
-        Of the log.
     start : int
         Log time, in nanoseconds of UTC.
-    auxiliary : bool
-        Whether to read directions and embeddings, too.
-
-    Yields
-    ------
-    Features or Gap
-        In the order of the log.
 
     Raises
     ------
@@ -119,15 +100,8 @@ def read_sound(
 def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
     """Save the whole parts of a damaged log to a folder.
 
-    Parameters
-    ----------
-    log : Path
-    folder : Path
-        The copy has the name of the log there.
-
     Returns
     -------
-    copy : Path
     loss : str
         What could not be saved; empty if nothing is lost.
 
@@ -155,11 +129,6 @@ def warm_up(
 
     Parameters
     ----------
-    info : RecorderInfo
-        Of the log.
-    earlier : sequence of Path
-        Logs before it, the last first.
-    classifier : Classifier
     states_only : bool
         Whether it suffices that the states have converged: the open segment may then lack its
         beginning.
@@ -239,14 +208,6 @@ def _label_readable(
 
 def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
     """Tell whether the sound of a log goes on in the next log.
-
-    Parameters
-    ----------
-    labeller : StreamLabeller
-        That has labelled the log to its end.
-    info : RecorderInfo
-        Of the log, and of the microphone that is labelled.
-    next_log : Path
 
     Returns
     -------

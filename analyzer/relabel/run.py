@@ -64,12 +64,6 @@ def relabel(
 
     Parameters
     ----------
-    paths : iterable of Path
-        Logs, or folders of logs.
-    model : Model
-    model_path : Path
-        Where workers find the model.
-    workers : Workers
     progress : callable, optional
         Told the share of the logs that is done, 0 to 1.
 

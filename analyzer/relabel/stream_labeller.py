@@ -19,21 +19,14 @@ class StreamLabeller:
 
     Parameters
     ----------
-    classifier : Classifier
     label_from : int
         Time before which frames are not labelled, in nanoseconds of UTC; of these only the floor of
         the room is tracked, which is much quicker.
     microphone : str
         Its name; the directions of an array that the model knows count.
-    embedding : EmbeddingSource, optional
-        Of the embeddings of its logs.
-    from_start : bool
-        Whether nothing is known of the sound before the first frame.
 
     Attributes
     ----------
-    segments : list of Segment
-        Those that have ended.
     floor_converged : bool
         Whether sound before the first frame would leave no trace in the floors to come.
     """

@@ -42,10 +42,6 @@ class ReplayComparison:
 
         Parameters
         ----------
-        recorded : sequence of RawMessages
-            Labels as the log has them.
-        replayed : sequence of EncodedMessage
-            Labels of the same span as they came out again.
         end : int
             Time from which on nothing was replayed, in nanoseconds of UTC.
 
@@ -71,8 +67,6 @@ class ReplayComparison:
 
         Parameters
         ----------
-        recorded : sequence of RawMessages
-            Segments as the log has them.
         replayed : sequence of EncodedMessage
             Segments as they came out again. One that closes at a gap is recorded earlier than it is
             replayed.

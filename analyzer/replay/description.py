@@ -37,18 +37,8 @@ def describe(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    recorded : RecorderInfo
-        Of the old log.
-    features : FeatureSet
-        Of the features in the new log.
     model : Model or None
         The model that labels the new log; None if there are no labels.
-    scenarios : mapping of str to Model
-        Those that label beside it, by the name of the scenario.
-    output : Path
-        Folder of the new log.
-    replayed : mapping of str to str
-        Further entries of the `hearthlog` record; they replace those of the old log.
     """
     if model is not None and model.sha256 == recorded.model_sha256:
         model = replace(model, name=recorded.model)  # whatever its file is called here

@@ -20,8 +20,6 @@ class LogSet:
     ----------
     paths : sequence of Path
         Layers and empty logs among them are left out.
-    kind : str
-        `features` or `audio`, as in `ReplayOptions`.
     microphone : str or None
         Name of the microphone; None if there is one only.
 
@@ -49,11 +47,6 @@ class LogSet:
     def span(self, options: ReplayOptions) -> tuple[int, int]:
         """Return the span of time that is replayed.
 
-        Parameters
-        ----------
-        options : ReplayOptions
-            Their offset and duration count.
-
         Returns
         -------
         start, end : int
@@ -67,11 +60,6 @@ class LogSet:
 
     def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
         """Return the logs to replay.
-
-        Parameters
-        ----------
-        options : ReplayOptions
-            Their offset and duration count.
 
         Returns
         -------

@@ -38,13 +38,8 @@ class Player:
 
     Parameters
     ----------
-    options : ReplayOptions
     start : int
         Log time before which messages are left out, in nanoseconds of UTC.
-    result : Replay
-        Counts, and new logs, are added to it.
-    stop : threading.Event
-        Once set, no more frames are replayed.
     progress : callable
         Told the time (nanoseconds of UTC) up to which frames were replayed.
 
@@ -105,20 +100,7 @@ class Player:
     def push(self, event: Features | Frames | Gap | SourceHealth) -> bool:
         """Replay an event.
 
-        Parameters
-        ----------
-        event : Features, Frames, Gap or SourceHealth
-            In the order of the log that is open.
-
-        Returns
-        -------
-        bool
-            Whether to go on; False once `stop` is set.
-
-        Raises
-        ------
-        LogError
-            If the new log cannot be written.
+        Raise `LogError` if the new log cannot be written.
         """
         if isinstance(event, Features):
             self._join(event)
@@ -132,15 +114,7 @@ class Player:
     def compare(self, batch: RecordedBatch) -> None:
         """Compare what was replayed since the last call with what was recorded.
 
-        Parameters
-        ----------
-        batch : RecordedBatch
-            The recorded labels and segments of the same span of time.
-
-        Raises
-        ------
-        LogError
-            If a recorded message is not of the type that its channel says.
+        Raise `LogError` if a recorded message is not of the type that its channel says.
         """
         if self._info is None:
             return

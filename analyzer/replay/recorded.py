@@ -50,13 +50,9 @@ class Features(NamedTuple):
 
     Attributes
     ----------
-    first : int
-        Number of the first frame.
     values : np.ndarray [shape=(n, d)], float32
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
-    auxiliary : Auxiliary
-        That became known with these frames.
     """
 
     first: int
@@ -91,19 +87,12 @@ def read_recorded(
 
     Parameters
     ----------
-    info : RecorderInfo
-        Of the log.
     start, end : int
         Log times, in nanoseconds of UTC: from `start` on, before `end`.
     sound_only : bool
         Read only features and gaps, and compare the checksums of what is read.
     auxiliary : bool
         Read the directions of an array and the embeddings of a network, too.
-
-    Yields
-    ------
-    RecordedBatch
-        In the order of time.
 
     Raises
     ------

@@ -33,10 +33,6 @@ def find_model(name: str, sha256: str, folders: Sequence[Path]) -> Model | None:
     ----------
     name : str
         Name of the model, which is that of its file without the suffix.
-    sha256 : str
-        Of the model file, as hexadecimal digits.
-    folders : sequence of Path
-        The first that has the model counts.
 
     Returns
     -------
@@ -67,18 +63,8 @@ def replay(
 
     Parameters
     ----------
-    logs : LogSet
-        Of the kind that the options say.
-    options : ReplayOptions
-    stop : threading.Event
-        Once set, the replay ends, and the new log is completed.
     progress : callable, optional
         Told the share that was replayed, 0 to 1.
-
-    Returns
-    -------
-    Replay
-        What was replayed, which logs were written, and how they compare with the recording.
 
     Raises
     ------

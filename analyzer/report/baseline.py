@@ -41,12 +41,6 @@ def usual(values: Sequence[Value | None]) -> Usual | None:
 def compared(value: Value, baseline: Usual) -> int:
     """Compare a figure, as labelled, with what is usual.
 
-    Parameters
-    ----------
-    value : Count, Minutes or Clock
-    baseline : Usual
-        Of the same kind of figure.
-
     Returns
     -------
     int

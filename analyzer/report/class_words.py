@@ -16,13 +16,7 @@ _MONTHS = (
 
 
 def several_in_words(label: str) -> str:
-    """Name the events of a class as people who count them would.
-
-    Parameters
-    ----------
-    label : str
-        A name of the class, in any spelling.
-    """
+    """Name the events of a class as people who count them would."""
     row = find_class(label)
     return (row.several if row else "") or in_words(label)
 
@@ -49,8 +43,6 @@ def clock_text(nanoseconds: int, zone: tzinfo) -> str:
     ----------
     nanoseconds : int
         Of UTC.
-    zone : tzinfo
-        Of the home.
     """
     return f"{local_time(nanoseconds, zone):%H:%M}"
 
@@ -62,8 +54,6 @@ def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
     ----------
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC, in any order.
-    zone : tzinfo
-        Of the home.
     most : int, optional
         Number of times that are listed, at most.
     """

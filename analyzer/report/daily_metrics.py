@@ -46,14 +46,7 @@ class Day:
         return common(self.home.coverage, self.night).length / HOUR
 
     def comparable(self, name: str = "") -> bool:
-        """Tell whether three quarters of the day, and of its night, were heard.
-
-        Parameters
-        ----------
-        name : str, optional
-            A class of the home: what was heard by microphones whose model knows it; by default the
-            class that is worst off.
-        """
+        """Tell whether three quarters of the day, and of its night, were heard."""
         spans = [self.home.listened[name]] if name else [*self.home.listened.values()]
         wholes = self.span, self.night
         shares = [common(each, whole).length / whole.length for each in spans for whole in wholes]
@@ -70,13 +63,7 @@ class Day:
         return _share(self.home.listened.get(name, NONE), self.span)
 
     def minutes(self, name: str) -> Minutes | None:
-        """Return how long a class was heard; None if it is not known.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        """
+        """Return how long a class was heard; None if it is not known."""
         minutes = _length(common(self.home.spans.get(name, NONE), self.span))
         return _if_known(minutes, self.share_of(name))
 
@@ -111,34 +98,16 @@ class Day:
         return self.home.minutes.counted(name, self.home.events_in(name, self.night))
 
     def count(self, name: str) -> Count | None:
-        """Return how often a class was heard on this day; None if it is not known.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        """
+        """Return how often a class was heard on this day; None if it is not known."""
         return _if_known(self._count(name, self.span), self.share_of(name))
 
     def night_count(self, name: str) -> Count | None:
-        """Return how often a class was heard in the night; None if it is not known.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        """
+        """Return how often a class was heard in the night; None if it is not known."""
         share = _share(self.home.listened.get(name, NONE), self.night)
         return _if_known(self._count(name, self.night), share)
 
     def beside_television(self, name: str) -> int:
-        """Return how many events of a class were not counted, because of a television.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        """
+        """Return how many events of a class were not counted, because of a television."""
         return self.home.minutes.between(self.span).beside_television(name)
 
     def _count(self, name: str, span: Spans) -> Count:
@@ -225,11 +194,8 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> Day:
 
     Parameters
     ----------
-    home : HomeMetrics
     day : date
         By the clock of the home; its night is from 22:00 on the day before to 07:00.
-    zone : tzinfo
-        Of the home.
     """
     start, end = day_span(day, zone)
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))

@@ -59,8 +59,6 @@ class HomeMetrics:
         ----------
         name : str
             Of the class; one without events, such as silence, has none.
-        span : Spans
-            A single one.
 
         Returns
         -------
@@ -110,14 +108,7 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
 
 
 def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSound:
-    """Return what routines are learned from: the labels of all microphones.
-
-    Parameters
-    ----------
-    data : HomeData
-    metrics : HomeMetrics
-        Of the same home.
-    """
+    """Return what routines are learned from: the labels of all microphones."""
     return HomeSound(_together(data.segments.values()), metrics.listened)
 
 

@@ -48,26 +48,12 @@ class HomeMinutes:
     certain: dict[str, Int64]
 
     def between(self, spans: Spans) -> "HomeMinutes":
-        """Return the minutes that begin in some spans of time.
-
-        Parameters
-        ----------
-        spans : Spans
-            In nanoseconds of UTC.
-        """
+        """Return the minutes that begin in some spans of time."""
         of = np.searchsorted(spans.starts, self.starts, side="right") - 1
         return self.rows((of >= 0) & (self.starts < spans.ends[of]))
 
     def count(self, name: str, rates: CheckedRates | None) -> Count:
-        """Count the events of a class; those of `SET_APART` only where no television sounds.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        rates : CheckedRates or None
-            Of the class.
-        """
+        """Count the events of a class; those of `SET_APART` only where no television sounds."""
         own = self.rows(~self.television) if name in SET_APART else self
         if name not in own.labelled:
             return Count(rates=rates)
@@ -84,8 +70,6 @@ class HomeMinutes:
 
         Parameters
         ----------
-        name : str
-            Of the class.
         starts : np.ndarray [shape=(n,)], int64
             When they began, within these minutes.
         """
@@ -131,10 +115,6 @@ def home_minutes(
 
     Parameters
     ----------
-    labels : Labelling
-        Of all microphones, in the order of time, as labelled.
-    gone_through : sequence of Spans
-        By microphone, what a person has gone through.
     coverage : Spans
         When at least one of them heard.
     events : mapping of str to np.ndarray [shape=(n,)], int64
@@ -164,14 +144,7 @@ def home_minutes(
 
 
 def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, CheckedRates]:
-    """Return the rates of the classes of which enough minutes were checked.
-
-    Parameters
-    ----------
-    minutes : HomeMinutes
-        Which tell how often each class is labelled.
-    checks : CheckedMinutes
-    """
+    """Return the rates of the classes of which enough minutes were checked."""
     amounts = {
         name: int(counts.sum()) + 1
         for name, counts in minutes.labelled.items()

@@ -37,15 +37,8 @@ def fill_page(picture: bytes, **parts: Any) -> str:
 
     Parameters
     ----------
-    picture : bytes
-        A PNG file.
     **parts
         By the names that the template has for them; none may be lacking.
-
-    Returns
-    -------
-    str
-        HTML.
     """
     environment = jinja2.Environment(
         autoescape=True,

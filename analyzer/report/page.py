@@ -54,13 +54,6 @@ def day_page(account: Account, picture: bytes) -> str:
     ----------
     account : Account
         Of one day.
-    picture : bytes
-        A PNG file.
-
-    Returns
-    -------
-    str
-        HTML.
     """
     day = account.days[0]
     names = [name for name in account.classes if name != SILENCE]
@@ -82,13 +75,6 @@ def week_page(account: Account, picture: bytes) -> str:
     ----------
     account : Account
         Of seven days.
-    picture : bytes
-        A PNG file.
-
-    Returns
-    -------
-    str
-        HTML.
     """
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{class_words.date_in_words(first)} to {class_words.date_in_words(last)}"

@@ -62,13 +62,7 @@ class HomeData:
     losses: list[str] = field(default_factory=list)  # what could not be read, and why
 
     def lose(self, line: str) -> None:
-        """Note what could not be read, once.
-
-        Parameters
-        ----------
-        line : str
-            The file, and why.
-        """
+        """Note what could not be read, once."""
         if line not in self.losses:
             self.losses.append(line)
 
@@ -84,9 +78,6 @@ def read_home(
 
     Parameters
     ----------
-    logs : HomeLogs
-    labelling : str
-        `live`, or the name of the model of relabel layers.
     since : int
         Log time from which on segments are read, in nanoseconds of UTC.
     close : (int, int)
@@ -94,11 +85,6 @@ def read_home(
         troubles are read too.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
-
-    Returns
-    -------
-    HomeData
-        What could not be read is in its `losses`.
 
     Raises
     ------

@@ -60,12 +60,8 @@ def make_report(
 
     Parameters
     ----------
-    logs : HomeLogs
-    period : Period
     page : Path
         Of the HTML file; the picture is beside it, with the suffix `.png`. Neither may exist.
-    labelling : str, optional
-        `live`, or the name of the model of relabel layers.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
 

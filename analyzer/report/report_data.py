@@ -93,10 +93,6 @@ class Account:
     def baseline(self, figure: Figure) -> tuple[Usual, Value] | None:
         """Return what is usual, and a value that can write it; None if there are too few days.
 
-        Parameters
-        ----------
-        figure : Figure
-
         Returns
         -------
         (Usual, Value) or None
@@ -111,10 +107,6 @@ class Account:
     def usually(self, figure: Figure) -> str:
         """Say what is usual: `4 (3 to 6)`.
 
-        Parameters
-        ----------
-        figure : Figure
-
         Returns
         -------
         str
@@ -125,11 +117,6 @@ class Account:
 
     def change(self, figure: Figure, day: Day) -> str:
         """Compare a figure of a day with all earlier days.
-
-        Parameters
-        ----------
-        figure : Figure
-        day : Day
 
         Returns
         -------

@@ -28,12 +28,7 @@ _NAMES = {STRETCHES: "times with sound", SOUND: "sound", QUIET: "longest quiet s
 
 
 def judgement_text(judged: Judgement) -> str:
-    """Say how unusual a day was, and what was unlike other days.
-
-    Parameters
-    ----------
-    judged : Judgement
-    """
+    """Say how unusual a day was, and what was unlike other days."""
     compared = f"{judged.days} earlier days"
     if judged.once_in < WEEK:
         single = [each for each in judged.differences if abs(each.deviation) >= _SINGLE]
@@ -46,13 +41,7 @@ def judgement_text(judged: Judgement) -> str:
 
 
 def too_few_text(days: int) -> str:
-    """Say that there are too few days to judge one by.
-
-    Parameters
-    ----------
-    days : int
-        That there are.
-    """
+    """Say that there are too few days to judge one by."""
     return (
         f"How unusual the day was cannot be told yet: that needs {FEWEST} days of the four weeks "
         f"before it, heard for the most part, and there are {days}."
@@ -60,24 +49,14 @@ def too_few_text(days: int) -> str:
 
 
 def rarity_text(judged: Judgement) -> str:
-    """Say how often a day is expected that is as unlike others: `one such day in 40`.
-
-    Parameters
-    ----------
-    judged : Judgement
-    """
+    """Say how often a day is expected that is as unlike others: `one such day in 40`."""
     if judged.once_in >= LONGEST:
         return "less than one such day in a year"
     return f"one such day in {whole(judged.once_in)}"
 
 
 def differences_text(judged: Judgement) -> str:
-    """Say what was unlike other days, what differs most first.
-
-    Parameters
-    ----------
-    judged : Judgement
-    """
+    """Say what was unlike other days, what differs most first."""
     more = len(judged.differences) - _SHOWN
     texts = [difference_text(each) for each in judged.differences[:_SHOWN]]
     text = "; ".join(texts) + (f"; and {more} more" if more > 0 else "")
@@ -85,12 +64,7 @@ def differences_text(judged: Judgement) -> str:
 
 
 def difference_text(difference: Difference) -> str:
-    """Say what a figure was, and what it is on eight of ten days.
-
-    Parameters
-    ----------
-    difference : Difference
-    """
+    """Say what a figure was, and what it is on eight of ten days."""
     figure, value = difference.figure, difference.value
     name = _name(figure)
     if figure.kind == CLOCK:

@@ -30,16 +30,8 @@ def read_scenario_minutes(
 
     Parameters
     ----------
-    logs : HomeLogs
     days : sequence of (int, int)
         Starts and ends, in nanoseconds of UTC, in the order of time.
-    lose : callable
-        Told what cannot be read, a log in a line.
-
-    Returns
-    -------
-    mapping of str to sequence of mapping
-        Without what a scenario has no name for.
     """
     found: dict[str, list[Counter[str]]] = {}
     start, end = days[0][0], days[-1][1]

@@ -32,13 +32,7 @@ class FigureSection(NamedTuple):
 
 
 def sections(classes: Sequence[str]) -> list[FigureSection]:
-    """Return the tables, for the classes that the model of a home knows.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        A figure of any other class is left out.
-    """
+    """Return the tables, for the classes that the model of a home knows."""
     return [
         FigureSection(
             "Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)
@@ -49,27 +43,13 @@ def sections(classes: Sequence[str]) -> list[FigureSection]:
 
 
 def minutes_of(name: str) -> Figure:
-    """Return the figure that says for how long a class was heard.
-
-    Parameters
-    ----------
-    name : str
-        Of the class.
-    """
+    """Return the figure that says for how long a class was heard."""
     title = in_words(name)
     return Figure(title, title, lambda day: day.minutes(name), name)
 
 
 def events_of(name: str, title: str = "") -> Figure:
-    """Return the figure that says how often a class was heard.
-
-    Parameters
-    ----------
-    name : str
-        Of the class.
-    title : str, optional
-        By default the class in words.
-    """
+    """Return the figure that says how often a class was heard."""
     title = title or in_words(name)
     return Figure(title, title, lambda day: day.count(name), name)
 

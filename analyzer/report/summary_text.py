@@ -29,14 +29,8 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
 
     Parameters
     ----------
-    account : Account
     day : Day
         One of its days.
-
-    Yields
-    ------
-    str
-        A paragraph of the page.
     """
     minutes = Minutes(day.coverage.length / _MINUTE).text
     yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
@@ -54,11 +48,6 @@ def gist_of_week(account: Account) -> Iterator[str]:
     ----------
     account : Account
         Of seven days.
-
-    Yields
-    ------
-    str
-        A paragraph of the page.
     """
     days = [day for day in account.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
@@ -79,10 +68,6 @@ def gist_of_week(account: Account) -> Iterator[str]:
 
 def not_heard(account: Account) -> Iterator[str]:
     """Say how much was not heard, and why.
-
-    Parameters
-    ----------
-    account : Account
 
     Yields
     ------
@@ -113,10 +98,6 @@ def not_heard(account: Account) -> Iterator[str]:
 def not_well(account: Account) -> Iterator[str]:
     """Say which troubles the box reported, where gaps do not say it already.
 
-    Parameters
-    ----------
-    account : Account
-
     Yields
     ------
     str
@@ -133,10 +114,6 @@ def not_well(account: Account) -> Iterator[str]:
 
 def longest_quiet(day: Day) -> str:
     """Say when the longest quiet stretch of the day was.
-
-    Parameters
-    ----------
-    day : Day
 
     Returns
     -------
@@ -164,13 +141,7 @@ def percent(share: float) -> str:
 
 
 def plain(name: str) -> str:
-    """Write a name as people do, with spaces for `_`.
-
-    Parameters
-    ----------
-    name : str
-        Of a microphone, or of a source of trouble.
-    """
+    """Write a name as people do, with spaces for `_`."""
     return name.replace("_", " ")
 
 

@@ -26,16 +26,7 @@ _DOTS = 150  # an inch
 
 
 def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
-    """Draw a day: a lane for each class, and the minutes with sound in each hour.
-
-    Parameters
-    ----------
-    path : Path
-        Of a PNG file, which is replaced.
-    day : Day
-    earlier : sequence of Day
-        Those that it is compared with.
-    """
+    """Draw a day: a lane for each class, and the minutes with sound in each hour."""
     names = _names(day)
     heights = [0.34 * len(names) + 0.1, 1.15]
     figure = Figure(figsize=(10, sum(heights) + 0.95), layout="constrained")
@@ -47,15 +38,7 @@ def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
 
 
 def save_week(path: Path, days: Sequence[Day]) -> None:
-    """Draw a week: for each class seven lanes, the first day at the top.
-
-    Parameters
-    ----------
-    path : Path
-        Of a PNG file, which is replaced.
-    days : sequence of Day
-        In the order of time.
-    """
+    """Draw a week: for each class seven lanes, the first day at the top."""
     names = _names(*days)
     figure = Figure(figsize=(10, 0.66 * len(names) + 0.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -86,24 +86,12 @@ class Count(_Quantity):
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a number of events, rounded.
-
-        Parameters
-        ----------
-        number : float
-            Of events.
-        """
+        """Write a number of events, rounded."""
         return f"{whole(number)}"
 
 
 def exactly(number: int) -> Count:
-    """Return a count that is certain.
-
-    Parameters
-    ----------
-    number : int
-        Of events.
-    """
+    """Return a count that is certain."""
     return Count(number, number)
 
 
@@ -164,10 +152,5 @@ Value = Count | Minutes | Clock
 
 
 def whole(number: float) -> int:
-    """Round to a whole number, halves upwards: 2.5 is 3.
-
-    Parameters
-    ----------
-    number : float
-    """
+    """Round to a whole number, halves upwards: 2.5 is 3."""
     return math.floor(number + 0.5)

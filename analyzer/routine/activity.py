@@ -15,15 +15,6 @@ _PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spans:
     """Find the longest quiet span from 07:00 to 22:00.
 
-    Parameters
-    ----------
-    sound, coverage : Spans
-        When there was any; when anything would have been heard.
-    day : date
-        By the clock of the home.
-    zone : tzinfo
-        Of the home.
-
     Returns
     -------
     Spans
@@ -39,13 +30,6 @@ def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spa
 
 def stretches(sound: Spans, night: Spans) -> int:
     """Count the stretches of sound in a night, with ten quiet minutes between them.
-
-    Parameters
-    ----------
-    sound : Spans
-        When there was any.
-    night : Spans
-        A single one.
 
     Returns
     -------

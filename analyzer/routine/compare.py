@@ -38,7 +38,6 @@ class Difference(NamedTuple):
 
     Attributes
     ----------
-    figure : Figure
     value : float
         Of the day, or the median of three: a number of events, minutes, or those since midnight.
     low, middle, high : float
@@ -61,13 +60,10 @@ class Judgement:
 
     Attributes
     ----------
-    day : date
     once_in : float
         Days in which one is expected that is as far from the usual, 1 to 365.
     span : int
         Days of which the differences are typical: the day by itself, 1, or with the two before, 3.
-    differences : sequence of Difference
-        The largest first.
     days : int
         How many days it is compared with.
     """
@@ -80,12 +76,7 @@ class Judgement:
 
 
 class Routines:
-    """Judges days of a home by the weeks before each.
-
-    Parameters
-    ----------
-    profiles : Profiles
-    """
+    """Judges days of a home by the weeks before each."""
 
     def __init__(self, profiles: Profiles) -> None:
         self._profiles = profiles
@@ -93,10 +84,6 @@ class Routines:
 
     def judge(self, day: date) -> Judgement | None:
         """Judge a day.
-
-        Parameters
-        ----------
-        day : date
 
         Returns
         -------
@@ -112,12 +99,7 @@ class Routines:
         return judge(compared, day)
 
     def earlier(self, day: date) -> list[DayProfile]:
-        """Return the days that a day can be compared with: four weeks, up to the third day before.
-
-        Parameters
-        ----------
-        day : date
-        """
+        """Return the days to compare a day with: four weeks, up to the third day before."""
         return self._between(day, DAYS + SPAN - 1, SPAN)
 
     def _between(self, day: date, first: int, last: int) -> list[DayProfile]:
@@ -138,7 +120,6 @@ class Compared(NamedTuple):
     ----------
     figures : sequence of Figure
         That are known on half of the earlier days at least.
-    usual : Usual
     rows : np.ndarray [shape=(k, f)], float64
         Of the days, as of `rooted`; NaN for what is not known.
     weekend : np.ndarray [shape=(k,)], bool
@@ -170,8 +151,6 @@ def compare(
         One at least.
     earlier : sequence of DayProfile
         14 at least.
-    figures : sequence of Figure
-        Of their values.
     classes : sequence of str
         Of their half hours.
     """
@@ -195,7 +174,6 @@ def judge(compared: Compared, day: date) -> Judgement:
     ----------
     compared : Compared
         The day, and those just before it.
-    day : date
     """
     # Halved, for either may be rare by chance.
     alone, together = (
@@ -224,8 +202,6 @@ def rarity(own: Float64, compared: Compared) -> float:
     ----------
     own : np.ndarray [shape=(k, f)], float64
         Deviations of one day or of successive ones.
-    compared : Compared
-        With the others.
 
     Returns
     -------

@@ -58,8 +58,6 @@ class Figure(NamedTuple):
 
     Attributes
     ----------
-    what : str
-        A class, or one of `STRETCHES`, `SOUND`, `FIRST`, `LAST` and `QUIET`.
     kind : str
         `COUNT`, `LENGTH` (in minutes) or `CLOCK` (minutes from midnight on).
     night : bool
@@ -82,8 +80,6 @@ class HomeSound:
     ----------
     labels : Labelling
         Of all microphones, by their starts, with one name for each class; they may overlap.
-    listened : mapping of str to Spans
-        By class, when it would have been heard.
     """
 
     labels: Labelling
@@ -96,8 +92,6 @@ class DayProfile:
 
     Attributes
     ----------
-    day : date
-        By the clock of the home.
     values : np.ndarray [shape=(f,)], float64
         Of the `figures` of its `Profiles`; NaN for what is not known.
     half_hours : np.ndarray [shape=(c, 48)], float64
@@ -120,9 +114,6 @@ class Profiles:
 
     Parameters
     ----------
-    home : HomeSound
-    zone : tzinfo
-        Of the home.
     night_after : bool
         Whether the night after a day belongs to it, and not the one before.
 
@@ -156,13 +147,7 @@ class Profiles:
             self._spans[name], self._events[name] = spans, events
 
     def of(self, day: date) -> DayProfile:
-        """Return the profile of a day.
-
-        Parameters
-        ----------
-        day : date
-            By the clock of the home.
-        """
+        """Return the profile of a day."""
         values = np.array([self._value(figure, day) for figure in self.figures])
         edges = _half_hours(day, self._zone)
         table = [self._minutes(name, edges) for name in self.classes]

@@ -36,12 +36,7 @@ _TOP = 3  # routines that make the score
 
 
 def routine_of(figure: Figure) -> str:
-    """Return the routine that a figure tells of.
-
-    Parameters
-    ----------
-    figure : Figure
-    """
+    """Return the routine that a figure tells of."""
     by_class = _BY_CLASS.get(figure.what, COMPANY)
     if by_class in {COUGHS, DISTRESS}:
         return by_class
@@ -64,7 +59,6 @@ def routine_scores(
         Deviations of the figures of a day; NaN for what is not known.
     others : np.ndarray [shape=(n, f)], float64
         Those of other days, by which the widths of routines are measured.
-    figures : sequence of Figure
 
     Returns
     -------

@@ -31,8 +31,6 @@ class Usual:
         On one day in ten a figure is below the low edge, on one above the high one.
     below, above : np.ndarray
         From the middle to the edges, never quite 0.
-    weekend : np.ndarray
-        By how much more it is at a weekend.
     """
 
     low: Float64
@@ -69,7 +67,6 @@ def learn(table: Float64, weekend: Bool, figures: Sequence[Figure]) -> Usual:
         Figures of n days, as of `rooted`; NaN for what is not known.
     weekend : np.ndarray [shape=(..., n)], bool
         Which of the days are of a weekend.
-    figures : sequence of Figure
     """
     weekend = weekend[..., np.newaxis]
     offset = _weekend(table, weekend)
@@ -131,7 +128,6 @@ def regular_hours(days: Sequence[DayProfile], classes: Sequence[str]) -> list[Fi
 
     Parameters
     ----------
-    days : sequence of DayProfile
     classes : sequence of str
         Of their half hours.
 
@@ -185,11 +181,8 @@ def figure_table(
 
     Parameters
     ----------
-    days : sequence of DayProfile
     classes : sequence of str
         Of their half hours.
-    hours : sequence of Figure
-        As of `regular_hours`.
 
     Returns
     -------
@@ -208,7 +201,6 @@ def rooted(table: Float64, figures: Sequence[Figure]) -> Float64:
     Parameters
     ----------
     table : np.ndarray [shape=(n, f)], float64
-    figures : sequence of Figure
     """
     clocks = np.array([figure.kind == CLOCK for figure in figures])
     return np.where(clocks, table, np.sqrt(np.where(clocks, 0, table)))

@@ -37,12 +37,7 @@ _FOLDS = 3  # by which the temperature is found
 
 
 def base_classes(model: Model) -> tuple[str, ...]:
-    """Return the classes of a model without those that it has from a home alone.
-
-    Parameters
-    ----------
-    model : Model
-    """
+    """Return the classes of a model without those that it has from a home alone."""
     insist_taught(model)
     kept = kept_inputs(model)
     if kept is None or not len(kept[1]):

@@ -24,12 +24,6 @@ _FEWEST_SEGMENTS = 20  # of a collection with a fold of its own
 def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
     """Leave out one collection after the other; small ones together.
 
-    Parameters
-    ----------
-    data : Dataset
-    taught : set of int
-        Numbers of classes that are always learned from something else, too.
-
     Returns
     -------
     list of Fold
@@ -51,12 +45,6 @@ def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> l
 
 def taught_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
     """Tell which segments are of a known class of which the other folds have five sources.
-
-    Parameters
-    ----------
-    data : Dataset
-    folds : sequence of Fold
-        As of `collection_folds`.
 
     Returns
     -------
@@ -84,16 +72,6 @@ def calibrate_elsewhere(
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
         Of classifiers that were not learned from the fold of the segment.
-    data : Dataset
-        Of n segments.
-    folds : sequence of Fold
-        As of `collection_folds`.
-
-    Returns
-    -------
-    inverse_temperature : float
-    elsewhere : Elsewhere
-        Scores of each fold with the temperature from the others.
     """
     taught = taught_elsewhere(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
@@ -108,8 +86,6 @@ def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Els
     ----------
     probabilities : np.ndarray [shape=(n, C)], float64
         Of classifiers that were not learned from the collection of the segment.
-    data : Dataset
-        Of n segments.
     taught : np.ndarray [shape=(n,)], bool
         As `taught_elsewhere` tells.
     """
@@ -153,11 +129,6 @@ def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
         Classes of the segments.
     base : float
         Inverse temperature of the model; it counts as much as 30 segments.
-
-    Returns
-    -------
-    float
-        Inverse temperature.
     """
     if not len(target):
         return base
@@ -207,7 +178,6 @@ def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) ->
         Of segments that were not learned from.
     target : np.ndarray [shape=(n,)], intp
         Their classes.
-    classes : sequence of str
 
     Returns
     -------

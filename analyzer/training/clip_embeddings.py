@@ -72,10 +72,6 @@ class ClipEmbeddings(NamedTuple):
     def at(self, start: int) -> Int8:
         """Return the window nearest to one that begins at a frame, at most five frames from it.
 
-        Parameters
-        ----------
-        start : int
-
         Returns
         -------
         np.ndarray [shape=(1 or 0, W)], int8
@@ -93,20 +89,7 @@ class ClipEmbeddings(NamedTuple):
 
 
 class ClipEmbedder:
-    """Embeds the windows of clips, those of each clip once.
-
-    Parameters
-    ----------
-    embed : callable
-        Turns a window into integers.
-    seed : int
-        Of the rooms that are drawn for clips.
-
-    Attributes
-    ----------
-    source : EmbeddingSource or None
-        The network and the projection, if it is one.
-    """
+    """Embeds the windows of clips, those of each clip once."""
 
     def __init__(self, embed: Embeds, seed: int = 0) -> None:
         self._embed, self._seed = embed, seed
@@ -134,8 +117,6 @@ def clip_embeddings(
     ----------
     frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         At least one.
-    embed : callable
-        Turns a window into integers.
     segments : np.ndarray [shape=(k,)], intp
         Frames at which the segments of the clip begin, multiples of five: these windows are
         embedded in any case.
@@ -278,17 +259,7 @@ def model_embedder(model: Model) -> ClipEmbedder | None:
 def network_embedder(network: str, seed: int = 0) -> ClipEmbedder:
     """Return what hears clips by a network.
 
-    Parameters
-    ----------
-    network : str
-        Its name.
-    seed : int
-        As of `ClipEmbedder`.
-
-    Raises
-    ------
-    ModelError
-        If it is not known, not there, another file, or cannot be used.
+    Raise `ModelError` if it is not known, not there, another file, or cannot be used.
     """
     path = find_network(network)
     if path is None:

@@ -25,10 +25,6 @@ class ClipSound(NamedTuple):
     frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
         of the file.
-    breaks : sequence of int
-        Frames that do not follow the one before them.
-    lost : int
-        Frames that were left out.
     """
 
     frames: Float32
@@ -44,15 +40,8 @@ def clip_frames(clip: LabelledClip) -> Float32:
 def read_clip(clip: LabelledClip) -> ClipSound:
     """Read a clip.
 
-    Parameters
-    ----------
-    clip : LabelledClip
-
-    Raises
-    ------
-    SourceError
-        If the clip cannot be read completely, is longer than an hour, or has no sample that is
-        finite.
+    Raise `SourceError` if the clip cannot be read completely, is longer than an hour, or has no
+    sample that is finite.
     """
     cutter = FrameCutter()
     faults: list[str] = []

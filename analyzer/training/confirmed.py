@@ -43,8 +43,6 @@ class Candidates(NamedTuple):
 
     Attributes
     ----------
-    recordings : list of Recording
-        Of one length, labelled with the name of the class.
     target : np.ndarray [shape=(n,)], intp
         Their classes.
     """
@@ -58,18 +56,7 @@ def confirmed_segments(
 ) -> Candidates:
     """Cut out what was looked at, and not marked.
 
-    Parameters
-    ----------
-    sound : HomeSound
-    classes : sequence of str
-        Of the model; what was labelled otherwise is left out.
-    segment_frames : int
-        Length of the window of the feature set.
-
-    Raises
-    ------
-    LogError
-        If the labelling that was looked at cannot be read.
+    Raise `LogError` if the labelling that was looked at cannot be read.
     """
     confirmed: list[Candidates] = []
     reviewed = [span for span in sound.reviewed if span.chosen != RANDOM]
@@ -91,20 +78,7 @@ def labelled_segments(
 ) -> Candidates:
     """Cut out what was labelled as some classes, whether anyone has looked at it or not.
 
-    Parameters
-    ----------
-    sound : HomeSound
-    classes : sequence of str
-        Of the model.
-    names : collection of str
-        Of the classes; of sound without labels all may be silence.
-    segment_frames : int
-        Length of the window of the feature set.
-
-    Raises
-    ------
-    LogError
-        If the labels cannot be read.
+    Raise `LogError` if the labels cannot be read.
     """
     if not sound.values.shape[1]:
         return _joined([])
@@ -124,8 +98,6 @@ def chosen(
 
     Parameters
     ----------
-    candidates : iterable of Candidates
-    model : Model
     least : float
         Probability of which it is sure.
     fewest : int

@@ -25,13 +25,6 @@ def cross_validate(
 
     Parameters
     ----------
-    methods : sequence of Method
-        All with the inputs and the number of copies that the examples have.
-    examples : Examples
-    classes : int
-        C, the number of classes.
-    folds : iterable of Fold
-        Indices of the segments to learn from, and of those to test on.
     progress : callable
         Is told the share of the fits that is done, 0 to 1.
 

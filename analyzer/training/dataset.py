@@ -51,22 +51,14 @@ class Recording(NamedTuple):
         As in a manifest; a group is never both learned from and tested on.
     features : np.ndarray [shape=(n, d)], float32
         Features of successive frames.
-    weight : float
-        Weight of its segments.
     floor : np.ndarray [shape=(n, b)], float64, or None
         Floor of the room at each frame; None for none, as in a clip that was cut out of it.
-    copies : sequence of RoomCopy
-        The same sound in other rooms.
     most : int or None
         Segments of it at most, evenly spaced; None for no limit.
     span : (int, int) or None
         Its start and end in nanoseconds of UTC, if that is known.
-    sighting : Sighting or None
-        Whence it came, if that is known.
     fault : str
         Why it could not be read; empty if it could.
-    breaks : sequence of int
-        Frames that do not follow the one before them.
     hole : str
         What is missing there; empty if nothing is.
     embedded : ClipEmbeddings or None
@@ -154,15 +146,8 @@ class Dataset:
     copies : np.ndarray [shape=(k, n, window_frames, d)], float32
         The same segments in other rooms; NaN where there is none.
     copy_floor : np.ndarray [shape=(k, n, b)], float64
-    classes : tuple of str
     seconds : dict of str to float
         Seconds of sound of each class, before it was thinned out.
-    collection_names : tuple of str
-        Names behind `collection`.
-    collections : dict of (name, licence) to int
-        Number of recordings that were used.
-    skipped : dict of str to int
-        Number of recordings that gave no segment, by the reason.
     spans : np.ndarray [shape=(k, 2)], int64
         Starts and ends of the recordings that were used, in nanoseconds of UTC, if they are known.
     sightings : sequence of (Sighting or None)
@@ -173,8 +158,6 @@ class Dataset:
         The segments as a network hears them; W is 0 without a network.
     is_embedded : np.ndarray [shape=(n,)], bool
         Of which segments that is known.
-    embedding_windows : EmbeddingWindows
-        What heads are learned from.
     """
 
     windows: Float32
@@ -338,15 +321,6 @@ def cut_recordings(
     Segments of silence are all kept, others if they are above -60 dBFS and at most 12 dB below the
     mean level of their recording. Of each class, source group and collection at most 24 segments,
     times their weight, are kept, evenly spaced.
-
-    Parameters
-    ----------
-    recordings : iterable of Recording
-        Their labels may be names of classes.
-    scenario : Scenario
-        Which class a label belongs to.
-    features : FeatureSet, optional
-        Of the recordings; one with another number of features is skipped.
 
     Returns
     -------

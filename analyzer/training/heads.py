@@ -49,11 +49,6 @@ def learn_heads(
 
     Parameters
     ----------
-    windows : EmbeddingWindows
-        Those of silence are not learned from.
-    classes : sequence of str
-    inputs : sequence of slice
-        For each head, which of the values of a window it takes.
     seen : np.ndarray [shape=(m,)], bool, optional
         Which of the windows may be learned from; all by default.
     """
@@ -90,8 +85,6 @@ def regressed(  # noqa: PLR0913
         Logarithms of probabilities, up to a constant.
     pull : np.ndarray [shape=(C,)], float64
         Of weights and biases to zero.
-    free : bool
-        Whether biases are not pulled.
 
     Returns
     -------

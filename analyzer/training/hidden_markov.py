@@ -19,8 +19,6 @@ def viterbi(probabilities: Float32, transitions: Float64, weight: float = 1.0) -
         Of the classes, frame by frame, 0 to 1.
     transitions : np.ndarray [shape=(C, C)], float64
         Probability that a frame of the row's class is followed by one of the column's class.
-    weight : float
-        As of `log_likelihoods`.
 
     Returns
     -------

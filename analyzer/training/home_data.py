@@ -42,28 +42,8 @@ def home_recordings(
 ) -> Iterator[Recording]:
     """Read the features of all marks in the logs of a folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of logs, with review layers beside them, and of enrolled sounds.
-    features : FeatureSet, optional
-        Marks in logs of another set give recordings without features.
-    gate : float
-        As of `marked_recordings`.
-    space : EmbeddingSpace, optional
-        As of `read_reviewed_sound`.
-
-    Yields
-    ------
-    Recording
-        As of `marked_recordings`.
-
-    Raises
-    ------
-    LogError
-        If there is no log, or if a log or a layer is damaged.
-    DataError
-        If there are marks, and all of them are in logs of other sets.
+    Raise `LogError` if there is no log, or if a log or a layer is damaged. Raise `DataError` if
+    there are marks, and all of them are in logs of other sets.
     """
     sounds = read_reviewed_sound(folder, features, space=space)
     for recording in marked_recordings(sounds, folder, features, gate):
@@ -81,11 +61,6 @@ def marked_recordings(
 
     Parameters
     ----------
-    sounds : iterable of HomeSound
-    folder : Path
-        Where they are from, for the warning.
-    features : FeatureSet
-        Of the sounds.
     gate : float
         A mark in which nothing is so many dB above the floor of the room is left out, unless it is
         silence; a `HearthlogWarning` counts them, and those of what was not recorded. 0 for none.
@@ -126,14 +101,7 @@ def marked_recordings(
 
 
 def is_short_silence(mark: Mark, features: FeatureSet) -> bool:
-    """Tell whether a mark of silence is shorter than what is learned from, and so teaches nothing.
-
-    Parameters
-    ----------
-    mark : Mark
-    features : FeatureSet
-        Of the sound that it is of.
-    """
+    """Whether a mark of silence is shorter than a window, so that nothing is learned from it."""
     is_short = mark.end - mark.start < features.window_seconds * NANOSECONDS
     return is_short and class_name(mark.label) == SILENCE
 
@@ -146,19 +114,7 @@ def lesson_recordings(
 ) -> Iterator[Recording]:
     """Read the marks in the logs of a folder that teach something; at most six segments of each.
 
-    Parameters
-    ----------
-    folder, features, gate, space
-        As of `home_recordings`.
-
-    Yields
-    ------
-    Recording
-
-    Raises
-    ------
-    LogError, DataError
-        As of `home_recordings`.
+    Raise `LogError, DataError` as of `home_recordings`.
     """
     sounds = (teaching(sound) for sound in read_reviewed_sound(folder, features, space=space))
     yield from marked_recordings(sounds, folder, features, gate)
@@ -169,10 +125,6 @@ def teaching(sound: HomeSound) -> HomeSound:
 
     Those are the marks of what a reviewer could not tell, and those that touch a span that was
     drawn at random.
-
-    Parameters
-    ----------
-    sound : HomeSound
     """
     return replace(sound, marks=_teaching(sound.marks, sound.reviewed))
 
@@ -220,12 +172,8 @@ def recording_of(
 
     Parameters
     ----------
-    sound : HomeSound
-    label : str
     frames : np.ndarray [shape=(n,)], intp
         Places of the frames.
-    floored : bool
-        Whether it is in the room.
     """
     stamps = sound.stamps[frames]
     span = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS

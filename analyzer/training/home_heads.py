@@ -41,15 +41,7 @@ class Heads(NamedTuple):
 
 
 def base_heads(model: Model, classes: Sequence[str]) -> Heads:
-    """Return the heads of a model as before it was ever adapted, with room for new classes.
-
-    Parameters
-    ----------
-    model : Model
-        With heads.
-    classes : sequence of str
-        The first of which are the first of the model.
-    """
+    """Return the heads of a model as before it was ever adapted, with room for new classes."""
     mix = model.description.embedding
     assert mix is not None
     count = len(mix.head_weights)
@@ -101,18 +93,8 @@ def learn_home(
 
     Parameters
     ----------
-    heads : Heads
-        As `base_heads` gives them.
-    windows : EmbeddingWindows
-        Of the home.
     marked : np.ndarray [shape=(m,)], bool
         Whether somebody has said what it is; the others are as they were labelled.
-    classes : sequence of str
-
-    Returns
-    -------
-    Heads
-        The same where there is no window of a sound.
     """
     sounds = sounds_of(classes)
     if UNKNOWN in classes and not heads.new:

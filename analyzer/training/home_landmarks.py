@@ -52,15 +52,6 @@ class HomeLandmarks(Method):
 
     The landmarks, each by what the base says of it, keep the base as it is where the home has no
     windows: a home has few sources, of few classes.
-
-    Attributes
-    ----------
-    base : mapping of str to np.ndarray
-        Arrays of the classifier, as of `LandmarksKind`.
-    values : mapping of str to value
-        Its `LandmarkParameters`.
-    inverse : float
-        Its inverse temperature before it was ever adapted.
     """
 
     base: Mapping[str, Array] = field(default_factory=dict, compare=False)
@@ -146,15 +137,8 @@ def is_moved(model: Model) -> bool:
 def learned_over(base: Model) -> Model:
     """Return a model whose landmarks say what the classifier of another kind says.
 
-    Parameters
-    ----------
-    base : Model
-        If a home has adapted it, so is what is learned, but for the classes that it has from there.
-
-    Raises
-    ------
-    DataError
-        If the classifier has kept no inputs of its kind, or none of one of its classes.
+    Raise `DataError` if the classifier has kept no inputs of its kind, or none of one of its
+    classes.
     """
     kept = kept_inputs(base)
     if kept is None or not len(kept[0]):

@@ -60,8 +60,6 @@ class Lessons(NamedTuple):
     segments : Dataset
         Of the classes of the model that was adapted first, and new ones behind them; none if there
         is nothing to learn from marks.
-    notes : list of str
-        What could not be used, and what a reviewer could do.
     nothing : str
         Why there is nothing to learn from marks; empty if there is.
     """
@@ -76,10 +74,6 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> L
 
     Parameters
     ----------
-    folders : sequence of Path
-        Folders of logs, with review layers beside them, and of enrolled sounds.
-    model : Model
-        Which is to be adapted.
     scenario : str, optional
         For which it labels: only what was marked of this scenario, by its name, is learned from;
         else only what was marked of none.

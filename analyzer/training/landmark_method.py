@@ -38,19 +38,7 @@ _LEAST = 1e-6  # of the largest eigenvalue: what is below is rounding
 
 @dataclass(frozen=True)
 class LandmarkMethod(WindowMethod):
-    """Multinomial logistic regression on a Nyström map of the inputs.
-
-    Attributes
-    ----------
-    cost : float
-        Of a wrong window, against large weights on the map.
-    gamma : float
-        Of the kernel, times the number of inputs.
-    landmarks : int
-        Centres of the windows of each class, of all classes together.
-    steps : int
-        Of a standard deviation, to which inputs are rounded.
-    """
+    """Multinomial logistic regression on a Nyström map of the inputs."""
 
     cost: float = 10 / 3
     gamma: float = 0.5
@@ -84,10 +72,7 @@ class LandmarkMethod(WindowMethod):
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> LearnedMachine:
         """Learn from some segments, as of `Method.fit`.
 
-        Raises
-        ------
-        DataError
-            If there are fewer landmarks than classes.
+        Raise `DataError` if there are fewer landmarks than classes.
         """
         with single_thread():
             return super().fit(examples, seen)
@@ -139,12 +124,6 @@ class LandmarkMethod(WindowMethod):
 class LandmarkMap:
     """Kernels of landmarks, and the root that makes their products those of the kernel.
 
-    Parameters
-    ----------
-    arrays : mapping of str to np.ndarray
-        As of `LandmarksKind`; its weights are not needed.
-    parameters : LandmarkParameters
-
     Attributes
     ----------
     root : np.ndarray [shape=(m, m)], float64
@@ -178,14 +157,11 @@ def centres(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    scaler : mapping of str to np.ndarray
-        As of `hearthlog.models.classifiers.scaler`.
     inputs : np.ndarray [shape=(n, width)], float32
     target : np.ndarray [shape=(n,)], intp
     weight : np.ndarray [shape=(n,)], float64
     most : int
         Centres of all classes; each has one at least that has a window.
-    seed : int, optional
     """
     scaled = Scaler(scaler)(inputs)
     windows = np.bincount(target)

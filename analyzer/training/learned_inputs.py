@@ -23,9 +23,6 @@ def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) 
     target : np.ndarray [shape=(n,)], intp
         Their classes.
     weight : np.ndarray [shape=(n,)], float64
-    most : int
-        How many.
-    seed : int
 
     Returns
     -------
@@ -90,7 +87,6 @@ def in_whole_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
 
     Parameters
     ----------
-    scaler : StandardScaler
     steps : int or None
         Of a standard deviation; None: nothing is rounded.
     """
@@ -126,10 +122,6 @@ def kept_inputs(model: Model) -> tuple[Float32, Indices] | None:
     """Return the inputs of windows that a model has kept of what it learned from.
 
     Those of a model that was adapted are those of its base.
-
-    Parameters
-    ----------
-    model : Model
 
     Returns
     -------

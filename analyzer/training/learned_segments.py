@@ -30,10 +30,6 @@ def segment_digests(windows: Float32) -> Int64:
 def learned_digests(model: Model) -> Int64:
     """Return the digests of what a model has learned from; older models have kept the segments.
 
-    Parameters
-    ----------
-    model : Model
-
     Returns
     -------
     np.ndarray [shape=(m,)], int64
@@ -45,12 +41,6 @@ def learned_digests(model: Model) -> Int64:
 
 def learned_groups(model: Model, data: Dataset) -> Indices:
     """Return the source groups of which a model has learned from a segment.
-
-    Parameters
-    ----------
-    model : Model
-    data : Dataset
-        Of the feature set of the model.
 
     Returns
     -------

@@ -23,11 +23,6 @@ class LabelledClip:
 
     Attributes
     ----------
-    path : Path
-        The audio file.
-    label : str
-    source_group : str
-        The original recording or speaker; folds never split a group.
     source, licence : str
         Its collection and licence; empty where the manifest does not say.
     start, end : float
@@ -77,12 +72,7 @@ def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
 
 
 def example_of(left_out: Sequence[LeftOut]) -> str:
-    """Name the first clip that was left out, behind the reasons; empty if there is none.
-
-    Parameters
-    ----------
-    left_out : sequence of LeftOut
-    """
+    """Name the first clip that was left out, behind the reasons; empty if there is none."""
     return f", such as {left_out[0].clip}" if left_out else ""
 
 

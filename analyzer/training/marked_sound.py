@@ -44,25 +44,16 @@ class HomeSound:
 
     Attributes
     ----------
-    log : Path
-    microphone : str
-    marks : sequence of Mark
-        In the order of time.
-    reviewed : sequence of ReviewedSpan
     stamps, frames : np.ndarray [shape=(n,)], int64
         Start of each frame in nanoseconds of UTC, and its number.
     values : np.ndarray [shape=(n, d)], float32
         Features; d is 0 if they are of another set.
     floors : np.ndarray [shape=(n, b)], float64, or None
         Floor of the room; None for a feature set without bands.
-    labelling : str
-        The recorder's that it was said of: `live`, or `scenario/<name>`.
     directions : Directions
         Of an array; none where only features were wanted.
     embeddings : Embeddings
         Of the network that was asked for; none of another one.
-    embedding : EmbeddingSpace or None
-        Of those that the log has, of whatever network.
     """
 
     log: Path
@@ -113,22 +104,8 @@ def read_reviewed_sound(
 ) -> Iterator[HomeSound]:
     """Read what was marked or looked at in the logs of a folder, log by log.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of logs, with review layers beside them, and of enrolled sounds.
-    features : FeatureSet
-    scenario : str, optional
-        What is said of this scenario, by its name, instead of the sounds of the home.
-    space : EmbeddingSpace, optional
-        Of the embeddings that are wanted.
-
-    Raises
-    ------
-    LogError
-        If there is no log, or if a log or a layer is damaged.
-    DataError
-        If there are marks, and all of them are in logs of other sets.
+    Raise `LogError` if there is no log, or if a log or a layer is damaged. Raise `DataError` if
+    there are marks, and all of them are in logs of other sets.
     """
     other: tuple[Path, str] | None = None  # log and microphone of another set
     usable = False
@@ -168,14 +145,9 @@ def read_sound_of(
 
     Parameters
     ----------
-    log : Path
-    features : FeatureSet
-    microphones : collection of str
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC. The floor is tracked from ten minutes
         before it on.
-    scenario : str, optional
-        As of `read_reviewed_sound`.
 
     Raises
     ------
@@ -229,7 +201,6 @@ def with_embeddings(
 
     Parameters
     ----------
-    sound : HomeSound
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC.
     space : EmbeddingSpace or None

@@ -70,11 +70,8 @@ class Examples(NamedTuple):
 
         Parameters
         ----------
-        learned : Learned
         unseen : np.ndarray [shape=(m,)], intp
             Indices of segments.
-        classes : int
-            C, the number of classes.
 
         Returns
         -------
@@ -207,23 +204,8 @@ class Method(ABC):
 def prepare(method: Method, data: Dataset) -> Examples:
     """Compute the inputs of segments for a method; the same segments give the same inputs.
 
-    Parameters
-    ----------
-    method : Method
-    data : Dataset
-        Segments of the method's feature set.
-
-    Returns
-    -------
-    inputs : Examples
-        All segments of `data`, in their order, unchanged and in `method.copies` augmented copies.
-
-    Raises
-    ------
-    DataError
-        If the method wants augmented copies and its feature set has none.
-    ModelError
-        If the feature set is not installed.
+    Raise `DataError` if the method wants augmented copies and its feature set has none. Raise
+    `ModelError` if the feature set is not installed.
     """
     features, rng = method.features, np.random.default_rng(_SEED + method.seed)
     if method.copies and features.augmented is None:
@@ -280,7 +262,6 @@ def loud_windows(power: Float64, window_frames: int, least: Float64 | None = Non
     ----------
     power : np.ndarray [shape=(n, f)], float64
         Mean squares of the frames of each segment.
-    window_frames : int
     least : np.ndarray [shape=(n, 1)], float64, optional
         What they must be above besides.
 

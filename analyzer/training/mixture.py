@@ -33,16 +33,7 @@ _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 @dataclass(frozen=True)
 class HeadInputs:
-    """The values of an embedding that the linear heads of a model are learned on.
-
-    Attributes
-    ----------
-    network, projection_sha256 : str
-    names : tuple of str
-        Of the values of a window.
-    inputs : tuple of slice
-        Of the linear heads.
-    """
+    """The values of an embedding that the linear heads of a model are learned on."""
 
     network: str
     projection_sha256: str
@@ -58,15 +49,7 @@ class HeadInputs:
 def head_inputs_of(network: str) -> HeadInputs:
     """Return the values of the embeddings of a network that linear heads are learned on.
 
-    Parameters
-    ----------
-    network : str
-        Its name.
-
-    Raises
-    ------
-    ModelError
-        If it is not known, or its projection is damaged.
+    Raise `ModelError` if it is not known, or its projection is damaged.
     """
     projection = read_projection(NETWORKS.get(network).projection)
     components = projection.components.shape[1]
@@ -84,7 +67,6 @@ def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
 
     Parameters
     ----------
-    data : Dataset
     unseen : np.ndarray [shape=(k,)], intp
         Segments that are left out: with them go the sources and collections of which all segments
         are.
@@ -104,14 +86,6 @@ def cross_validated_heads(
 ) -> Float64:
     """Return what heads say of segments that they have not learned from.
 
-    Parameters
-    ----------
-    data : Dataset
-    mix : EmbeddingMix
-    inputs : sequence of slice
-        Of its linear heads.
-    folds : sequence of Fold
-
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
@@ -128,12 +102,7 @@ def cross_validated_heads(
 
 
 def can_learn_heads(data: Dataset) -> bool:
-    """Return whether heads can be learned: from two classes of sound, of some sources each.
-
-    Parameters
-    ----------
-    data : Dataset
-    """
+    """Return whether heads can be learned: from two classes of sound, of some sources each."""
     sources = _sources(data)[sounds_of(data.classes)]
     return int((sources >= FEWEST_SOURCES).sum()) > 1
 
@@ -143,7 +112,6 @@ class Tried(NamedTuple):
 
     Attributes
     ----------
-    folds : sequence of Fold
     decisions : np.ndarray [shape=(n, C)], float64
         Of the classifier, times its inverse temperature.
     used : np.ndarray [shape=(n,)], bool
@@ -160,8 +128,6 @@ class Mixture(NamedTuple):
 
     Attributes
     ----------
-    mix : EmbeddingMix
-    heads : LinearHeads
     of_sources, of_collections : np.ndarray [shape=(n, C)], float64
         Logarithms of the probabilities of segments left out, with what the others say of how sure
         the mix may be.
@@ -178,9 +144,6 @@ class BestMix(NamedTuple):
 
     Attributes
     ----------
-    mix : EmbeddingMix
-    inputs : tuple of slice
-        Of its linear heads.
     by_heads : list of np.ndarray [shape=(n, C)], float64
         What heads say of segments, for each way of leaving out.
     left_out : list of np.ndarray [shape=(n, C)], float64
@@ -203,9 +166,6 @@ def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix
 
     Parameters
     ----------
-    data : Dataset
-        With windows for heads.
-    taken : HeadInputs
     ways : sequence of Tried
         At least one.
     """
@@ -268,10 +228,6 @@ def learn_mixture(
 
     Parameters
     ----------
-    data : Dataset
-        With windows for heads.
-    taken : HeadInputs
-    sources : Tried
     collections : Tried or None
         None if there are too few of them.
     """
@@ -304,11 +260,6 @@ def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
 def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
     """Return what the names of a network say of whether a sound is of any known class.
 
-    Parameters
-    ----------
-    taken : HeadInputs
-    classes : sequence of str
-
     Returns
     -------
     NamesHead or None
@@ -331,13 +282,7 @@ def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | Non
 
 
 def names_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
-    """Return what the names of a network say of some classes; None if one of them has no name.
-
-    Parameters
-    ----------
-    taken : HeadInputs
-    classes : sequence of str
-    """
+    """Return what the names of a network say of some classes; None if one of them has no name."""
     first, groups = taken.inputs[-1].start, taken.groups
     named = {name: _groups_of(name) for name in classes if name != SILENCE}
     if len(named) < 2 or not all(one in groups for same in named.values() for one in same):

@@ -57,11 +57,6 @@ def in_room(
     ----------
     frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         At least one frame.
-    features : FeatureSet
-        A set with bands.
-    rng : np.random.Generator
-    silence : bool
-        Whether nothing happens in the sound: then the noise is of any level.
     """
     sound, level = other_room(frames, rng, silence=silence)
     return in_noise(sound, level, features, rng, silence=silence)
@@ -76,9 +71,6 @@ def other_room(
     ----------
     frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         At least one frame.
-    rng : np.random.Generator
-    silence : bool
-        Whether nothing happens in the sound: then the noise is of any level.
 
     Returns
     -------
@@ -109,11 +101,6 @@ def in_noise(
         Samples of whole frames at 16 kHz, at least one frame.
     level : float
         Of the noise, in dBFS.
-    features : FeatureSet
-        A set with bands.
-    rng : np.random.Generator
-    silence : bool
-        Whether nothing happens in the sound: then it belongs to the floor.
     """
     noise = steady_noise(len(sound), level, rng)
     copy = captured(sound + noise, features)
@@ -136,14 +123,7 @@ def level_of(sound: Float64) -> float:
 
 
 def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
-    """Compute the features of some seconds of steady noise.
-
-    Parameters
-    ----------
-    features : FeatureSet
-        A set with bands.
-    rng : np.random.Generator
-    """
+    """Compute the features of some seconds of steady noise."""
     level = rng.uniform(*_STEADY_DBFS)
     noise = steady_noise(_STEADY_SECONDS * SAMPLE_RATE, level, rng)
     copy = captured(noise, features)
@@ -165,7 +145,6 @@ def reverberated(
         Until the reverberation has fallen by 60 dB (RT60).
     direct : float
         Direct sound above the reverberation, in dB.
-    rng : np.random.Generator
 
     Returns
     -------
@@ -265,11 +244,8 @@ def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
 
     Parameters
     ----------
-    count : int
-        Number of samples.
     level : float
         In dBFS.
-    rng : np.random.Generator
 
     Returns
     -------
@@ -289,7 +265,6 @@ def captured(sound: Float64, features: FeatureSet) -> Float32:
     ----------
     sound : np.ndarray [shape=(n,)], float64
         Samples of whole frames at 16 kHz in full scale; those beyond it are clipped.
-    features : FeatureSet
 
     Returns
     -------

@@ -23,16 +23,7 @@ LABELS = frozenset(row.name for row in sound.CLASSES) - {sound.OTHER, sound.UNKN
 
 @dataclass(frozen=True)
 class Scenario:
-    """The classes of a model, and the labels of each.
-
-    Attributes
-    ----------
-    name : str
-    classes : mapping of str to tuple of str
-        Each class and the labels that belong to it, in the order of the model's classes.
-    ignored : frozenset of str
-        Labels that may stand in a manifest and are left out.
-    """
+    """The classes of a model, and the labels of each."""
 
     name: str
     classes: Mapping[str, tuple[str, ...]]
@@ -48,13 +39,6 @@ class Scenario:
 
         It is the class that lists this very label. If none does, it is the one that lists another
         name of the same sound (see `hearthlog.models.classes`), unless two classes do.
-
-        Parameters
-        ----------
-        label : str
-            As in a manifest, or as a reviewer gives it.
-        marked : bool
-            Whether a reviewer gives it: then the names of the classes are labels, too.
 
         Returns
         -------
@@ -72,11 +56,6 @@ class Scenario:
     def with_unknown(self, sources: Iterable[tuple[str, str]]) -> "Scenario":
         """Return this scenario with a class `unknown` of all that is in none of its classes.
 
-        Parameters
-        ----------
-        sources : iterable of (str, str)
-            Label and source group of each clip of a manifest.
-
         Returns
         -------
         Scenario
@@ -92,12 +71,7 @@ class Scenario:
         return Scenario(self.name, {**self.classes, sound.UNKNOWN: labels}, self.ignored)
 
     def with_classes(self, names: Iterable[str]) -> "Scenario":
-        """Return this scenario with some of its classes; labels of the others are unknown again.
-
-        Parameters
-        ----------
-        names : iterable of str
-        """
+        """Return this scenario with some of its classes; labels of the others are unknown again."""
         classes = {name: self.classes[name] for name in names}
         if sound.UNKNOWN in classes:
             others = [labels for name, labels in self.classes.items() if name not in classes]
@@ -105,13 +79,7 @@ class Scenario:
         return Scenario(self.name, classes, self.ignored)
 
     def with_taught(self, learned: Mapping[str, tuple[str, ...]]) -> "Scenario":
-        """Return this scenario with the classes that a home teaches, which then are not unknown.
-
-        Parameters
-        ----------
-        learned : mapping of str to tuple of str
-            The new classes, and the labels of each.
-        """
+        """Return this scenario with the classes that a home teaches, which then are not unknown."""
         classes = {**self.classes, **learned}
         if sound.UNKNOWN in self.classes:
             taken = learned.keys() | {one for labels in learned.values() for one in labels}

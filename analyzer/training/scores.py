@@ -26,11 +26,8 @@ class ClassScores:
 
     Attributes
     ----------
-    precision, recall, f1 : float or None
     f1_interval : tuple of float, or None
         95 %, bootstrap over groups; None with a single group.
-    support : int
-        True segments of the class.
     """
 
     precision: float | None
@@ -46,15 +43,8 @@ class Scores:
 
     Attributes
     ----------
-    macro_f1, macro_precision, macro_recall : float
-        Means over the classes that occur.
     macro_f1_interval : tuple of float, or None
         95 %, bootstrap over groups; None with a single group.
-    per_class : dict of str to ClassScores
-    confusion : list of list of int
-        True classes in rows, predicted ones in columns.
-    segments, groups : int
-    classes : tuple of str
     """
 
     macro_f1: float
@@ -74,12 +64,8 @@ class Bin:
 
     Attributes
     ----------
-    bin : int
     confidence : float
         Mean probability of the winning class.
-    accuracy : float
-        Share in which it is the true one.
-    count : int
     """
 
     bin: int
@@ -119,8 +105,6 @@ def score(
         Indices of the true classes and of the predicted ones.
     group : np.ndarray [shape=(n,)], int
         Numbers of the source groups, which are resampled as a whole for the intervals.
-    classes : sequence of str
-        Names of the C classes.
     weight : np.ndarray [shape=(n,)], int64, optional
         How many segments a row stands for; one by default. At least 0.
 
@@ -173,8 +157,6 @@ def difference(
         Of the two models; the class of the highest one is the predicted one.
     group : np.ndarray [shape=(n,)], int
         Numbers of the source groups, which are resampled as a whole for the interval.
-    classes : sequence of str
-        Names of the C classes.
 
     Raises
     ------

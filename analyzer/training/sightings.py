@@ -46,13 +46,7 @@ class Sighting(NamedTuple):
 
 
 def sighting_of(microphone: str, directions: Directions) -> Sighting | None:
-    """Sum up the directions of a recording; None if it has none.
-
-    Parameters
-    ----------
-    microphone : str
-    directions : Directions
-    """
+    """Sum up the directions of a recording; None if it has none."""
     weight = directions.confidences.astype(np.float64)
     if not weight.sum() > 0:
         return None
@@ -71,11 +65,6 @@ def with_directions(model: Model, target: Indices, sightings: Sequence[Sighting 
         Classes of segments that it was learned from; those of silence say nothing.
     sightings : sequence of (Sighting or None)
         Whence they came, if that is known; empty if it is of none.
-
-    Returns
-    -------
-    Model
-        The same model where directions tell nothing.
     """
     silence = model.classes.index(SILENCE) if SILENCE in model.classes else -1
     located = zip(target.tolist(), sightings, strict=False)
@@ -112,7 +101,6 @@ def evidence_of(classifier: Classifier, sightings: Sequence[Sighting | None]) ->
 
     Parameters
     ----------
-    classifier : Classifier
     sightings : sequence of (Sighting or None)
         Of n segments; empty if it is known of none.
 

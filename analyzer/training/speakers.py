@@ -34,20 +34,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
 
     Enrolled spans of logs are one source where they are less than half an hour apart.
 
-    Parameters
-    ----------
-    folders : iterable of Path
-    features : FeatureSet
-
-    Yields
-    ------
-    Recording
-        Of a voice, of silence, or of another sound; those have labels of the table of classes.
-
-    Raises
-    ------
-    LogError, DataError
-        As of `hearthlog.analyzer.training.home_data.home_recordings`.
+    Raise `LogError, DataError` as of `hearthlog.analyzer.training.home_data.home_recordings`.
     """
     cut: list[Recording] = []
     for folder in folders:
@@ -95,14 +82,7 @@ def is_voice(label: str) -> bool:
 def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
     """Return the scenario of the voices that are enrolled, silence, and all else as `unknown`.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-
-    Raises
-    ------
-    DataError
-        If no voice is enrolled, or one only once, or for less than ten seconds.
+    Raise `DataError` if no voice is enrolled, or one only once, or for less than ten seconds.
     """
     groups: dict[str, set[str]] = {}
     seconds: dict[str, float] = {}
@@ -130,14 +110,6 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
 
 def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32, Indices]:
     """Return what a model of sounds has learned from: in the scenario silence, or unknown.
-
-    Parameters
-    ----------
-    model : Model
-        Such as the starter model `general`.
-    method : Method
-        That learns the scenario.
-    scenario : Scenario
 
     Returns
     -------

@@ -38,14 +38,8 @@ class SvmMethod(Method):
 
     Attributes
     ----------
-    cost : float
-        Cost of a window on the wrong side of the margin.
-    gamma : float
-        Gamma of the kernel, times the number of inputs.
     steps : int or None
         Of a standard deviation, to which inputs are rounded; None for a model that does not.
-    most_windows : int
-        That are learned from; the time that it takes grows with their square.
     """
 
     cost: float = 4.0
@@ -68,7 +62,6 @@ class SvmMethod(Method):
 
         Parameters
         ----------
-        examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
             Indices of the segments to learn from; all by default.
         """
@@ -119,12 +112,8 @@ class LearnedSvm:
 
     Parameters
     ----------
-    machine : sklearn.pipeline.Pipeline
-        A scaler, what rounds to steps if they are rounded, and an `SVC`.
     support : np.ndarray [shape=(n, width)], float32
         Inputs that became support vectors, in the order of the `SVC`.
-    steps : int or None
-        Of a standard deviation, to which inputs are rounded.
     """
 
     def __init__(self, machine: Pipeline, support: Float32, steps: int | None) -> None:
@@ -138,8 +127,6 @@ class LearnedSvm:
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
-        classes : int
-            C, the number of all classes.
 
         Returns
         -------
@@ -179,11 +166,5 @@ SVM = SvmMethod("svm", **as_room(SVM_RBF), cost=1.0, gamma=0.5)
 
 
 def network_method(name: str) -> SvmMethod:
-    """Return the method that learns from the embeddings of a network.
-
-    Parameters
-    ----------
-    name : str
-        Of the network, and of the method.
-    """
+    """Return the method that learns from the embeddings of a network."""
     return SvmMethod(name, name, INPUTS, SVM_RBF.name, copies=0, rooms=1, cost=4.0, gamma=0.5)

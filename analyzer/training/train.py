@@ -163,14 +163,7 @@ def train_model(  # noqa: PLR0913, PLR0917
 def check_varied(data: Dataset) -> None:
     """Check that not all segments are alike.
 
-    Parameters
-    ----------
-    data : Dataset
-
-    Raises
-    ------
-    DataError
-        If there are segments, and their features never change.
+    Raise `DataError` if there are segments, and their features never change.
     """
     if len(data) and (np.ptp(data.windows.reshape(-1, data.windows.shape[2]), axis=0) == 0).all():
         raise DataError("all segments are alike: their features never change; is this sound?")
@@ -179,23 +172,8 @@ def check_varied(data: Dataset) -> None:
 def group_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
 
-    Parameters
-    ----------
-    data : Dataset
-    taught : set of int
-        Numbers of classes that are always learned from something else, too.
-
-    Returns
-    -------
-    list of Fold
-        Indices of the segments to learn from, among which every other class is, and of those to
-        test on.
-
-    Raises
-    ------
-    DataError
-        If another class comes from fewer than two groups, or no division leaves every such class
-        something to learn from.
+    Raise `DataError` if another class comes from fewer than two groups, or no division leaves
+    every such class something to learn from.
     """
     sources = [amount.sources for amount in data.amounts.values()]
     needed = [number for number in range(len(data.classes)) if number not in taught]

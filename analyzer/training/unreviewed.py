@@ -35,10 +35,6 @@ def unreviewed_silence(
 
     Parameters
     ----------
-    folders : sequence of Path
-        Of logs.
-    model : Model
-        With a class of silence.
     scenario : str, optional
         For which it labels; empty for the sounds of the home.
 
@@ -62,11 +58,6 @@ def unreviewed_sounds(
 
     Parameters
     ----------
-    folders : sequence of Path
-        Of logs.
-    model : Model
-    names : collection of str
-        Of its classes.
     scenario : str, optional
         For which it labels; empty for the sounds of the home.
 

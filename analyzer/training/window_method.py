@@ -19,13 +19,7 @@ _SEED = 20_261_122
 
 @dataclass(frozen=True)
 class WindowMethod(Method):
-    """A classifier of scikit-learn, whose classes are weighted against their number.
-
-    Attributes
-    ----------
-    most_windows : int
-        That are learned from, those that method `room` would learn from.
-    """
+    """A classifier of scikit-learn, whose classes are weighted against their number."""
 
     most_windows: int = 12_000
 
@@ -44,7 +38,6 @@ class WindowMethod(Method):
 
         Parameters
         ----------
-        examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
             Indices of the segments to learn from; all by default.
         """
@@ -68,23 +61,11 @@ class WindowMethod(Method):
         target : np.ndarray [shape=(n,)], intp
             Numbers of their classes, of which none is without a window.
         weight : np.ndarray [shape=(n,)], float64
-
-        Returns
-        -------
-        machine : Machine
-        arrays, parameters : dict
-            Those of a model.
         """
 
 
 def as_room(kind: ClassifierKind) -> dict[str, Any]:
-    """Return the fields of a method with the inputs of method `room`.
-
-    Parameters
-    ----------
-    kind : ClassifierKind
-        That it learns.
-    """
+    """Return the fields of a method with the inputs of method `room`."""
     return {
         "feature_set": "home33",
         "inputs": "above_floor",
@@ -101,14 +82,8 @@ class LearnedMachine:
 
     Parameters
     ----------
-    machine : Machine
-        Of the classes that were learned.
     classes : np.ndarray [shape=(c,)], intp
         Their numbers, an attribute.
-    arrays : mapping of str to np.ndarray
-        Of a model.
-    parameters : mapping of str to value
-        The field `parameters` of its description.
     """
 
     def __init__(

@@ -45,21 +45,8 @@ def connected(scheduler: str) -> Iterator["Cluster"]:
     Workers of another version that join later get no tasks; they are named in a HearthlogWarning
     when the block ends.
 
-    Parameters
-    ----------
-    scheduler : str
-        Address of the scheduler, as `tcp://host:port`.
-
-    Yields
-    ------
-    Cluster
-        Open until the block ends.
-
-    Raises
-    ------
-    WorkerError
-        If Dask is not installed, there is no such scheduler, it has no workers, or a worker has
-        another version of hearthlog.
+    Raise `WorkerError` if Dask is not installed, there is no such scheduler, it has no workers,
+    or a worker has another version of hearthlog.
     """
     try:
         from distributed import Client  # noqa: PLC0415  part of the extra `cluster`
@@ -108,12 +95,6 @@ class Cluster:
     All that waits for the cluster waits, in the event loop of the client, for the end of `_watch`
     too, which looks at the cluster once a second: so nothing outlives the scheduler, and no task
     costs a call of its own.
-
-    Parameters
-    ----------
-    client : distributed.Client
-    scheduler : str
-        Its address, for messages.
     """
 
     def __init__(self, client: "Client", scheduler: str) -> None:
@@ -128,10 +109,7 @@ class Cluster:
     def open(self) -> None:
         """Wait for workers, and compare their versions.
 
-        Raises
-        ------
-        WorkerError
-            As `connected` does.
+        Raise `WorkerError` as `connected` does.
         """
         self._in_loop(self._begin()).result()
 
@@ -157,17 +135,9 @@ class Cluster:
 
         Parameters
         ----------
-        function : callable
-            At the top level of a module, which the worker imports.
         *args
             Arguments of the function, which can be pickled. A large array that several tasks have
             is sent once, and must not change.
-
-        Returns
-        -------
-        concurrent.futures.Future
-            It raises what the function raises, LostClusterError if the scheduler is gone, and
-            WorkerError if the task killed its workers.
         """
         future = self._in_loop(self._until_lost(self._run(function, args)))
         self._open.add(future)

@@ -12,13 +12,7 @@ _SILENT_SECONDS = 20.0  # after which a scheduler that does not answer is as goo
 
 
 class Members:
-    """The workers of a cluster, as they come and go.
-
-    Parameters
-    ----------
-    client : distributed.Client
-        All methods run in its event loop.
-    """
+    """The workers of a cluster, as they come and go."""
 
     def __init__(self, client: "Client") -> None:
         self._client = client
@@ -32,10 +26,7 @@ class Members:
     async def look(self) -> None:
         """Ask the scheduler which workers there are, and new ones for their version.
 
-        Raises
-        ------
-        OSError, TimeoutError
-            If the scheduler does not answer.
+        Raise `OSError, TimeoutError` if the scheduler does not answer.
         """
         scheduler: Any = self._client.scheduler
         identity = await asyncio.wait_for(scheduler.identity(n_workers=-1), _SILENT_SECONDS)

@@ -16,19 +16,7 @@ _CLUSTER: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
 
 def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
-    """Yield the results of calls, in their order.
-
-    Parameters
-    ----------
-    calls : iterable of joblib.delayed
-        With positional arguments. They run in up to four threads, since libsvm releases the lock,
-        or in the block of `fits_on` on the cluster.
-
-    Yields
-    ------
-    object
-        What each call returned; the first error of a call is raised.
-    """
+    """Yield the results of calls, in their order."""
     cluster = _CLUSTER.get()
     if cluster is not None:
         yield from _on(cluster, calls)

@@ -10,36 +10,12 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
-    """Pickle a call.
-
-    Parameters
-    ----------
-    function : callable
-        At the top level of a module, since it is pickled by its name.
-    args : tuple
-        Its positional arguments, which can be pickled.
-
-    Returns
-    -------
-    bytes
-        For `attempt`.
-    """
+    """Pickle a call."""
     return pickle.dumps((function, args))
 
 
 def attempt(call: bytes) -> bytes:
-    """Do a call, and pickle its result or its exception.
-
-    Parameters
-    ----------
-    call : bytes
-        From `pack_call`.
-
-    Returns
-    -------
-    bytes
-        For `read_reply`. An exception that cannot be pickled becomes a WorkerError.
-    """
+    """Do a call, and pickle its result or its exception."""
     try:
         function, args = pickle.loads(call)  # noqa: S301  sent by our own parent or client
         return pickle.dumps((function(*args), None))
@@ -49,11 +25,6 @@ def attempt(call: bytes) -> bytes:
 
 def read_reply(reply: bytes) -> Any:
     """Return what the call returned, or raise what it raised.
-
-    Parameters
-    ----------
-    reply : bytes
-        From `attempt`.
 
     Raises
     ------

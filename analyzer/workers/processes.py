@@ -58,21 +58,7 @@ class Processes:
                 self.submit(import_module, module)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
-        """Run a function once a process is free.
-
-        Parameters
-        ----------
-        function : callable
-            At the top level of a module, which the process imports.
-        *args
-            Arguments of the function, which can be pickled.
-
-        Returns
-        -------
-        concurrent.futures.Future
-            It raises what the function raises, and WorkerError if the task lost its worker three
-            times, or if the processes were closed.
-        """
+        """Run a function once a process is free."""
         return self._threads.submit(self._run, function, args)
 
     def close(self) -> None:

@@ -53,15 +53,9 @@ def open_workers(
     count : int
         Number of processes, at least 1; with 1 each task runs in this process, when it is
         submitted.
-    scheduler : str, optional
-        Address of a running Dask cluster, as `tcp://host:port`; its workers are used instead.
     module : str, optional
         Name of the module of the tasks: processes start and import it at once, not with the first
         task.
-
-    Yields
-    ------
-    Workers
 
     Raises
     ------
@@ -86,19 +80,7 @@ class InlineWorkers:
     parallel = 1
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a function at once.
-
-        Parameters
-        ----------
-        function : callable
-        *args, **kwargs
-            Arguments of the function.
-
-        Returns
-        -------
-        concurrent.futures.Future
-            Done; it raises what the function raised.
-        """
+        """Run a function at once."""
         future: Future[T] = Future()
         try:
             future.set_result(function(*args, **kwargs))

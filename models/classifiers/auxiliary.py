@@ -13,13 +13,7 @@ class Auxiliary(NamedTuple):
     embeddings: Embeddings = NO_EMBEDDINGS
 
     def known_at(self, first: int, count: int) -> "Auxiliary":
-        """Return those that become known with some successive frames.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
-        """
+        """Return those that become known with some successive frames."""
         return Auxiliary(
             self.directions.known_at(first, count), self.embeddings.known_at(first, count)
         )

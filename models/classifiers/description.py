@@ -70,12 +70,6 @@ class TrainingData(_Record):
 
     Attributes
     ----------
-    home : dict of str to Amount
-        What a home added, by class, if the model was adapted.
-    home_confirmed : dict of str to int
-        Segments among these that a reviewer has left as they were labelled; the others are marked.
-    home_frames : int
-        Frames of the home from which a model of an earlier version learned transitions.
     home_spans : list of [start, end]
         Time of the home whose sound was learned from, in nanoseconds of UTC, in order; by whatever
         microphone, and with what is less than a minute between.
@@ -126,20 +120,12 @@ class Elsewhere(_Record):
 
     Attributes
     ----------
-    collections : int
-        Number of collections, each of which was left out.
-    segments : int
-        Number of segments of classes that other collections have, too.
     right : float
         Share of them that were recognised.
-    expected_calibration_error : float
-        With the temperature from the other collections.
     macro_f1 : float or None
         Over the classes of these segments and `unknown`; None of models that were not told.
     macro_f1_interval : list of float, or None
         95 %, bootstrap over source groups.
-    classes : dict of str to float
-        F1 of each of the classes.
     calibration_errors : dict of str to float
         Of these segments, where ten or more were labelled as a class: how far the mean probability
         of it is from the share that is right.
@@ -160,16 +146,10 @@ class Smoothing(_Record):
 
     Attributes
     ----------
-    method : str
-        `merge`: successive equal labels become one. `hmm`: the labels are those of the likeliest
-        path through a hidden Markov model, decided `lag_seconds` after the sound.
-    lag_seconds : float
     weight : float
         Weight of a frame's probabilities in the hidden Markov model.
     reach_seconds : float
         Time by which a border of silence is moved at most, to where the level changes.
-    shortest_seconds : float
-        States that are shorter give way to the one before.
     class_exponent : float or None
         Exponent of how likely a class other than silence is, relative to the likeliest of them;
         then the probability of silence counts by itself. None: the probabilities count as they are.
@@ -184,19 +164,7 @@ class Smoothing(_Record):
 
 
 class NamesHead(_Record):
-    """A head that has learned nothing: what the names of a network say as they are.
-
-    Attributes
-    ----------
-    weight : float
-        In the mix.
-    slope : float
-        Decision value of a step of a logged value.
-    classes : dict of str to list of int
-        Numbers of the logged values of each class, of which the highest counts.
-    bias : dict of str to float
-        What is added to the decision values of classes.
-    """
+    """A head that has learned nothing: what the names of a network say as they are."""
 
     weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]
     slope: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]
@@ -218,23 +186,10 @@ class EmbeddingMix(_Record):
 
     Attributes
     ----------
-    network : str
-        Its name.
-    projection_sha256 : str
-        SHA-256 of the projection from its output onto what is logged.
-    values : int
-        Number of the logged values of a window.
-    head_weights : list of float
-        Of the linear heads, in the mix.
-    names : list of NamesHead
-    machine_weight : float
-        Of the classifier.
     inverse_temperature : float
         Of the mix, the weighted mean of the logarithms of probabilities.
     base_inverse_temperature : float or None
         That of the model before it was adapted to a home; None if it never was.
-    bias : dict of str to float
-        What is added to the mean, by class.
     of_home : bool
         Whether there is one linear head more, of a home: its decision values are no logarithms of
         probabilities, but added to the sum of those of the other heads.
@@ -265,29 +220,15 @@ class Description(_Record):
 
     Attributes
     ----------
-    kind : str
-        Kind of classifier.
-    parameters : dict
-        Parameters of that kind.
-    feature_set, feature_set_version, inputs : str, int, str
-        Feature set of the classifier, and which of its inputs.
     feature_set_sha256 : str
         SHA-256 of the network whose values the features are; empty for other feature sets.
-    method : str
-        Method by which it was learned.
     label_frame : int
         Frame of a window, from 0 on, which the label of the window speaks of.
     gate : float
         A window is silence where no band is so many dB above the floor of the room; 0 for no
         gate.
-    copies : int
-        Number of augmented copies of each segment.
-    inverse_temperature : float
-        Factor of the decision values before the softmax, from calibration.
     base_inverse_temperature : float or None
         The one before the model was adapted to a home; None if it was not.
-    decision_bias : dict of str to float
-        What is added to the decision values of classes before.
     novelty : str
         `doubt`: the probability that a label is wrong. `machine`: what the kind of classifier
         gives, as older models have it.
@@ -298,8 +239,6 @@ class Description(_Record):
         The arrays of a home whose directions the model takes, by name; with any, the format is 6.
     embedding : EmbeddingMix or None
         What it takes of a network's embeddings; with any, the format is 7.
-    seed : int
-        Of what was drawn at random when it was learned.
     """
 
     format: Literal[5, 6, 7]
@@ -353,15 +292,7 @@ class Description(_Record):
 def read_description(text: str) -> Description:
     """Read a description, of this format or an older one.
 
-    Parameters
-    ----------
-    text : str
-        JSON.
-
-    Raises
-    ------
-    ModelError
-        If the description is of a newer format, is no JSON, or is invalid.
+    Raise `ModelError` if the description is of a newer format, is no JSON, or is invalid.
     """
     try:
         content = json.loads(text)
@@ -399,28 +330,12 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def first_problem(error: ValidationError) -> str:
-    """Return the first problem of a description on one line.
-
-    Parameters
-    ----------
-    error : pydantic.ValidationError
-
-    Returns
-    -------
-    str
-        `field: problem`, printable.
-    """
+    """Return the first problem of a description on one line."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
     return f"{one_line(where)}: {one_line(first['msg'])}"
 
 
 def one_line(text: object) -> str:
-    """Return a text from any file as a part of a message: printable, 200 characters at most.
-
-    Parameters
-    ----------
-    text : object
-        What `str` makes of it is shown.
-    """
+    """Return a text from any file as a part of a message: printable, 200 characters at most."""
     return printable(text)[:200]

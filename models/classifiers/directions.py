@@ -76,26 +76,11 @@ class DirectionEvidence:
         self._full_from: int | None = None
 
     def is_full(self, frame: int) -> bool:
-        """Tell whether directions before the first frame leave no trace from a frame on.
-
-        Parameters
-        ----------
-        frame : int
-            Number of the next frame.
-        """
+        """Tell whether directions before the first frame leave no trace from a frame on."""
         return self._full_from is not None and frame >= self._full_from
 
     def push(self, directions: Directions, first: int, count: int, windows: int) -> Float64:
         """Add successive frames.
-
-        Parameters
-        ----------
-        directions : Directions
-            That become known with these frames.
-        first, count : int
-            Number of the first frame, and how many.
-        windows : int
-            How many windows end with the last ones of these frames.
 
         Returns
         -------

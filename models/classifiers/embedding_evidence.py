@@ -24,8 +24,6 @@ class EmbeddingEvidence:
     ----------
     of_windows : callable
         Turns embeddings, shape (m, W), into values, shape (m, C).
-    classes : int
-        Number of classes.
     """
 
     def __init__(self, of_windows: Callable[[Int8], Float64], classes: int) -> None:
@@ -40,14 +38,7 @@ class EmbeddingEvidence:
         self._first: int | None = None
 
     def push(self, embeddings: Embeddings, first: int) -> None:
-        """Add embeddings.
-
-        Parameters
-        ----------
-        embeddings : Embeddings
-        first : int
-            Number of the first of the frames with which they become known.
-        """
+        """Add embeddings."""
         if self._first is None:
             self._first = first
         if not len(embeddings.frames):
@@ -57,23 +48,12 @@ class EmbeddingEvidence:
         self._values = np.concatenate([self._values, values])
 
     def is_full(self, frame: int) -> bool:
-        """Tell whether embeddings before the first frame leave no trace from a frame on.
-
-        Parameters
-        ----------
-        frame : int
-            Number of the next frame that is labelled.
-        """
+        """Tell whether embeddings before the first frame leave no trace from a frame on."""
         begin = frame - frame % HOP_FRAMES - _MIDDLE
         return self._first is not None and begin >= self._first
 
     def at(self, first: int, count: int) -> Float64:
         """Interpolate the evidence to successive frames, and forget that of earlier ones.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
 
         Returns
         -------

@@ -31,18 +31,10 @@ class EmbeddingHeads:
 
     Parameters
     ----------
-    mix : EmbeddingMix
     weights : np.ndarray [shape=(H, W, C)], int32
         Of the linear heads, in units of `UNIT`.
     bias : np.ndarray [shape=(H, C)], int32
         In the same units; `UNTAUGHT` for a class that is left to the other heads.
-    classes : sequence of str
-        Of the model.
-
-    Attributes
-    ----------
-    network, projection_sha256 : str
-        As of `EmbeddingMix`.
     """
 
     def __init__(
@@ -116,12 +108,7 @@ class _Names:
 
 
 def sounds_of(classes: Sequence[str]) -> Indices:
-    """Return the numbers of the classes that are no silence.
-
-    Parameters
-    ----------
-    classes : sequence of str
-    """
+    """Return the numbers of the classes that are no silence."""
     sounds = [number for number, name in enumerate(classes) if name != SILENCE]
     return np.array(sounds, np.intp)
 
@@ -152,8 +139,6 @@ def mixed(
         Logarithms of the probabilities of a classifier, plus any constant for each row.
     by_heads : np.ndarray [shape=(n, C)], float64
         As `EmbeddingHeads.log_probabilities` gives them.
-    mix : EmbeddingMix
-    classes : sequence of str
 
     Returns
     -------
@@ -175,12 +160,7 @@ def mixed(
 
 
 def mix_weight(mix: EmbeddingMix) -> float:
-    """Return the sum of all weights of a mix.
-
-    Parameters
-    ----------
-    mix : EmbeddingMix
-    """
+    """Return the sum of all weights of a mix."""
     return sum(mix.head_weights) + sum(head.weight for head in mix.names) + mix.machine_weight
 
 

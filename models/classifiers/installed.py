@@ -17,14 +17,6 @@ CLASSIFIERS = Extensions(
 def classifier_kind(name: str) -> ClassifierKind:
     """Return a kind of classifier by its name.
 
-    Parameters
-    ----------
-    name : str
-        As the field `kind` of a description has it, such as "svm-rbf".
-
-    Raises
-    ------
-    ModelError
-        If there is none of this name, or it cannot be imported.
+    Raise `ModelError` if there is none of this name, or it cannot be imported.
     """
     return CLASSIFIERS.get(name)

@@ -27,8 +27,6 @@ class LandmarkParameters(BaseModel):
     ----------
     gamma : float
         Of the kernel exp(-gamma |x - l|^2).
-    steps : int
-        Of a standard deviation, to which inputs are rounded.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
@@ -123,14 +121,7 @@ def all_landmarks(arrays: Mapping[str, Array]) -> Float32:
 
 
 class LandmarksMachine:
-    """Inference of one model.
-
-    Parameters
-    ----------
-    arrays : mapping of str to np.ndarray
-        As of `LandmarksKind`.
-    parameters : LandmarkParameters
-    """
+    """Inference of one model."""
 
     def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
         self._scaled = Scaler(arrays)

@@ -18,8 +18,6 @@ def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[i
 
     Parameters
     ----------
-    width : int
-        Number of inputs.
     arrays : mapping of str to np.ndarray
         Those of the model, by name; they may be of any type and shape.
     """
@@ -34,17 +32,8 @@ def target_problem(classes: int, arrays: Mapping[str, Array], *names: str) -> st
 
     Parameters
     ----------
-    classes : int
-        Number of classes.
     arrays : mapping of str to np.ndarray
         By name; of the right types and shapes, and finite.
-    *names : str
-        Of those that hold numbers of classes.
-
-    Returns
-    -------
-    str or None
-        The rest of a sentence that begins with the file.
     """
     for name in names:
         target = arrays.get(name, np.empty(0, np.int64))

@@ -27,14 +27,6 @@ class NameRule(BaseModel):
 
     Attributes
     ----------
-    value : int
-        Number of the logged value.
-    begins : int
-        Logged integer from which a window says the name.
-    goes_on : int
-        Integer from which a sound that was named goes on.
-    windows : int
-        How many windows must say it.
     seconds : float
         Expected duration without a pause; of names at once, that of the shortest sound counts.
     precision : float
@@ -52,17 +44,7 @@ class NameRule(BaseModel):
 
 
 class NamesParameters(BaseModel):
-    """Parameters of a model that labels by names.
-
-    Attributes
-    ----------
-    network : str
-        Whose names they are.
-    projection_sha256 : str
-        Of the projection by which they are logged.
-    rules : dict of str to NameRule
-        By class; all but silence.
-    """
+    """Parameters of a model that labels by names."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -115,12 +97,7 @@ class _Silent:
 
 
 def names_parameters(model: Model) -> NamesParameters:
-    """Return the parameters of a model that labels by names.
-
-    Parameters
-    ----------
-    model : Model
-    """
+    """Return the parameters of a model that labels by names."""
     return NamesParameters.model_validate(model.description.parameters)
 
 

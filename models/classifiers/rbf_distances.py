@@ -45,13 +45,6 @@ class RoundedDistances:
 
     Products of whole numbers, and all their sums, are exact, in whatever order: in float32 where
     rows and vectors are as near to the mean as nearly all are, else in float64.
-
-    Parameters
-    ----------
-    gamma : float
-        Of the kernel.
-    steps : int
-        Of the standard deviation of an input.
     """
 
     def __init__(self, gamma: float, steps: int) -> None:
@@ -79,13 +72,7 @@ class RoundedDistances:
 
 
 class UnroundedDistances:
-    """Distances as models of hearthlog 0.1 take them.
-
-    Parameters
-    ----------
-    gamma : float
-        Of the kernel.
-    """
+    """Distances as models of hearthlog 0.1 take them."""
 
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
@@ -111,8 +98,6 @@ def in_steps(scaled: Float64, steps: int) -> Float64:
     ----------
     scaled : np.ndarray [shape=(n, width)], float64
         In standard deviations from the mean.
-    steps : int
-        Of a standard deviation.
 
     Returns
     -------

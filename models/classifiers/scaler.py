@@ -16,13 +16,7 @@ _SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
 
 
 class Scaler:
-    """Scales inputs as a model has it.
-
-    Parameters
-    ----------
-    arrays : mapping of str to np.ndarray
-        Among them `SCALER`, mean and standard deviation of the inputs.
-    """
+    """Scales inputs as a model has it."""
 
     def __init__(self, arrays: Mapping[str, Array]) -> None:
         self._mean = arrays["scaler_mean"]
@@ -45,11 +39,6 @@ def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
     ----------
     arrays : mapping of str to np.ndarray
         As of `Scaler`; of the right types and shapes, and finite.
-
-    Returns
-    -------
-    str or None
-        The rest of a sentence that begins with the file.
     """
     if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
         return None

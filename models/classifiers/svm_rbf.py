@@ -35,8 +35,6 @@ class SvmParameters(BaseModel):
 
     Attributes
     ----------
-    cost : float
-        Of an error.
     gamma : float
         Of the kernel exp(-gamma |x - s|^2).
     steps : int or None
@@ -153,11 +151,6 @@ class SvmMachine:
     """Inference of one model; its pairs of classes decide as scikit-learn's `SVC` within 1e-5.
 
     The decision value of a class is that of the weakest of its pairs, plus `home_votes`.
-
-    Parameters
-    ----------
-    model : Model
-        Of kind `svm-rbf`.
     """
 
     def __init__(self, model: Model) -> None:
@@ -265,8 +258,6 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
     ----------
     pairs : np.ndarray [shape=(n, C (C - 1) / 2)], float64
         Decision values for the first class of (0, 1), (0, 2) … (1, 2) …, against the second.
-    classes : int
-        C.
 
     Returns
     -------

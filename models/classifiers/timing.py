@@ -14,8 +14,6 @@ class LabelTiming(NamedTuple):
 
     Attributes
     ----------
-    window_frames : int
-        Frames of the window of a label.
     label_frame : int
         Frame of the window, from 0 on, which the label speaks of.
     needs_floor : bool
@@ -35,13 +33,7 @@ class LabelTiming(NamedTuple):
         return self.window_frames - 1 - self.label_frame + self.ahead
 
     def first_window_end(self, start: int) -> int:
-        """Return the frame with which the first label of a sound is known.
-
-        Parameters
-        ----------
-        start : int
-            Number of the first frame of the sound.
-        """
+        """Return the frame with which the first label of a sound is known."""
         if self.needs_floor:  # it is known with the last frame of the first whole block
             start += -start % BLOCK_FRAMES + BLOCK_FRAMES - 1
         return start + self.window_frames - 1 + self.ahead
@@ -50,14 +42,7 @@ class LabelTiming(NamedTuple):
 def label_timing(description: Description) -> LabelTiming:
     """Return the timing of a model's labels.
 
-    Parameters
-    ----------
-    description : Description
-
-    Raises
-    ------
-    ModelError
-        If its feature set is not installed.
+    Raise `ModelError` if its feature set is not installed.
     """
     if description.kind == BY_NAMES:  # of each frame, by the windows around it
         parameters = NamesParameters.model_validate(description.parameters)

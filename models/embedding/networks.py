@@ -49,7 +49,6 @@ class NetworkFile:
 
     Attributes
     ----------
-    sha256 : str
     size : int
         In bytes.
     url : str
@@ -62,18 +61,7 @@ class NetworkFile:
 
 
 class KnownAnswer(NamedTuple):
-    """What a network is known to say of a synthetic sound.
-
-    Attributes
-    ----------
-    sound : str
-        Of `synthetic_sounds`.
-    number : int
-        Of a score.
-    name : str
-        What it is of.
-    logit : float
-    """
+    """What a network is known to say of a synthetic sound."""
 
     sound: str
     number: int
@@ -87,21 +75,8 @@ class EmbeddingNetwork:
 
     Attributes
     ----------
-    name : str
-        Also that of its file.
-    files : tuple of NetworkFile
-        Conversions of the same weights; the first is the one to fetch.
     window : int
         Samples at 16 kHz that it takes, of a second at most.
-    width, names : int
-        Of its embedding, and of its scores.
-    projection : Path
-        Of its output onto what is logged.
-    licence, attribution : str
-    suffix : str
-        Of its file: `.tflite`, or `.onnx`.
-    answers : tuple of KnownAnswer
-        By which a file whose numbers differ is told when it is fetched.
     """
 
     name: str
@@ -156,23 +131,7 @@ class Embedder:
 
     It is tried with synthetic sounds first.
 
-    Parameters
-    ----------
-    network : EmbeddingNetwork
-    path : Path
-        Its file.
-
-    Attributes
-    ----------
-    network : EmbeddingNetwork
-    projection : Projection
-    sha256 : str
-        Of the file.
-
-    Raises
-    ------
-    ModelError
-        If the file is missing, is another one, or cannot be used.
+    Raise `ModelError` if the file is missing, is another one, or cannot be used.
     """
 
     def __init__(self, network: EmbeddingNetwork, path: Path) -> None:
@@ -268,15 +227,7 @@ def _check_projection(network: EmbeddingNetwork, projection: Projection) -> None
 def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str]:
     """Read a file of a network; return it, and its SHA-256.
 
-    Parameters
-    ----------
-    network : EmbeddingNetwork
-    path : Path
-
-    Raises
-    ------
-    ModelError
-        If it is missing, cannot be read, or is none of those that are known.
+    Raise `ModelError` if it is missing, cannot be read, or is none of those that are known.
     """
     sizes = {each.size for each in network.files}
     source = "" if network.files[0].url else " --from FILE"
@@ -300,12 +251,7 @@ def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str
 
 
 def find_network(name: str) -> Path | None:
-    """Return the file of a network; None where there is none.
-
-    Parameters
-    ----------
-    name : str
-    """
+    """Return the file of a network; None where there is none."""
     places = [folder / NETWORKS.get(name).filename for folder in network_folders()]
     return next(filter(os.path.lexists, places), None)
 
@@ -314,14 +260,6 @@ def find_network(name: str) -> Path | None:
 def load_embedder(name: str, path: Path) -> Embedder:
     """Load a network once, however many microphones there are.
 
-    Parameters
-    ----------
-    name : str
-    path : Path
-
-    Raises
-    ------
-    ModelError
-        As `Embedder`.
+    Raise `ModelError` as `Embedder`.
     """
     return Embedder(NETWORKS.get(name), path)

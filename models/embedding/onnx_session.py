@@ -20,14 +20,8 @@ class OnnxModel:
 
     Parameters
     ----------
-    data : bytes
-        The file.
-    window : int
-        Samples that it takes.
     input_name : str, optional
         Name of the input; empty for the only one.
-    whose : str, optional
-        Who says how long the window is, for the message.
 
     Raises
     ------
@@ -59,9 +53,6 @@ class OnnxModel:
         Parameters
         ----------
         samples : np.ndarray [shape=(window,)], float32
-        outputs : sequence of str
-            Their names.
-        options : onnxruntime.RunOptions, optional
         """
         return self._session.run(
             list(outputs), {self._input: samples.reshape(self._shape)}, options
@@ -70,14 +61,7 @@ class OnnxModel:
     def chosen_output(self, wanted: str) -> str:
         """Return the name of the output that is wanted, or of the only one if that is empty.
 
-        Parameters
-        ----------
-        wanted : str
-
-        Raises
-        ------
-        ModelError
-            If there is none, or there are several.
+        Raise `ModelError` if there is none, or there are several.
         """
         name = wanted or next(iter(self.outputs), "")
         if name not in self.outputs or (not wanted and len(self.outputs) > 1):
@@ -92,17 +76,7 @@ class OnnxModel:
     ) -> list[Any]:
         """Try it with some windows, for some seconds at most; return the outputs of the last.
 
-        Parameters
-        ----------
-        windows : sequence of np.ndarray
-        outputs : sequence of str
-        check : callable
-            Raises a ModelError for outputs that cannot be.
-
-        Raises
-        ------
-        ModelError
-            If it fails, takes too long, or an output cannot be.
+        Raise `ModelError` if it fails, takes too long, or an output cannot be.
         """
         options = self._runtime.RunOptions()
         watch = threading.Timer(_PATIENCE_SECONDS, lambda: setattr(options, "terminate", True))
@@ -144,19 +118,7 @@ class OnnxSession:
     They are told apart by their widths. Where it gives several rows of them for a window, their
     mean counts.
 
-    Parameters
-    ----------
-    data : bytes
-        The file.
-    window : int
-        Samples that it takes.
-    embedding, names : int
-        Width of the embedding, and number of the names.
-
-    Raises
-    ------
-    ModelError
-        If onnxruntime is not installed, or the file is no such network.
+    Raise `ModelError` if onnxruntime is not installed, or the file is no such network.
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:

@@ -41,10 +41,6 @@ class Projection:
         Differences from one integer to the next.
     lows : np.ndarray [shape=(W,)], float32
         Values that are lower count as this.
-    groups : mapping of str to sequence of int
-        Numbers of the names whose highest logit is logged, by name of the group.
-    sha256 : str
-        Of the file.
     """
 
     mean: Float32
@@ -101,13 +97,7 @@ class Projection:
 
 
 def write_projection(projection: Projection, path: Path) -> None:
-    """Write a projection.
-
-    Parameters
-    ----------
-    projection : Projection
-    path : Path
-    """
+    """Write a projection."""
     arrays: dict[str, NDArray[Any]] = {
         "mean": projection.mean.astype(np.float16),
         "components": np.ascontiguousarray(projection.components, np.float16),
@@ -122,14 +112,7 @@ def write_projection(projection: Projection, path: Path) -> None:
 def read_projection(path: Path) -> Projection:
     """Read a projection.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    ModelError
-        If there is none, or it is damaged.
+    Raise `ModelError` if there is none, or it is damaged.
     """
     data = read_whole(path, "projection of a network", _SIZE_LIMIT, ModelError)
     try:

@@ -17,15 +17,7 @@ _MODULES = {".tflite": ("ai_edge_litert",), ".onnx": ("onnx", "onnxruntime")}
 def session_type(suffix: str) -> Callable[[bytes, int, int, int], Session]:
     """Return what makes a session of a file's bytes, window, width and number of names.
 
-    Parameters
-    ----------
-    suffix : str
-        That of the file, as `.tflite`.
-
-    Raises
-    ------
-    ModelError
-        If there is no runtime for it.
+    Raise `ModelError` if there is no runtime for it.
     """
     if suffix not in _TYPES:
         raise ModelError(f"is no network that can be used: it ends in none of {', '.join(_TYPES)}")
@@ -33,10 +25,5 @@ def session_type(suffix: str) -> Callable[[bytes, int, int, int], Session]:
 
 
 def missing_modules(suffix: str) -> list[str]:
-    """Return the modules for files of a suffix that are not installed, without importing any.
-
-    Parameters
-    ----------
-    suffix : str
-    """
+    """Return the modules for files of a suffix that are not installed, without importing any."""
     return [module for module in _MODULES.get(suffix, ()) if find_spec(module) is None]

@@ -56,19 +56,7 @@ class TfliteSession:
     The file is not unpacked: a longer list of outputs is appended to it, as the library that
     rewrites such files takes 50 MB.
 
-    Parameters
-    ----------
-    data : bytes
-        The file.
-    window : int
-        Samples that it takes.
-    embedding, names : int
-        Width of the embedding, and number of the names.
-
-    Raises
-    ------
-    ModelError
-        If LiteRT is not installed, or the file is no such network.
+    Raise `ModelError` if LiteRT is not installed, or the file is no such network.
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:

@@ -29,22 +29,8 @@ class SoundName(NamedTuple):
 
     Attributes
     ----------
-    name : str
-        Of the class; that of `hearthlog.models.classes` where it means the same.
-    words : str
-        What people call the sound.
-    group : str
-        The group of AudioSet's names that says it.
-    seconds : float
-        Expected duration without a pause.
-    windows : int
-        How many windows must say it.
-    threshold : float
-        Logit from which a window says it.
     is_event : bool
         Whether it was measured to be right often enough; else it is a hint.
-    clips, sources : int
-        Recordings of it that it was measured with.
     precision, recall, false_an_hour : float
         Of an event on sources that its threshold was not chosen on, of a hint on all; NaN where
         there are too few.
@@ -85,13 +71,7 @@ def read_names(path: Path) -> list[SoundName]:
 
 
 def write_names(names: Sequence[SoundName], path: Path) -> None:
-    """Write a table of names, as `read_names` reads it.
-
-    Parameters
-    ----------
-    names : sequence of SoundName
-    path : Path
-    """
+    """Write a table of names, as `read_names` reads it."""
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(SoundName._fields)
@@ -103,11 +83,8 @@ class NamedSound(NamedTuple):
 
     Attributes
     ----------
-    name : SoundName
     first, end : int
         Numbers of its first frame, and of the one behind its last.
-    logit : float
-        The highest.
     """
 
     name: SoundName
@@ -124,24 +101,7 @@ def named_sounds(
     A sound begins with a window above the threshold, and goes on while windows no more than a
     second apart are above it or a little below.
 
-    Parameters
-    ----------
-    embeddings : Embeddings
-        In the order of their frames.
-    projection : Projection
-        With which they were logged.
-    names : sequence of SoundName, optional
-        Those to look for; `audioset_names` by default.
-
-    Returns
-    -------
-    list of NamedSound
-        In the order of their first frames.
-
-    Raises
-    ------
-    ValueError
-        If the projection has not the group of a name.
+    Raise `ValueError` if the projection has not the group of a name.
     """
     names = audioset_names() if names is None else names
     columns, sounds = _columns(projection, names), list[NamedSound]()

@@ -21,10 +21,6 @@ class EmbeddingStream:
 
     Windows begin at frames whose number is a multiple of ten. One is embedded if there is sound
     within half a second of its middle, without the noise of windows in which there is none.
-
-    Parameters
-    ----------
-    embedder : Embedder
     """
 
     def __init__(self, embedder: Embedder) -> None:
@@ -47,15 +43,8 @@ class EmbeddingStream:
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         sound : np.ndarray [shape=(n,)], bool
             Whether what ends with each frame, 0.4 s at most, is above the floor of the room.
-        first : int
-            Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-
-        Returns
-        -------
-        Embeddings
-            Of the windows that these frames complete.
         """
         samples = np.clip(np.nan_to_num(frames, posinf=0.0, neginf=0.0), -1.0, 1.0)
         samples = np.concatenate([self._frames, samples])

@@ -44,17 +44,6 @@ class FeatureSet:
 
     Attributes
     ----------
-    name : str
-    version : int
-        Increased when the same sound gives other values.
-    feature_names, units : tuple of str
-        Names and units of the d values of a frame.
-    window_frames : int
-        Length of the window of the logged statistics.
-    extractor : callable
-        Makes an `Extractor`.
-    inputs : mapping of str to Inputs
-        Inputs of classifiers, by name.
     power : callable
         Maps features, shape (..., d), to the mean square of the samples, shape (...); full scale
         is 1.

@@ -194,7 +194,6 @@ def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) 
         Powers of the bands of successive frames.
     floors : np.ndarray [shape=(n, b)], float64
         Floor at the last frame of each window.
-    window_frames : int
     gate : float
         In dB.
 

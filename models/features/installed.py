@@ -43,21 +43,11 @@ def feature_set(name: str = DEFAULT.name) -> FeatureSet:
 
 
 def is_network(name: str) -> bool:
-    """Tell whether a name is that of a network, and not of a feature set that is installed.
-
-    Parameters
-    ----------
-    name : str
-    """
+    """Tell whether a name is that of a network, and not of a feature set that is installed."""
     return not FEATURE_SETS.has(name) and has_card(name)
 
 
 def entries_of(features: FeatureSet) -> dict[str, str]:
-    """Return what the metadata record of a log says of its feature set.
-
-    Parameters
-    ----------
-    features : FeatureSet
-    """
+    """Return what the metadata record of a log says of its feature set."""
     source = "" if features.digest else FEATURE_SETS.distribution(features.name)
     return feature_entries(features.name, features.version, features.digest, source)

@@ -86,7 +86,6 @@ def of_segments(inputs: Inputs, segments: Float32, floors: Float64 | None = None
 
     Parameters
     ----------
-    inputs : Inputs
     segments : np.ndarray [shape=(n, f, d)], float32
         Features of successive frames, at least a window.
     floors : np.ndarray [shape=(n, b)], float64, optional
@@ -118,13 +117,8 @@ class WindowStatistics:
 
     Attributes
     ----------
-    window_frames : int
     values : callable
         Maps features, shape (n, d), to the values of each frame, shape (n, d').
-    values_width : int
-        d'.
-    changes : bool
-        Whether the mean absolute difference from frame to frame is an input too.
     needs_floor : bool
         Whether `values` takes floors, shape (n, b), or None as a second argument.
     """
@@ -198,12 +192,7 @@ class WindowStatistics:
 
 
 class StatisticsStream:
-    """The statistics at the frames of one stream, as `InputStream`.
-
-    Parameters
-    ----------
-    inputs : WindowStatistics
-    """
+    """The statistics at the frames of one stream, as `InputStream`."""
 
     def __init__(self, inputs: WindowStatistics) -> None:
         self._inputs = inputs

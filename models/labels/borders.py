@@ -17,15 +17,8 @@ class Borders:
 
     Parameters
     ----------
-    silence : int
-        State of silence.
     reach, shortest : int
         Numbers of frames; 0 and 1 leave all as it is.
-
-    Attributes
-    ----------
-    delay : int
-        Frames by which the refined states are behind.
     """
 
     def __init__(self, silence: int, reach: int, shortest: int) -> None:

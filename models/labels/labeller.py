@@ -38,10 +38,6 @@ class FrameLabels(NamedTuple):
         The same by the features alone: what is private is decided by them.
     novelty : np.ndarray [shape=(n,)], float32
         From 0 to 1; NaN where the classifier has none.
-    calibrated_elsewhere : bool
-        As of the classifier.
-    ahead : int
-        Frames behind the window that they waited for.
     by_names : np.ndarray [shape=(n, C)], float64, or None
         Highest logit that a network gives to the names of each class around the frame; NaN where
         there is no embedding, or the class has no names.
@@ -59,18 +55,7 @@ class FrameLabels(NamedTuple):
     by_names: Float64 | None = None
 
     def columns(self, microphone: str) -> dict[str, Column]:
-        """Return the fields of one `AudioLabel` for each frame.
-
-        Parameters
-        ----------
-        microphone : str
-            Its name.
-
-        Returns
-        -------
-        dict of str to column
-            By field path, as `encode_groups` takes them.
-        """
+        """Return the fields of one `AudioLabel` for each frame."""
         return label_columns(self._asdict(), self.classes, microphone)
 
 
@@ -85,8 +70,6 @@ def label_columns(
         With the names `frames`, `stamps`, `probabilities` and `novelty` of `FrameLabels`.
     classes : sequence of str
         Names behind the columns of the probabilities.
-    microphone : str
-        Its name.
     """
     probabilities = labels["probabilities"]
     best = probabilities.argmax(axis=1)
@@ -417,21 +400,7 @@ def _both(before: Float64 | None, after: Float64 | None) -> Float64 | None:
 def segment_columns(
     segments: Sequence[Segment], classes: Sequence[str], microphone: str
 ) -> dict[str, Column]:
-    """Return the fields of one `AudioSegment` for each segment.
-
-    Parameters
-    ----------
-    segments : sequence of Segment
-    classes : sequence of str
-        Names behind the labels of the segments.
-    microphone : str
-        Its name.
-
-    Returns
-    -------
-    dict of str to column
-        By field path, as `encode_groups` takes them.
-    """
+    """Return the fields of one `AudioSegment` for each segment."""
     starts = np.array([segment.start for segment in segments], np.int64)
     ends = np.array([segment.end for segment in segments], np.int64)
     return {

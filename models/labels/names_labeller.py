@@ -28,21 +28,6 @@ class NamesLabeller:
     """Labels one stream of frames by names; as `Labeller` for other models.
 
     Where the embeddings are not those of the model's network and projection, all is silence.
-
-    Parameters
-    ----------
-    classifier : Classifier
-        With names.
-    embedding : EmbeddingSource, optional
-        Of the embeddings.
-
-    Attributes
-    ----------
-    classes : tuple of str
-    timing : LabelTiming
-    segmenter : Segmenter
-    takes_auxiliary : bool
-        Whether embeddings change its labels.
     """
 
     def __init__(self, classifier: Classifier, embedding: EmbeddingSource | None = None) -> None:
@@ -102,13 +87,7 @@ class NamesLabeller:
         unlabelled: int,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> None:
-        """Take the place of another labeller: what was heard before does not count.
-
-        Parameters
-        ----------
-        features, floors, stamps, frame, unlabelled, auxiliary
-            As of `Labeller.follow`.
-        """
+        """Take the place of another labeller: what was heard before does not count."""
 
     def push(
         self,
@@ -118,18 +97,7 @@ class NamesLabeller:
         stamps: Int64,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> tuple[FrameLabels, list[Segment]]:
-        """Add successive frames.
-
-        Parameters
-        ----------
-        features, floors, first, stamps, auxiliary
-            As of `Labeller.push`; features and floors say nothing here.
-
-        Returns
-        -------
-        labels : FrameLabels
-        segments : list of Segment
-        """
+        """Add successive frames."""
         del features, floors
         if self._end is None:
             self._window = -(-first // HOP_FRAMES)
@@ -165,11 +133,6 @@ class NamesLabeller:
         ----------
         end : int
             End of the sound, in nanoseconds of UTC.
-
-        Returns
-        -------
-        list of Segment
-            In the order of time.
         """
         segments: list[Segment] = []
         count = len(self._stamps)
@@ -264,13 +227,7 @@ class NamesLabeller:
 def labeller_of(
     classifier: Classifier, microphone: str = "", embedding: EmbeddingSource | None = None
 ) -> Labeller | NamesLabeller:
-    """Return what labels a stream of frames by a classifier.
-
-    Parameters
-    ----------
-    classifier, microphone, embedding
-        As of `Labeller`.
-    """
+    """Return what labels a stream of frames by a classifier."""
     if classifier.names is not None:
         return NamesLabeller(classifier, embedding)
     return Labeller(classifier, microphone, embedding)

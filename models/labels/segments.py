@@ -25,12 +25,8 @@ class Run(NamedTuple):
 
     Attributes
     ----------
-    label : int
-        Index of the class.
     start : int
         Start of the first frame, in nanoseconds of UTC.
-    frames : int
-        Number of frames.
     confidence : int
         Sum of the probabilities of the class, in units of 2**-30: whole numbers give the same sum
         in any order.
@@ -48,11 +44,6 @@ class Run(NamedTuple):
         ----------
         earlier : Run or None
             Of the same label, ending where this run starts; None for none.
-
-        Returns
-        -------
-        Run
-            With the start of the earlier run, and the frames of both.
         """
         if earlier is None:
             return self
@@ -65,7 +56,6 @@ class Segment(NamedTuple):
 
     Attributes
     ----------
-    run : Run
     end : int
         End of the last frame, in nanoseconds of UTC.
     decided_at : int
@@ -138,14 +128,11 @@ class Segmenter:
     ----------
     classes : sequence of str
         Names behind the columns of the probabilities.
-    smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
         Transition probabilities of the hidden Markov model; unused where segments are merged.
 
     Attributes
     ----------
-    open_run : Run or None
-        The frames after the last segment, as far as their states are decided.
     segments_converged : bool
         Whether frames before the first one would leave no trace in the segments to come.
     """
@@ -204,11 +191,6 @@ class Segmenter:
         ----------
         frames : LabelledFrames
             At least one.
-
-        Returns
-        -------
-        list of Segment
-            In the order of time.
         """
         states = frames.probabilities.argmax(axis=1)
         if self._smoother is not None:
@@ -234,11 +216,6 @@ class Segmenter:
         ----------
         end : int
             End of the sound, in nanoseconds of UTC.
-
-        Returns
-        -------
-        list of Segment
-            In the order of time.
         """
         segments = []
         if self._undecided is not None:

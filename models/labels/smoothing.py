@@ -22,15 +22,7 @@ _FEWEST_LANES = 3
 
 
 class ClassesApart(NamedTuple):
-    """How doubts about the class of a sound are kept from counting for silence.
-
-    Attributes
-    ----------
-    silence : int
-        Number of the class.
-    exponent : float
-        Of how likely each other class is, relative to the likeliest of them.
-    """
+    """How doubts about the class of a sound are kept from counting for silence."""
 
     silence: int
     exponent: float
@@ -46,12 +38,6 @@ def log_likelihoods(
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float32
-    weight : float
-        Factor of the logarithms: successive windows overlap, so that each tells less than if it
-        stood alone.
-    apart : ClassesApart, optional
-        Then the likeliest sound counts as much as silence leaves to all of them, which would each
-        lose to silence where it is doubtful which of them is heard.
 
     Returns
     -------
@@ -88,11 +74,6 @@ class FixedLagSmoother:
     transitions : np.ndarray [shape=(C, C)], float64
         Probability that a frame of the row's class is followed by one of the column's class. The
         first frame may be of any class.
-    lag_frames : int
-    weight : float
-        As of `log_likelihoods`.
-    apart : ClassesApart, optional
-        As of `log_likelihoods`.
 
     Attributes
     ----------

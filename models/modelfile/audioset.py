@@ -99,21 +99,12 @@ def audioset_file() -> bytes:
 
 
 def is_by_names(model: Model) -> bool:
-    """Return whether a model labels by names, which leave a class to any model that learned it.
-
-    Parameters
-    ----------
-    model : Model
-    """
+    """Return whether a model labels by names, which leave a class to any model that learned it."""
     return model.description.kind == BY_NAMES
 
 
 def insist_taught(model: Model) -> None:
     """Refuse a model that labels by names where one is asked for that was taught.
-
-    Parameters
-    ----------
-    model : Model
 
     Raises
     ------
@@ -127,16 +118,7 @@ def insist_taught(model: Model) -> None:
 
 
 def without_classes(model: Model, names: Collection[str], features: FeatureSet) -> Model:
-    """Return a model that labels by names without some of its classes.
-
-    Parameters
-    ----------
-    model : Model
-    names : collection of str
-        Those that it has not are passed over.
-    features : FeatureSet
-        What is recorded beside the embeddings.
-    """
+    """Return a model that labels by names without some of its classes."""
     before = model.description
     kept = [name for name in before.classes if name not in names]
     if kept == before.classes and before.feature_set == features.name:

@@ -16,15 +16,7 @@ _FEW = 12  # sources
 
 
 def attachment_of(name: str, microphone: str) -> str:
-    """Name an attachment about the model of one microphone, where others have another model.
-
-    Parameters
-    ----------
-    name : str
-        `CARD` or `DESCRIPTION`.
-    microphone : str
-        Its name.
-    """
+    """Name an attachment about the model of one microphone, where others have another model."""
     stem, suffix = name.rsplit(".", 1)
     return f"{stem}.{microphone}.{suffix}"
 
@@ -32,14 +24,8 @@ def attachment_of(name: str, microphone: str) -> str:
 def model_attachments(model: Model) -> list[Attachment]:
     """Return the attachments of a log with labels of a model: its card and its description.
 
-    Parameters
-    ----------
-    model : Model
-
-    Raises
-    ------
-    ModelError
-        If the model's kind of classifier is not installed, or cannot be imported.
+    Raise `ModelError` if the model's kind of classifier is not installed, or cannot be
+    imported.
     """
     description = {"name": model.name, "sha256": model.sha256, **model.description.model_dump()}
     text = json.dumps(description, ensure_ascii=False)
@@ -52,14 +38,8 @@ def model_attachments(model: Model) -> list[Attachment]:
 def model_card(model: Model) -> str:
     """Describe a model for people, as Markdown.
 
-    Parameters
-    ----------
-    model : Model
-
-    Raises
-    ------
-    ModelError
-        If the model's kind of classifier is not installed, or cannot be imported.
+    Raise `ModelError` if the model's kind of classifier is not installed, or cannot be
+    imported.
     """
     description, metrics = model.description, model.description.metrics
     amounts = description.training_data.classes

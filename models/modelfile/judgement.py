@@ -28,16 +28,12 @@ class Judgement(BaseModel):
 
     Attributes
     ----------
-    model : str
-        SHA-256 of its file.
     champion : str
         SHA-256 of the model that it was compared with; empty if there was none.
     judged : int
         When, in nanoseconds of UTC.
     reasons : tuple of str
         Why it may not, each a sentence; empty if it may.
-    insisted : bool
-        Whether a person lets it label all the same.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -55,15 +51,7 @@ class Judgement(BaseModel):
 
 
 def judgement_path(folder: Path, sha256: str) -> Path:
-    """Return where the judgement of a model is kept.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-    sha256 : str
-        Of the model's file.
-    """
+    """Return where the judgement of a model is kept."""
     return folder / _FOLDER / f"{sha256}.json"
 
 
@@ -74,13 +62,6 @@ def judgements_of(folder: Path) -> list[Path]:
 
 def read_judgement(folder: Path, sha256: str) -> Judgement | None:
     """Read the judgement of a model.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-    sha256 : str
-        Of the model's file.
 
     Returns
     -------
@@ -101,16 +82,7 @@ def read_judgement(folder: Path, sha256: str) -> Judgement | None:
 def write_judgement(folder: Path, judgement: Judgement) -> None:
     """Keep a judgement, in the place of an earlier one of the same model.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-    judgement : Judgement
-
-    Raises
-    ------
-    ModelError
-        If it cannot be written.
+    Raise `ModelError` if it cannot be written.
     """
     path = judgement_path(folder, judgement.model)
     try:
@@ -124,17 +96,7 @@ def write_judgement(folder: Path, judgement: Judgement) -> None:
 def insist(folder: Path, sha256: str) -> None:
     """Let a model label whatever its judgement says, or without one.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-    sha256 : str
-        Of the model's file.
-
-    Raises
-    ------
-    ModelError
-        If that cannot be written.
+    Raise `ModelError` if that cannot be written.
     """
     judgement = read_judgement(folder, sha256)
     if judgement is None or not judgement.may_label:

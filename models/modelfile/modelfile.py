@@ -65,16 +65,8 @@ _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are op
 def check_output(path: Path) -> None:
     """Check that a model can be saved under a name.
 
-    Parameters
-    ----------
-    path : Path
-        A new file whose name ends in `.safetensors`.
-
-    Raises
-    ------
-    ModelError
-        If the name has another ending or cannot be printed, if there is a file of this name, or if
-        its folder does not exist or cannot be written.
+    Raise `ModelError` if the name has another ending or cannot be printed, if there is a file
+    of this name, or if its folder does not exist or cannot be written.
     """
     if path.suffix != SUFFIX:
         raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
@@ -89,17 +81,8 @@ def check_output(path: Path) -> None:
 def save_model(model: Model, path: Path) -> None:
     """Write a model file; the same model gives the same bytes.
 
-    Parameters
-    ----------
-    model : Model
-    path : Path
-        A new file whose name ends in `.safetensors`.
-
-    Raises
-    ------
-    ModelError
-        If `check_output` refuses the name, the file cannot be written, or the model is
-        inconsistent.
+    Raise `ModelError` if `check_output` refuses the name, the file cannot be written, or the
+    model is inconsistent.
     """
     check_output(path)
     common = {name: getattr(model, name) for name in _COMMON if getattr(model, name).size}
@@ -174,15 +157,8 @@ def starter_for(path: Path, network: str) -> Path:
 def name_and_digest(path: Path) -> tuple[str, str]:
     """Return what tells a model from others, `Model.name` and `Model.sha256`, without loading it.
 
-    Parameters
-    ----------
-    path : Path
-        As `load_model` takes it.
-
-    Raises
-    ------
-    ModelError
-        If the file is missing or larger than 64 MiB, or its name cannot be printed.
+    Raise `ModelError` if the file is missing or larger than 64 MiB, or its name cannot be
+    printed.
     """
     path, data = _read(path)
     return path.stem, hashlib.sha256(data).hexdigest()

@@ -50,11 +50,6 @@ class ModelEntry:
 def list_models(folder: Path) -> list[ModelEntry]:
     """Load every model of a folder, and the starters; list the targets of broken aliases too.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-
     Returns
     -------
     list of ModelEntry
@@ -79,13 +74,6 @@ def list_models(folder: Path) -> list[ModelEntry]:
 
 def target(folder: Path, alias: str) -> str | None:
     """Return the name of the model that an alias points to.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-    alias : str
-        `champion` or `candidate`.
 
     Returns
     -------
@@ -114,8 +102,6 @@ def resolve(folder: Path, name: str) -> str:
 
     Parameters
     ----------
-    folder : Path
-        Folder of model files.
     name : str
         Name of a model, of its file, or an alias. That there is such a model is not checked.
 
@@ -141,8 +127,6 @@ def load(folder: Path, name: str) -> Model:
 
     Parameters
     ----------
-    folder : Path
-        Folder of model files.
     name : str
         Name of a model, of its file, or an alias; a starter of which there is no file, or
         `audioset`.
@@ -162,13 +146,6 @@ def load(folder: Path, name: str) -> Model:
 def find_model(folder: Path, sha256: str) -> Path | None:
     """Find a model by its content, in a folder or among the starter models.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files; need not exist.
-    sha256 : str
-        Of the file.
-
     Returns
     -------
     Path or None
@@ -181,26 +158,13 @@ def find_model(folder: Path, sha256: str) -> Path | None:
 
 
 def is_starter(name: str, sha256: str) -> bool:
-    """Tell whether a model is a starter model of this version.
-
-    Parameters
-    ----------
-    name : str
-        Of the model.
-    sha256 : str
-        Of its file.
-    """
+    """Tell whether a model is a starter model of this version."""
     file = starter_file(name)
     return name in STARTERS and file.is_file() and _digest(file) == sha256
 
 
 def first_starter(folder: Path) -> str | None:
     """Name the starter model that labelled a home before the champion.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
 
     Returns
     -------
@@ -237,26 +201,8 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
 
     Whether it may label is for a judgement to say, which a recorder asks for.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-    name : str
-        Name of a model, of its file, or an alias.
-    alias : str
-        `champion` or `candidate`.
-
-    Returns
-    -------
-    model : Model
-    before : str or None
-        What the alias pointed to; the same name if nothing had to be done.
-
-    Raises
-    ------
-    ModelError
-        If the model cannot be used, if the folder does not exist or cannot be written, or if a file
-        in the place of the alias is no link to a model file.
+    Raise `ModelError` if the model cannot be used, if the folder does not exist or cannot be
+    written, or if a file in the place of the alias is no link to a model file.
     """
     with _locked(folder, make=name.removesuffix(SUFFIX) in STARTERS):
         before = target(folder, alias)
@@ -279,23 +225,8 @@ def rollback(folder: Path) -> tuple[Model, str]:
 
     Before the first one that was the starter model which the recorder began with.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of model files.
-
-    Returns
-    -------
-    model : Model
-        The champion now.
-    before : str
-        The champion until now.
-
-    Raises
-    ------
-    ModelError
-        If there is no champion, or none before it that can be used, or the folder does not exist or
-        cannot be written.
+    Raise `ModelError` if there is no champion, or none before it that can be used, or the
+    folder does not exist or cannot be written.
     """
     with _locked(folder):
         before = resolve(folder, CHAMPION)

@@ -7,13 +7,7 @@ NETWORK = "yamnet"  # whose embeddings the others take
 
 
 def with_network(name: str) -> str:
-    """Name the starter model that takes embeddings, of one that goes by features alone.
-
-    Parameters
-    ----------
-    name : str
-        One of `BY_FEATURES`.
-    """
+    """Name the starter model that takes embeddings, of one that goes by features alone."""
     return f"{name}-embedding"
 
 
@@ -27,11 +21,5 @@ SHA256 = {  # of their files, as `sha256sum` prints it
 
 
 def starter_file(name: str) -> Path:
-    """Return the file of a starter model.
-
-    Parameters
-    ----------
-    name : str
-        One of `STARTERS`.
-    """
+    """Return the file of a starter model."""
     return Path(__file__).with_name(f"{name}.safetensors")

@@ -44,16 +44,8 @@ class ClipFinder:
     keep : Keep
         `events`: sound around all that is not labelled silence; `unsure`: around what the model is
         not sure of, or has not learned; `always`: everything.
-    never : sequence of str
-        Classes that are never kept.
-    pre_roll_frames : int
-        Frames kept before a sound that is worth keeping.
     window_frames : int
         A second, or the length of the window of a label, if that is longer.
-    late_frames : int
-        Frames by which the log is later than its labels.
-    most_ahead : int
-        Frames behind its window that a label may wait for.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -95,11 +87,6 @@ class ClipFinder:
             Where they do not follow the frames before, those are decided first, as by `close`.
         labels : FrameLabels or None
             Of the last of these frames; their classes include all that are never kept.
-
-        Returns
-        -------
-        list of KeptSound
-            In the order of time.
         """
         sounds = []
         if frames.first != self._next:
@@ -109,13 +96,7 @@ class ClipFinder:
         return [*sounds, *self._decide(len(self._samples) - self._ahead)]
 
     def close(self) -> list[KeptSound]:
-        """Return what is to be kept of a sound that ends, and begin anew.
-
-        Returns
-        -------
-        list of KeptSound
-            In the order of time.
-        """
+        """Return what is to be kept of a sound that ends, and begin anew."""
         self._private = np.append(self._private, self._guard.close())
         self._worth = np.append(self._worth, np.zeros(self._ahead, bool))
         sounds = self._decide(len(self._samples))

@@ -43,17 +43,9 @@ class ClipWriter:
 
     Parameters
     ----------
-    settings : Settings
-    microphones : sequence of str
-        Their names.
     file_at : callable
         Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
         log; see `RollingLog.file_at`.
-
-    Attributes
-    ----------
-    kept_frames : int
-        That were written.
     """
 
     def __init__(
@@ -78,13 +70,6 @@ class ClipWriter:
     def write(self, microphone: str, sounds: Sequence[KeptSound]) -> list[Notice]:
         """Append sound to the layers of the logs that contain its time.
 
-        Parameters
-        ----------
-        microphone : str
-            Whose sound it is.
-        sounds : sequence of KeptSound
-            In the order of time.
-
         Returns
         -------
         list of Notice
@@ -103,18 +88,7 @@ class ClipWriter:
         return notices
 
     def tick(self, now: int) -> list[Notice]:
-        """Complete the layer of a log that has ended, once no sound of it is held back.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-
-        Returns
-        -------
-        list of Notice
-            One if the layer cannot be completed.
-        """
+        """Complete the layer of a log that has ended, once no sound of it is held back."""
         if self._writer is None or self._file_at(now)[0] == self._log:
             self._rolled = None
         elif self._rolled is None:
@@ -124,13 +98,7 @@ class ClipWriter:
         return []
 
     def finish(self) -> list[Notice]:
-        """Complete the layer that is open.
-
-        Returns
-        -------
-        list of Notice
-            One if it cannot be completed.
-        """
+        """Complete the layer that is open."""
         writer, self._writer = self._writer, None
         if writer is None:
             return []

@@ -21,9 +21,6 @@ class ClipRecorder:
 
     Parameters
     ----------
-    settings : Settings
-    pipelines : sequence of Pipeline
-        Of the microphones whose sound it is.
     file_at : callable
         Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
         log; see `RollingLog.file_at`.
@@ -58,12 +55,6 @@ class ClipRecorder:
     def before(self, microphone: str, event: Event) -> list[Notice]:
         """Prepare for an event that is about to be logged: a gap ends the sound before it.
 
-        Parameters
-        ----------
-        microphone : str
-            Whose event it is.
-        event : Event
-
         Returns
         -------
         list of Notice
@@ -73,14 +64,6 @@ class ClipRecorder:
 
     def after(self, microphone: str, event: Event, labels: FrameLabels | None) -> list[Notice]:
         """Keep the sound of an event that was logged, and delete what is old.
-
-        Parameters
-        ----------
-        microphone : str
-            Whose event it is.
-        event : Event
-        labels : FrameLabels or None
-            Of its last frames, if they are labelled.
 
         Returns
         -------

@@ -16,10 +16,6 @@ class ClipRetention:
 
     Parameters
     ----------
-    root : Path
-        Folder of logs; links in it are not followed.
-    node : str
-        Node whose clips they are.
     days : int
         Age at which a layer is deleted: on so many later days something was recorded.
     """
@@ -32,11 +28,6 @@ class ClipRetention:
 
     def tick(self, now: int) -> list[Notice]:
         """Delete old clips, unless the last time was less than an hour ago.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
 
         Returns
         -------
@@ -71,19 +62,8 @@ class ClipRetention:
 def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple[Path, int]]:
     """Find the layers of sound of a node, whole or damaged.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of logs.
-    node : str
-        Name of the node.
-    failures : list of OSError
-        Errors of folders that cannot be read are appended.
-
     Yields
     ------
-    path : Path
-        The layer.
     start : int
         When its log began, in nanoseconds of UTC.
     """

@@ -10,12 +10,7 @@ _FRAMES = 200  # ten seconds of sound
 
 
 class ChannelWatch:
-    """Watches the channels of an array.
-
-    Parameters
-    ----------
-    channels : int
-    """
+    """Watches the channels of an array."""
 
     def __init__(self, channels: int) -> None:
         self._pairs = np.array(list(combinations(range(channels), 2)))

@@ -67,10 +67,6 @@ class DirectionFinder:
 
     Blocks depend on the numbers of the frames only, so that the same frames give the same bits in
     pieces of any size.
-
-    Parameters
-    ----------
-    geometry : ArrayGeometry
     """
 
     def __init__(self, geometry: ArrayGeometry) -> None:
@@ -97,13 +93,6 @@ class DirectionFinder:
         ----------
         frames : np.ndarray [shape=(n, 800, c)], float32
             Samples of all channels in full scale, -1 to 1.
-        first : int
-            Number of the first frame.
-
-        Returns
-        -------
-        Located
-            Of the blocks that these frames complete.
         """
         begin = 0
         if self._held is None:

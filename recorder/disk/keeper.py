@@ -27,12 +27,7 @@ _NICENESS = 19
 
 
 class DiskKeeper:
-    """Keeps the disk as configured while a recorder goes on, which never waits for it.
-
-    Parameters
-    ----------
-    rules : KeepingRules
-    """
+    """Keeps the disk as configured while a recorder goes on, which never waits for it."""
 
     def __init__(self, rules: KeepingRules) -> None:
         self._rules = rules
@@ -44,20 +39,7 @@ class DiskKeeper:
         self._helpless = False
 
     def tick(self, now: int) -> tuple[list[EncodedMessage], list[str]]:
-        """Look after the disk if it is time, and tell what came of the last time.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-
-        Returns
-        -------
-        messages : list of EncodedMessage
-            For `/diagnostics` and `/rosout`, of this time.
-        problems : list of str
-            What was not said before.
-        """
+        """Look after the disk if it is time, and tell what came of the last time."""
         if self._process is not None:
             if self._process.poll() is None:
                 return [], []
@@ -112,21 +94,7 @@ class DiskKeeper:
 
 
 def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMessage]:
-    """Tell what came of a look at the disk.
-
-    Parameters
-    ----------
-    node : str
-        Name of the node.
-    stamp : int
-        In nanoseconds of UTC.
-    report : DiskReport
-
-    Returns
-    -------
-    list of EncodedMessage
-        One for `/diagnostics`, named `hearthlog: <node> disk`, and one for each line of `/rosout`.
-    """
+    """Tell what came of a look at the disk."""
     level = WARNING if report.problem else OK
     text = report.problem or report.done or "nothing to delete"
     health = SourceHealth(stamp, level, text, report.values)

@@ -35,10 +35,6 @@ class DiskReport(NamedTuple):
         What was deleted and thinned; empty for nothing.
     problem : str
         What cannot be done; empty for nothing.
-    values : mapping of str to str
-        Figures by name.
-    more : bool
-        Whether more logs are to be thinned.
     """
 
     done: str
@@ -55,16 +51,7 @@ class DiskReport(NamedTuple):
 def keep_disk(rules: KeepingRules, *, may_thin: bool = True) -> DiskReport:
     """Delete what the rules say, unless that would leave only the newest of several logs, and thin.
 
-    Parameters
-    ----------
-    rules : KeepingRules
-    may_thin : bool
-        Whether to look for logs to thin, for which each old log is opened.
-
-    Raises
-    ------
-    OSError
-        If the disk cannot be measured.
+    Raise `OSError` if the disk cannot be measured.
     """
     root, failures = Path(rules.root), list[OSError]()
     logs = recorded_logs(root, rules.node, failures)

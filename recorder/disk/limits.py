@@ -10,8 +10,6 @@ class Limits(NamedTuple):
     ----------
     days : int
         Days on which something was recorded.
-    files : int
-        Finished logs.
     size : int
         Bytes of finished logs and their layers.
     free : int
@@ -25,16 +23,7 @@ class Limits(NamedTuple):
 
 
 class ThinningDays(NamedTuple):
-    """After how many days with sound a log loses what; 0 for never.
-
-    Attributes
-    ----------
-    statistics : int
-    features : int
-        These, and the statistics.
-    rest : int
-        All but labels, segments and gaps.
-    """
+    """After how many days with sound a log loses what; 0 for never."""
 
     statistics: int = 0
     features: int = 0
@@ -53,17 +42,7 @@ class ThinningDays(NamedTuple):
 
 
 class KeepingRules(NamedTuple):
-    """What a recorder keeps of which logs.
-
-    Attributes
-    ----------
-    root : str
-        Folder of logs.
-    node : str
-        Name of the node.
-    limits : Limits
-    thinning : ThinningDays
-    """
+    """What a recorder keeps of which logs."""
 
     root: str
     node: str

@@ -26,14 +26,10 @@ class RecordedLog(NamedTuple):
 
     Attributes
     ----------
-    path : Path
     start : int
         By its name, in nanoseconds of UTC.
-    layers : tuple of Path
     size : int
         Bytes on the disk, of all of them.
-    locked : bool
-        Whether its keeper wants it kept: there is `<log>.keep`.
     """
 
     path: Path
@@ -66,11 +62,6 @@ class RecordedDays:
     def since(self, start: int) -> int:
         """Count the days with sound after the day of a time.
 
-        Parameters
-        ----------
-        start : int
-            In nanoseconds of UTC.
-
         Returns
         -------
         int
@@ -82,21 +73,7 @@ class RecordedDays:
 
 
 def walk(root: Path, failures: list[OSError]) -> Iterator[tuple[Path, list[str]]]:
-    """Go through the folders of a recorder's days.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of logs.
-    failures : list of OSError
-        Errors of folders that cannot be read are appended.
-
-    Yields
-    ------
-    folder : Path
-    files : list of str
-        Names in it that are no folders.
-    """
+    """Go through the folders of a recorder's days."""
     for folder, folders, files in os.walk(root, onerror=failures.append):
         folders[:] = [each for each in folders if each.isdigit()]
         yield Path(folder), files
@@ -104,13 +81,6 @@ def walk(root: Path, failures: list[OSError]) -> Iterator[tuple[Path, list[str]]
 
 def start_of(name: str, node: str) -> int | None:
     """Return when a log or a layer of a node began, by its name.
-
-    Parameters
-    ----------
-    name : str
-        Of the file.
-    node : str
-        Name of the node.
 
     Returns
     -------
@@ -129,37 +99,14 @@ def start_of(name: str, node: str) -> int | None:
 
 
 def recorded_days(root: Path, node: str) -> RecordedDays:
-    """Find the days on which a node has recorded.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of logs.
-    node : str
-        Name of the node.
-    """
+    """Find the days on which a node has recorded."""
     names = (name for _, files in walk(root, []) for name in files)
     ours = (start_of(name, node) for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX)))
     return RecordedDays(start for start in ours if start is not None)
 
 
 def recorded_logs(root: Path, node: str, failures: list[OSError]) -> list[RecordedLog]:
-    """Find the finished logs of a node.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of logs.
-    node : str
-        Name of the node.
-    failures : list of OSError
-        Errors of folders that cannot be read are appended.
-
-    Returns
-    -------
-    list of RecordedLog
-        The oldest first.
-    """
+    """Find the finished logs of a node."""
     logs = []
     for folder, files in walk(root, failures):
         names = set(files)

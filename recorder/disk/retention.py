@@ -41,14 +41,8 @@ class Plan:
 
     Attributes
     ----------
-    deletions : list of Deletion
-        The oldest first.
     kept : dict of Path to str
         Logs that a limit asks for, and why they are kept all the same.
-    problems : list of str
-        Limits that cannot be met.
-    wipes : bool
-        Whether only the newest log would be left of several.
     """
 
     deletions: list[Deletion] = field(default_factory=list)
@@ -60,10 +54,7 @@ class Plan:
 def disk_of(folder: Path) -> Disk:
     """Measure the disk of a folder, or of the one that it will be made in.
 
-    Raises
-    ------
-    OSError
-        If it cannot be.
+    Raise `OSError` if it cannot be.
     """
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     usage = shutil.disk_usage(there)
@@ -73,16 +64,7 @@ def disk_of(folder: Path) -> Disk:
 def plan_retention(
     logs: Sequence[RecordedLog], days: RecordedDays, limits: Limits, disk: Disk
 ) -> Plan:
-    """Choose the logs that are to be deleted.
-
-    Parameters
-    ----------
-    logs : sequence of RecordedLog
-        The oldest first. The newest is always kept.
-    days : RecordedDays
-    limits : Limits
-    disk : Disk
-    """
+    """Choose the logs that are to be deleted."""
     plan = Plan()
     limits = limits._replace(free=_sensible_floor(logs, limits, disk, plan))
     count, size, free = len(logs), sum(log.size for log in logs), disk.free
@@ -144,12 +126,7 @@ def _unmet(limits: Limits, count: int, size: int, free: int) -> list[str]:
 
 
 def kept_because(log: RecordedLog) -> str:
-    """Say why a log is never deleted; empty if it may be.
-
-    Parameters
-    ----------
-    log : RecordedLog
-    """
+    """Say why a log is never deleted; empty if it may be."""
     if log.locked:
         return "locked by its .keep file"
     if is_reviewed(log.path):
@@ -163,13 +140,7 @@ def kept_because(log: RecordedLog) -> str:
 
 
 def is_reviewed(log: Path) -> bool:
-    """Tell whether a log has marks or reviewed time, or may have.
-
-    Parameters
-    ----------
-    log : Path
-        A finished log.
-    """
+    """Tell whether a log has marks or reviewed time, or may have."""
     layer = review_path(log)
     if not os.path.lexists(layer):
         return False
@@ -181,19 +152,7 @@ def is_reviewed(log: Path) -> bool:
 
 
 def carry_out(plan: Plan, failures: list[OSError]) -> list[RecordedLog]:
-    """Delete what a plan says, each log after its layers.
-
-    Parameters
-    ----------
-    plan : Plan
-    failures : list of OSError
-        Errors of files that cannot be deleted are appended.
-
-    Returns
-    -------
-    list of RecordedLog
-        Those that were deleted.
-    """
+    """Delete what a plan says, each log after its layers."""
     deleted = []
     for log, _ in plan.deletions:
         try:

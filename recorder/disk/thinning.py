@@ -32,20 +32,7 @@ class Thinned(NamedTuple):
 def plan_thinning(
     logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays
 ) -> Iterator[Thinned]:
-    """Choose the logs to thin; one that is reviewed only of statistics, for it is learned from.
-
-    Parameters
-    ----------
-    logs : sequence of RecordedLog
-        The oldest first. The newest is left as it is.
-    days : RecordedDays
-    limits : ThinningDays
-
-    Yields
-    ------
-    Thinned
-        The oldest first.
-    """
+    """Choose the logs to thin; one that is reviewed only of statistics, for it is learned from."""
     for log in logs[:-1]:
         due = limits.step(days.since(log.start))
         if not due or (kept := kept_because(log)) not in {"", REVIEWED}:
@@ -60,12 +47,6 @@ def plan_thinning(
 
 def thin(log: Path, step: int) -> bool:
     """Put a thinner log in the place of one, in one step that nothing can halve.
-
-    Parameters
-    ----------
-    log : Path
-    step : int
-        A place in `hearthlog.schemas.salvage.thin.STEPS`.
 
     Returns
     -------

@@ -23,18 +23,6 @@ class CandidateWatch:
     """Checks every second, in a thread of its own, whether there is another candidate.
 
     The candidate is the link `candidate.safetensors` beside the model in use. It need not be there.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the model in use.
-    features : FeatureSet
-        Of that model.
-
-    Attributes
-    ----------
-    first : Loaded or None
-        The candidate at the start.
     """
 
     def __init__(self, folder: Path, features: FeatureSet) -> None:

@@ -11,12 +11,6 @@ from hearthlog.schemas.messages.topics import LIVE
 def clash(model: Model, others: Mapping[str, Model]) -> str:
     """Say which class of a model another one labels as well.
 
-    Parameters
-    ----------
-    model : Model
-    others : mapping of str to Model
-        By labelling: `live`, `scenario/<name>`.
-
     Returns
     -------
     str
@@ -37,13 +31,7 @@ def clash(model: Model, others: Mapping[str, Model]) -> str:
 
 
 def shared_classes(model: Model, others: Iterable[Model]) -> list[str]:
-    """Return the classes of a model that others label as well, by its names.
-
-    Parameters
-    ----------
-    model : Model
-    others : iterable of Model
-    """
+    """Return the classes of a model that others label as well, by its names."""
     theirs = {name for other in others for name in _classes(other)}
     return [label for name, label in _classes(model).items() if name in theirs]
 

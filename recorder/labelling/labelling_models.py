@@ -21,12 +21,8 @@ class Change(NamedTuple):
 
     Attributes
     ----------
-    labelling : str
-        `live`, `candidate` for the model on trial, or `scenario/<name>`.
     model : Model or None
         None for no labels.
-    classifier : Classifier or None
-        Of that model.
     """
 
     labelling: str
@@ -41,20 +37,6 @@ class LabellingModels:
     ----------
     watch : ModelWatch or None
         Gives the models, one after the other; None for no labels.
-    candidates : CandidateWatch or None
-        Gives the models that label on trial beside them.
-    scenarios : mapping of str to ModelWatch, optional
-        Give the models of scenarios, by the name of the scenario.
-    left_out : list of str, optional
-        Why scenarios cannot label; those are added that cannot beside the others. By default it is
-        an error if there are any.
-    features : FeatureSet, optional
-        What is recorded where no model labels.
-
-    Attributes
-    ----------
-    in_use : dict of str to Loaded
-        By labelling: `live`, `candidate` for the model on trial, `scenario/<name>`.
 
     Raises
     ------
@@ -112,16 +94,7 @@ class LabellingModels:
     def leave_out(self, labelling: str, reason: str) -> None:
         """Let a scenario not label, and say why at the next call of `refusals`.
 
-        Parameters
-        ----------
-        labelling : str
-            `scenario/<name>`.
-        reason : str
-
-        Raises
-        ------
-        ConfigurationError
-            If none may be left out.
+        Raise `ConfigurationError` if none may be left out.
         """
         text = f"{labelling.replace('/', ' ')}: {reason}"
         if self._left_out is None:

@@ -39,13 +39,7 @@ class Loaded(NamedTuple):
 
 
 class ReloadRequests:
-    """Asks all watches to look at their files at once; a signal handler may do so.
-
-    Attributes
-    ----------
-    restart : bool
-        Whether the recorder, once it is stopped, starts again by itself.
-    """
+    """Asks all watches to look at their files at once; a signal handler may do so."""
 
     def __init__(self) -> None:
         self.restart = False
@@ -73,21 +67,13 @@ class ModelWatch:
     requests : SimpleQueue
         An item makes the watch check at once, and report again what it has refused. Unlike an
         event, a queue can be used from a signal handler at any moment.
-    scenario : str, optional
-        Name of the one whose model it is; by default it is the one that labels the home.
-    network : str, optional
-        Whose embeddings there are; the names of starter models mean those that take them.
 
     Attributes
     ----------
-    first : Loaded
-        The model at the start.
     starter : str
         Name of the starter model at the start; empty if it is a file.
     ready : Loaded or None
         The last model that replaced it; to be set to None by who uses it.
-    held : Loaded or None
-        What the file has, and was refused because of what another model labels.
 
     Raises
     ------
@@ -132,13 +118,7 @@ class ModelWatch:
         return loaded
 
     def refusals(self) -> Iterator[str]:
-        """Yield why models were refused since the last call, and update `ready`.
-
-        Yields
-        ------
-        str
-            A sentence about one file.
-        """
+        """Yield why models were refused since the last call, and update `ready`."""
         with suppress(Empty):
             while True:
                 result, self.held = self._results.get_nowait(), None
@@ -154,13 +134,6 @@ class ModelWatch:
 
     def refuse_ready(self, reason: str, in_use: Model) -> str:
         """Refuse the model that is ready, and hold it.
-
-        Parameters
-        ----------
-        reason : str
-            Why it cannot be used.
-        in_use : Model
-            The one that goes on.
 
         Returns
         -------
@@ -280,29 +253,14 @@ def _warn_if_changed(path: Path, champion: Model) -> None:
 def load_checked(path: Path, on_damage: Callable[[str], object] | None = None) -> Loaded:
     """Load a model, and check that it can classify.
 
-    Parameters
-    ----------
-    path : Path
-        Model file, or the name of a starter model.
-    on_damage : callable, optional
-        As `load_model` takes it.
-
-    Raises
-    ------
-    ModelError
-        If it cannot be used.
+    Raise `ModelError` if it cannot be used.
     """
     model = load_model(path, on_damage)
     return Loaded(model, Classifier(model))
 
 
 def file_identity(path: Path) -> FileIdentity:
-    """Return what differs between two files of one name; None if there is no file.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """Return what differs between two files of one name; None if there is no file."""
     try:
         status = path.stat()
     except OSError:

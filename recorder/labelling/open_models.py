@@ -27,22 +27,10 @@ def open_models(  # noqa: PLR0913
 
     Parameters
     ----------
-    settings : Settings
-    microphones : sequence of str
-        Names of those that are recorded.
     reload_requests : ReloadRequests or None
         Make the recorder check at once whether a file has been replaced.
-    stack : contextlib.ExitStack
-        Closes what watches the files.
     leaves_out : bool
         Whether scenarios that cannot label are left out; else they are an error.
-    network : str, optional
-        Whose embeddings there are; the names of starter models mean those that take them.
-
-    Returns
-    -------
-    dict of str to LabellingModels
-        By the name of the microphone.
 
     Raises
     ------

@@ -50,14 +50,8 @@ def describe_log(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    settings : Settings
-    info : message
-        `AudioStreamInfo` of the logs.
-    features : FeatureSet
     model : Model or None
         The model that labels the sound; None for no labels.
-    beside : mapping of str to Model, optional
-        Those that label beside it, by labelling: `candidate`, `scenario/<name>`.
     embedding : EmbeddingSource, optional
         Of the embeddings; None without a network.
     """
@@ -106,16 +100,7 @@ def describe_log(  # noqa: PLR0913, PLR0917
 def with_scenarios(
     description: LogDescription, microphone: str, scenarios: Mapping[str, Model]
 ) -> LogDescription:
-    """Add what logs say of the scenarios of a microphone, but their topics.
-
-    Parameters
-    ----------
-    description : LogDescription
-    microphone : str
-        Its name.
-    scenarios : mapping of str to Model
-        The models that label for them, by the name of the scenario.
-    """
+    """Add what logs say of the scenarios of a microphone, but their topics."""
     entries = dict(description.metadata)
     attachments = list(description.attachments)
     for name, model in scenarios.items():
@@ -139,14 +124,7 @@ def _scenario_attachments(scenario: str, model: Model) -> list[Attachment]:
 
 
 def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
-    """Return the description of the logs of several microphones.
-
-    Parameters
-    ----------
-    descriptions : sequence of LogDescription
-        One for each microphone. The metadata are those of the first, with the scenarios of all;
-        attachments of another one are named after it where they differ.
-    """
+    """Return the description of the logs of several microphones."""
     first = descriptions[0]
     attachments = {each.name: each for each in first.attachments}
     for other in descriptions[1:]:

@@ -36,13 +36,7 @@ class LogFinisher:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def add(self, active: Sequence[Path]) -> None:
-        """Begin to write logs anew that are completed or cut, but not named; return at once.
-
-        Parameters
-        ----------
-        active : sequence of Path
-            Their active names; one that somebody still writes is left alone.
-        """
+        """Begin to write logs anew that are completed or cut, but not named; return at once."""
         self._forget([process for process in self._processes if process.poll() is not None])
         self._left = [path for path in dict.fromkeys([*self._left, *active]) if path.exists()]
         command = [*_COMMAND, *map(str, self._left)]

@@ -28,17 +28,8 @@ class FolderLock:
     logs, but is nobody's once the process has ended. Where the disk takes no file now, nothing is
     locked.
 
-    Parameters
-    ----------
-    folder : Path
-    node : str
-        Name of the recorder.
-
-    Raises
-    ------
-    LogError
-        As a context manager at its start: if another recorder holds it, or the folder cannot be
-        written to.
+    Raise `LogError` as a context manager at its start: if another recorder holds it, or the
+    folder cannot be written to.
     """
 
     def __init__(self, folder: Path, node: str) -> None:
@@ -66,10 +57,7 @@ class FolderLock:
     def renew(self) -> None:
         """Hold the lock again if its folder has been deleted, moved away or mounted since.
 
-        Raises
-        ------
-        LogError
-            If another recorder holds it now, or the folder cannot be written to.
+        Raise `LogError` if another recorder holds it now, or the folder cannot be written to.
         """
         if self._descriptor is None or not self._is_here(self._descriptor):
             self._release()
@@ -130,10 +118,7 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
 def check_writable(folder: Path) -> None:
     """Check whether a folder can be written to, or made, and leave no trace.
 
-    Raises
-    ------
-    LogError
-        If it cannot be.
+    Raise `LogError` if it cannot be.
     """
     folder = folder.absolute()
     there = next(path for path in (folder, *folder.parents) if path.exists())
@@ -146,8 +131,6 @@ class NodeLock(NamedTuple):
 
     Attributes
     ----------
-    path : Path
-    node : str
     process : int
         The last one that held it; 0 if the file does not name one.
     is_held : bool or None

@@ -57,12 +57,7 @@ class HeldMessages:
         return not _ENTRY.unpack_from(self._memory, self._begin)[1]
 
     def extend(self, items: Iterable[Held]) -> None:
-        """Append messages and descriptions.
-
-        Parameters
-        ----------
-        items : iterable of EncodedMessage or LogDescription
-        """
+        """Append messages and descriptions."""
         for item in items:
             if isinstance(item, LogDescription):
                 self._descriptions.append(item)

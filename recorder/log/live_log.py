@@ -26,17 +26,7 @@ _WRITTEN_AT_ONCE = 256  # messages of those that were held
 
 
 class LiveLog:
-    """Writes messages to a rolling log, and holds them in memory while the disk refuses them.
-
-    Parameters
-    ----------
-    log : RollingLog
-        Live.
-    root : Path
-        Its folder.
-    lock : FolderLock or None
-        Of the folder.
-    """
+    """Writes messages to a rolling log, and holds them in memory while the disk refuses them."""
 
     def __init__(self, log: RollingLog, root: Path, lock: FolderLock | None = None) -> None:
         self._log = log
@@ -61,13 +51,7 @@ class LiveLog:
         return self._log.finished
 
     def write(self, messages: Sequence[EncodedMessage]) -> None:
-        """Append messages, or hold them.
-
-        Parameters
-        ----------
-        messages : sequence of EncodedMessage
-            In the order of their log times.
-        """
+        """Append messages, or hold them."""
         self._held.extend(messages)
         self._write(messages)
 
@@ -77,50 +61,22 @@ class LiveLog:
         return notices
 
     def may_begin(self, stamp: int) -> bool:
-        """Tell whether a file may begin at a time, as `RollingLog.may_begin` does.
-
-        Parameters
-        ----------
-        stamp : int
-            In nanoseconds of UTC.
-        """
+        """Tell whether a file may begin at a time, as `RollingLog.may_begin` does."""
         return not self._failing and self._log.may_begin(stamp)
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
-        """Find the file that contains a time, as `RollingLog.file_at` does.
-
-        Parameters
-        ----------
-        stamp : int
-            In nanoseconds of UTC.
-        """
+        """Find the file that contains a time, as `RollingLog.file_at` does."""
         return self._log.file_at(stamp)
 
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
-        """Complete the open file, and let the next message begin one of another description.
-
-        Parameters
-        ----------
-        description : LogDescription
-            Of the files to come.
-        messages : sequence of EncodedMessage
-            The last ones of the open file, in the order of their log times.
-        """
+        """Complete the open file, and let the next message begin one of another description."""
         self._held.extend([*messages, description])
         self._write([*messages, description])
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
         """Append the last messages, and complete the open file.
 
-        Parameters
-        ----------
-        messages : sequence of EncodedMessage
-            In the order of their log times.
-
-        Raises
-        ------
-        LogError
-            If the disk refuses them.
+        Raise `LogError` if the disk refuses them.
         """
         self._held.extend(messages)
         self._retry_at = 0.0

@@ -47,13 +47,6 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
     of sound are not kept, for they are to be forgotten some day. A log that cannot be completed is
     left for the next start; an empty file, as a power cut leaves it, is deleted.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of the logs.
-    node : str
-        Name of the node.
-
     Returns
     -------
     list of Recovered
@@ -71,15 +64,7 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
 
 
 def active_logs(root: Path, node: str) -> list[Path]:
-    """Return the logs of a node, and their clips, that have no final name yet, by name.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of the logs.
-    node : str
-        Name of the node.
-    """
+    """Return the logs of a node, and their clips, that have no final name yet, by name."""
     return sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}")))
 
 
@@ -118,10 +103,6 @@ def end_of_sound(root: Path, node: str, microphone: str, before: int) -> int:
 
     Parameters
     ----------
-    root : Path
-        Folder of the logs.
-    node, microphone : str
-        Their names.
     before : int
         Logs that begin later are not looked at: the clock was wrong when they were made. In
         nanoseconds of UTC.

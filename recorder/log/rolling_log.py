@@ -30,26 +30,14 @@ class RollingLog:
 
     Parameters
     ----------
-    description : LogDescription
     file_seconds : int
         Files begin at multiples of this, in UTC.
     flush_seconds : float
         A killed process loses at most this much sound.
     sync_seconds : float
         A power cut loses at most this much sound.
-    live : bool, optional
-        Whether a file whose name is taken gets another one, as where the clock was set back.
     file_bytes : int
         Another file begins where one has grown so large; 0 for any size.
-    finisher : LogFinisher or None
-        Gives complete files their names; by default they get them at once.
-
-    Attributes
-    ----------
-    finished : list of Path
-        Files that are complete, by their final names.
-    safe : int
-        How many of the messages that were given are on the disk.
     """
 
     def __init__(  # noqa: PLR0913
@@ -88,16 +76,8 @@ class RollingLog:
 
         Where time runs backwards, because the clock was set, another file begins.
 
-        Parameters
-        ----------
-        messages : sequence of EncodedMessage
-            In the order of their log times.
-
-        Raises
-        ------
-        LogError
-            If the disk refuses: what was written stays, for the next start to complete. Also if
-            there is a file already with the name of one that begins, unless live.
+        Raise `LogError` if the disk refuses: what was written stays, for the next start to
+        complete. Also if there is a file already with the name of one that begins, unless live.
         """
         with self._keeping_what_was_written():
             for part in self._parts(messages):
@@ -120,10 +100,7 @@ class RollingLog:
     def flush(self) -> None:
         """Hand what was written over to the operating system.
 
-        Raises
-        ------
-        OSError
-            If the disk refuses.
+        Raise `OSError` if the disk refuses.
         """
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
@@ -135,10 +112,7 @@ class RollingLog:
     def sync(self) -> None:
         """Wait until what was written is on the disk.
 
-        Raises
-        ------
-        OSError
-            If the disk refuses.
+        Raise `OSError` if the disk refuses.
         """
         self.flush()
         if self._writer is not None:
@@ -166,13 +140,7 @@ class RollingLog:
             self._finish_file()
 
     def may_begin(self, stamp: int) -> bool:
-        """Tell whether a file may begin at a time: each second has one name.
-
-        Parameters
-        ----------
-        stamp : int
-            In nanoseconds of UTC.
-        """
+        """Tell whether a file may begin at a time: each second has one name."""
         description = self._description
         path = log_path(description.root, description.node, stamp)
         return free_log_path(description.root, description.node, stamp) == path
@@ -196,8 +164,6 @@ class RollingLog:
 
         Returns
         -------
-        path : Path
-            Name of the finished file.
         end : int
             When the next file begins, in nanoseconds of UTC.
         """
@@ -213,17 +179,7 @@ class RollingLog:
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
         """Complete the open file, and let the next message begin one of another description.
 
-        Parameters
-        ----------
-        description : LogDescription
-            Of the files to come.
-        messages : sequence of EncodedMessage
-            The last ones of the open file, in the order of their log times.
-
-        Raises
-        ------
-        LogError
-            As `finish` does.
+        Raise `LogError` as `finish` does.
         """
         self.finish(messages)
         self._description = description
@@ -241,10 +197,7 @@ class RollingLog:
     def begin_after_failure(self) -> None:
         """Go on after an error: the messages that are not `safe` are to be written again.
 
-        Raises
-        ------
-        OSError
-            If the disk still refuses.
+        Raise `OSError` if the disk still refuses.
         """
         if self._abandoned is not None:
             self._abandoned.discard_unsynced()

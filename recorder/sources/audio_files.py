@@ -46,7 +46,6 @@ class FileSource:
 
     Parameters
     ----------
-    paths : sequence of Path
     start : int
         Time of the first sample in nanoseconds of UTC.
     times : sequence of (FileTime or None), optional
@@ -60,12 +59,6 @@ class FileSource:
         The one to hear, from 1 on.
     progress : callable
         Told the share of the sound that was read, 0 to 1.
-
-    Attributes
-    ----------
-    realtime : bool
-    frames : int
-        Number of frames that were yielded.
 
     Raises
     ------
@@ -132,20 +125,8 @@ class FileSource:
 
         The health comes every ten seconds of sound.
 
-        Parameters
-        ----------
-        stop : threading.Event
-            Ends the source when it is set.
-
-        Yields
-        ------
-        Event
-            `Frames`, `Gap` and `SourceHealth`, in the order of time.
-
-        Raises
-        ------
-        SourceError
-            If a file cannot be opened any more, or if all together are shorter than a frame.
+        Raise `SourceError` if a file cannot be opened any more, or if all together are shorter
+        than a frame.
         """
         began = time.monotonic()
         next_frame, end, report = 0, self._start, 0
@@ -331,19 +312,10 @@ def find_audio(
 ) -> tuple[list[Path], list[str]]:
     """Replace folders by the audio files in them and in their folders.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Files, which are taken as they are, and folders.
-    check : callable
-        Raises `SourceError` for a file of a folder that is to be left out.
-
     Returns
     -------
     list of Path
         Those of a folder in the order of their names, without hidden ones.
-    list of str
-        Why others of a folder were left out, in a line each.
 
     Raises
     ------
@@ -375,10 +347,6 @@ def files_below(folder: Path) -> Iterator[Path]:
     """Yield all files in a folder and its folders, also those behind links, sorted by folder.
 
     Hidden folders are left out.
-
-    Parameters
-    ----------
-    folder : Path
     """
     seen: set[tuple[int, int]] = set()
     for parent, folders, names in os.walk(folder, followlinks=True):

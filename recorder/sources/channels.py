@@ -40,8 +40,6 @@ def missing_channel(there: int, wanted: int) -> str:
 
     Parameters
     ----------
-    there : int
-        How many there are.
     wanted : int
         From 1 on.
     """
@@ -59,8 +57,6 @@ class ChannelMixer:
     ----------
     channel : int or None
         The one to hear whatever they hold, from 1 on.
-    chosen : callable
-        As of `read_audio`.
     """
 
     def __init__(self, channel: int | None = None, chosen: Callable[[str], object] = str) -> None:
@@ -164,17 +160,7 @@ class StreamMixer:
 
 
 class _Choice:
-    """Which of several channels are heard.
-
-    Parameters
-    ----------
-    count : int
-        Of the channels.
-    chosen : callable
-        As of `read_audio`.
-    takes_first : bool
-        As of `StreamMixer`.
-    """
+    """Which of several channels are heard."""
 
     def __init__(
         self, count: int, chosen: Callable[[str], object], *, takes_first: bool = False
@@ -241,8 +227,6 @@ class _Choice:
         Parameters
         ----------
         block : np.ndarray [shape=(n, c)], float32
-        is_whole : bool
-            Whether it is more than the beginning of a block.
         """
         step = max(len(block) // (_PIECES * _SAMPLES), 1)
         rows = block[::step].astype(np.float64)

@@ -33,15 +33,12 @@ def read_audio(  # noqa: PLR0913
 
     Parameters
     ----------
-    path : Path
     start, end : float
         The part to read, in seconds, as far as the file goes.
     channels : int or None
         Those of an array, as `check_channels` takes them, which are kept apart.
     channel : int or None
         The one to read, from 1 on.
-    incomplete : callable
-        Told at the end that the file is damaged or cut short, if it is; what is there was yielded.
     chosen : callable
         Told in a sentence which channels are heard and why, whenever others are; in an empty one,
         when all are heard again.
@@ -106,7 +103,6 @@ def check_channels(path: Path, channels: int | None, channel: int | None = None)
 
     Parameters
     ----------
-    path : Path
     channels : int or None
         Of the array; None allows any.
     channel : int or None
@@ -143,13 +139,7 @@ def _resampled(
 
 
 class _Holes:
-    """Where samples are NaN, before and after they are resampled.
-
-    Parameters
-    ----------
-    ratio : float
-        Samples after, to one before.
-    """
+    """Where samples are NaN, before and after they are resampled."""
 
     def __init__(self, ratio: float) -> None:
         self._ratio = ratio

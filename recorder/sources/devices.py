@@ -17,16 +17,10 @@ class Device:
 
     Attributes
     ----------
-    index : int
-        Number in PortAudio, valid only in this process.
     name : str
         Name without the number of the sound card, which changes from one start to the next.
-    channels : int
     default_rate : float
         In Hz.
-    is_default : bool
-    port, serial : str
-        Where it is plugged in, as `UsbPlace` has it.
     """
 
     index: int
@@ -46,10 +40,7 @@ class Device:
 def load_portaudio() -> ModuleType:
     """Import sounddevice, which looks for PortAudio and starts it.
 
-    Raises
-    ------
-    SourceError
-        If PortAudio is missing or cannot start.
+    Raise `SourceError` if PortAudio is missing or cannot start.
     """
     try:
         import sounddevice  # noqa: PLC0415  starting PortAudio may fail, and takes time
@@ -64,11 +55,6 @@ def load_portaudio() -> ModuleType:
 
 def list_devices(sounddevice: ModuleType) -> list[Device]:
     """List the microphones.
-
-    Parameters
-    ----------
-    sounddevice : module
-        As `load_portaudio` returns it.
 
     Returns
     -------
@@ -96,13 +82,9 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
 
     Parameters
     ----------
-    devices : list of Device
-        All microphones, as `list_devices` gives them.
     name : str
         A name or a part of one, in which capitals make no difference; or a port or serial number,
         as `UsbPlace` has them; empty for the default microphone.
-    exact : bool, optional
-        Whether only a whole name will do.
 
     Raises
     ------

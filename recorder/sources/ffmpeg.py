@@ -62,10 +62,7 @@ _MEANINGS = {
 def check_ffmpeg() -> None:
     """Check that there is an ffmpeg.
 
-    Raises
-    ------
-    SourceError
-        If there is none; it says how to get it.
+    Raise `SourceError` if there is none; it says how to get it.
     """
     if shutil.which("ffmpeg") is None:
         raise SourceError(
@@ -82,19 +79,8 @@ def has_ffmpeg() -> bool:
 class FileDecoder:
     """The first sound of a file, decoded by ffmpeg, which may open this file only.
 
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    rate, channels : int
-
-    Raises
-    ------
-    SourceError
-        If ffmpeg finds no sound in it; its text is the reason alone, empty if ffmpeg does not know
-        the format.
+    Raise `SourceError` if ffmpeg finds no sound in it; its text is the reason alone, empty if
+    ffmpeg does not know the format.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,15 +110,7 @@ class FileDecoder:
     def read(self, frames: int) -> bytes:
         """Return the next samples as big-endian float32, fewer at the end.
 
-        Parameters
-        ----------
-        frames : int
-            Samples of each channel.
-
-        Raises
-        ------
-        SourceError
-            If ffmpeg does not go on.
+        Raise `SourceError` if ffmpeg does not go on.
         """
         size = _SAMPLE_BYTES * self.channels
         data = self._read(frames * size)
@@ -243,11 +221,6 @@ def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
 
     ffmpeg ends with the thread that starts it, also if that is killed.
 
-    Parameters
-    ----------
-    address : str
-        As `check_address` takes it.
-
     Returns
     -------
     subprocess.Popen
@@ -281,14 +254,8 @@ def explain(address: str, said: str) -> str:
 
     Parameters
     ----------
-    address : str
     said : str
         What it wrote to standard error, which may have the address in it.
-
-    Returns
-    -------
-    str
-        One line, without any of what it said.
     """
     said = said.replace(address, "")
     found = next((meaning for text, meaning in _MEANINGS.items() if re.search(text, said)), None)

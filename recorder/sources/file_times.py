@@ -76,12 +76,8 @@ class FileTime(NamedTuple):
 
     Attributes
     ----------
-    start : int
-        Nanoseconds of UTC.
     step : int
         To which this is known, in nanoseconds.
-    origin : str
-        `NAME`, `METADATA` or `GUESS`.
     remark : str
         Why the start may be wrong; empty if nothing speaks for that.
     """
@@ -109,7 +105,6 @@ def file_time(
 
     Parameters
     ----------
-    path : Path
     zone : tzinfo
         Of the times that say none.
     pattern : str
@@ -150,18 +145,14 @@ def arrange(
 
     Parameters
     ----------
-    paths : sequence of Path
     zone : tzinfo
         Of the times that say none.
-    pattern : str
-        As of `file_time`.
     start : int or None
         When the first of them begins, in nanoseconds of UTC, whatever it says itself; all others
         keep their distance from it.
 
     Returns
     -------
-    list of Path
     list of (FileTime or None)
         When each begins; None: where the one before it ends.
 
@@ -193,10 +184,7 @@ def arrange(
 def check_pattern(pattern: str) -> None:
     """Check that a pattern says a date and a time of day.
 
-    Raises
-    ------
-    ConfigurationError
-        If it does not.
+    Raise `ConfigurationError` if it does not.
     """
     found = re.findall("%(.)", pattern)
     used = set(found)
@@ -459,13 +447,7 @@ def _wav_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 def doubts(paths: Sequence[Path], times: Sequence[FileTime | None]) -> list[str]:
-    """Say in lines which starts may be wrong, and what to do.
-
-    Parameters
-    ----------
-    paths, times
-        As `arrange` returns them, without a start that was given.
-    """
+    """Say in lines which starts may be wrong, and what to do."""
     lines: dict[str, list[tuple[Path, str]]] = {}
     follows = 0
     for path, found in zip(paths, times, strict=True):

@@ -32,8 +32,6 @@ class FrameCutter:
         ----------
         samples : np.ndarray [shape=(m,) or (m, c)], float32
             At the rate of the sound.
-        last : bool
-            Whether the sound ends with these samples.
 
         Returns
         -------

@@ -27,8 +27,6 @@ class SampleBlock:
 
     Attributes
     ----------
-    index : int
-        Number of the first sample since that process started.
     samples : np.ndarray [shape=(n,) or (n, c)], int16
         With an axis of channels, if it is an array of microphones.
     overflowed : bool
@@ -151,11 +149,6 @@ class Framer:
     def add(self, block: SampleBlock) -> list[Frames | Gap]:
         """Add a block and return the frames that it completes.
 
-        Parameters
-        ----------
-        block : SampleBlock
-            The next one of the same capture process.
-
         Returns
         -------
         list of Frames or Gap
@@ -236,8 +229,6 @@ def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:
 
     Parameters
     ----------
-    first : int
-        Number of the first frame.
     frames : np.ndarray [shape=(n, 800) or (n, 800, c)], float32
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.

@@ -14,20 +14,7 @@ _LOOK_SECONDS = 1.0
 
 
 def merged_events(sources: Mapping[str, SoundSource], stop: Flag) -> Iterator[tuple[str, Event]]:
-    """Yield the events of microphones, each of several read by a thread of its own.
-
-    Parameters
-    ----------
-    sources : mapping of str to SoundSource
-        By the name of the microphone.
-    stop : threading.Event
-        Ends the sources when it is set.
-
-    Yields
-    ------
-    (str, Event)
-        Name of the microphone, and one of its events.
-    """
+    """Yield the events of microphones, each of several read by a thread of its own."""
     if len(sources) == 1:
         yield from ((name, event) for name in sources for event in sources[name].events(stop))
         return

@@ -48,15 +48,8 @@ _FALLBACK_SECONDS = 10.0  # of patience with the device, before another one is h
 def check_device(device: str) -> None:
     """Check what can be known of a device before it is opened.
 
-    Parameters
-    ----------
-    device : str
-        As `MicrophoneSource` takes it.
-
-    Raises
-    ------
-    SourceError
-        If it is an address that cannot be one of sound, or for which ffmpeg or ROS is not there.
+    Raise `SourceError` if it is an address that cannot be one of sound, or for which ffmpeg or
+    ROS is not there.
     """
     if is_address(device):
         check_address(device)
@@ -81,8 +74,6 @@ class MicrophoneSource:
     waits : bool, optional
         Whether a device that is not there at the start is waited for, as it is later. One that is
         no such array is not waited for without a fallback.
-    rest : Rest or None
-        When the device is to be closed; by default never.
     channels : int or None
         Of an array; None of a single microphone.
     channel : int or None
@@ -140,11 +131,6 @@ class MicrophoneSource:
 
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield frames, gaps and health until `stop` is set, even if the microphone is lost.
-
-        Parameters
-        ----------
-        stop : threading.Event
-            Ends the source when it is set.
 
         Yields
         ------

@@ -78,7 +78,6 @@ class OpenAudio(NamedTuple):
 
     Attributes
     ----------
-    rate, channels : int
     frames : int or None
         Samples of each channel, as the header says; None if it does not.
     blocks : callable
@@ -99,15 +98,8 @@ class OpenAudio(NamedTuple):
 def open_audio(path: Path) -> Iterator[OpenAudio]:
     """Open an audio file.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    SourceError
-        If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
-        768 kHz.
+    Raise `SourceError` if the file is missing, is not audio, holds none, or has a sample rate
+    below 1 kHz or above 768 kHz.
     """
     with _readable(path), _open(path) as audio:
         yield audio
@@ -152,14 +144,7 @@ def audio_seconds(path: Path) -> float:
 
     Where it says none, all of the file is decoded.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    SourceError
-        As `open_audio`.
+    Raise `SourceError` as `open_audio`.
     """
     with open_audio(path) as audio:
         if audio.frames is not None:
@@ -176,12 +161,7 @@ def _decoded_seconds(path: Path, _time: int, _size: int) -> float:
 
 
 def is_audio(name: str) -> bool:
-    """Whether a file is named as audio that can be read.
-
-    Parameters
-    ----------
-    name : str
-    """
+    """Whether a file is named as audio that can be read."""
     suffix = os.path.splitext(name)[1].lower()  # noqa: PTH122
     return suffix in _SUFFIXES and not name.startswith(".")
 
@@ -189,14 +169,7 @@ def is_audio(name: str) -> bool:
 def text_fields(path: Path) -> list[str]:
     """Return the texts that libsndfile finds in an audio file, such as a comment.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    SourceError
-        If there is no such file, or nothing can be read of it.
+    Raise `SourceError` if there is no such file, or nothing can be read of it.
     """
     _check_file(path)
     with _readable(path), suppress(soundfile.LibsndfileError), _opened(path, []) as sound:

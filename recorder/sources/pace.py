@@ -19,11 +19,6 @@ class Pace:
     ----------
     began : float
         Time at which the source was called, in seconds of CLOCK_MONOTONIC.
-
-    Attributes
-    ----------
-    count : int
-        Samples that have arrived.
     """
 
     def __init__(self, began: float) -> None:

@@ -34,10 +34,7 @@ _INPUT_OVERFLOW = 2  # paInputOverflow
 def query_devices() -> list[Device]:
     """List the microphones, as `list_devices` does, in a process of its own.
 
-    Raises
-    ------
-    SourceError
-        If PortAudio is missing, cannot start, hangs or crashes.
+    Raise `SourceError` if PortAudio is missing, cannot start, hangs or crashes.
     """
     try:
         answer = subprocess.run(  # noqa: S603  our own module
@@ -60,10 +57,7 @@ def query_devices() -> list[Device]:
 def check_ros() -> None:
     """Check that there is a ROS 2 for this Python.
 
-    Raises
-    ------
-    SourceError
-        If there is none; it says how to get it.
+    Raise `SourceError` if there is none; it says how to get it.
     """
     if find_spec("rclpy") is None:
         raise SourceError(
@@ -172,18 +166,12 @@ class CaptureProcess(_Process):
     ----------
     device : str
         As `hearthlog devices` lists it, or empty for the default one.
-    exact : bool, optional
-        Whether no other device will do whose name contains this one.
     channels : int or None
         Of an array; None of a single microphone.
     channel : int or None
         The one to hear, from 1 on; by default the blocks have all of up to eight.
     latency : float
         Seconds that PortAudio holds while nobody reads.
-
-    Attributes
-    ----------
-    format : CaptureFormat
 
     Raises
     ------
@@ -221,16 +209,8 @@ class NetworkProcess(_Process):
 
     Parameters
     ----------
-    address : str
-        As `check_address` takes it.
-    stop : threading.Event
-        Ends the wait for its first answer when it is set.
     channel : int or None
         The one to hear, from 1 on; by default the blocks have all, of a topic the first one.
-
-    Attributes
-    ----------
-    format : CaptureFormat
 
     Raises
     ------

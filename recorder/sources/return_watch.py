@@ -12,13 +12,7 @@ _RETRY_SECONDS = 10.0
 
 
 class ReturnWatch:
-    """Opens a device as soon as it is there, in a thread: that may take as long as it likes.
-
-    Parameters
-    ----------
-    open_device : callable
-        Is told a flag that ends the attempt, and returns the capture, or raises SourceError.
-    """
+    """Opens a device as soon as it is there, in a thread: that may take as long as it likes."""
 
     def __init__(self, open_device: Callable[[Flag], Capture]) -> None:
         self._open = open_device

@@ -60,8 +60,6 @@ class SampleClock:
 
         Parameters
         ----------
-        index : int
-            Number of the sample.
         time : float
             Seconds of CLOCK_MONOTONIC.
         is_exact : bool

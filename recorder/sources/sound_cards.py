@@ -9,14 +9,7 @@ _LOOK_SECONDS = 0.25
 
 
 def cards_change(stop: Flag, seconds: float) -> bool:
-    """Wait, but no longer than until a sound card comes or goes; return whether one does.
-
-    Parameters
-    ----------
-    stop : threading.Event
-        Ends the wait when it is set.
-    seconds : float
-    """
+    """Wait, but no longer than until a sound card comes or goes; return whether one does."""
     cards, end = _sound_cards(), time.monotonic() + seconds
     while time.monotonic() < end and not stop.wait(min(_LOOK_SECONDS, seconds)):
         if _sound_cards() != cards:

@@ -23,15 +23,7 @@ class UsbPlace(NamedTuple):
 
 
 def usb_place(card: int, cards: Path = _CARDS) -> UsbPlace:
-    """Find where a sound card is plugged in.
-
-    Parameters
-    ----------
-    card : int
-        Its number in ALSA.
-    cards : Path, optional
-        The folder in which Linux lists them.
-    """
+    """Find where a sound card is plugged in."""
     interface = (cards / f"card{card}" / "device").resolve()
     device = interface.parent  # of the interface that is the sound card
     try:

@@ -45,10 +45,7 @@ class WallClock:
 def check_times(first: int, last: int) -> None:
     """Check that a log can have the times of audio files, in nanoseconds of UTC.
 
-    Raises
-    ------
-    SourceError
-        If it cannot.
+    Raise `SourceError` if it cannot.
     """
     if first < 0 or last >= _LAST:
         day = _day(first if first < 0 else last)

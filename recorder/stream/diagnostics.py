@@ -14,10 +14,6 @@ def diagnostics(subject: str, health: SourceHealth, microphone: str = "") -> Enc
     ----------
     subject : str
         A microphone or recorder by its name, and behind a space what of it, if not all of it.
-    health : SourceHealth
-        Of it.
-    microphone : str
-        The microphone whose sound it is about, if it is about one.
     """
     status = message(
         "diagnostic_msgs/msg/DiagnosticStatus",

@@ -15,12 +15,7 @@ from hearthlog.schemas.messages.topics import topic
 
 
 class ArrayDirections:
-    """Finds whence the sound of an array comes, and watches its channels.
-
-    Parameters
-    ----------
-    geometry : ArrayGeometry
-    """
+    """Finds whence the sound of an array comes, and watches its channels."""
 
     def __init__(self, geometry: ArrayGeometry) -> None:
         self._finder = DirectionFinder(geometry)
@@ -63,16 +58,8 @@ def direction_messages(
 
     Parameters
     ----------
-    microphone : str
-        Its name.
-    directions : Directions
     known : np.ndarray [shape=(m,)], int64
         Starts of the last frames of their blocks, in nanoseconds of UTC.
-
-    Returns
-    -------
-    list of EncodedMessage
-        In the order of their log times: each is known with the last frame of its block.
     """
     columns: dict[str, Column] = {
         "header.stamp": directions.stamps,

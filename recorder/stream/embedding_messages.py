@@ -17,14 +17,7 @@ _GATE, _GATE_FRAMES = 2.0, 8  # dB above the floor, and the window, as of the mo
 
 
 class MicrophoneEmbeddings:
-    """Embeds what a microphone hears above the floor of the room.
-
-    Parameters
-    ----------
-    embedder : Embedder
-    features : FeatureSet
-        By which the sound is compared with the floor.
-    """
+    """Embeds what a microphone hears above the floor of the room."""
 
     def __init__(self, embedder: Embedder, features: FeatureSet) -> None:
         self._feature_set = features
@@ -47,8 +40,6 @@ class MicrophoneEmbeddings:
         features : np.ndarray [shape=(n, d)], float32
         floors : Floors or None
             At the last of these frames; None if the feature set has no bands.
-        first : int
-            Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         """
@@ -83,16 +74,8 @@ def embedding_messages(
 
     Parameters
     ----------
-    microphone : str
-        Its name.
-    embeddings : Embeddings
     known : np.ndarray [shape=(m,)], int64
         Starts of the last frames of their windows, in nanoseconds of UTC.
-
-    Returns
-    -------
-    list of EncodedMessage
-        In the order of their log times: each is known with the last frame of its window.
     """
     if not len(known):
         return []

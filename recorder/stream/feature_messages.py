@@ -13,16 +13,7 @@ from hearthlog.schemas.messages.topics import topic
 
 
 class FeatureMessages:
-    """Encodes the features of one stream of frames, and their statistics.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    statistics : RollingStatistics
-    statistics_every : int
-        Frames from one statistics message to the next: those of the frames whose number it divides.
-    """
+    """Encodes the features of one stream of frames, and their statistics."""
 
     def __init__(
         self, microphone: str, statistics: RollingStatistics, statistics_every: int
@@ -41,15 +32,8 @@ class FeatureMessages:
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
-        first : int
-            Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-
-        Returns
-        -------
-        list of EncodedMessage
-            Features, then statistics; each in the order of their log times.
         """
         if not len(features):
             return []

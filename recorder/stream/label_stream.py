@@ -26,22 +26,10 @@ from hearthlog.schemas.messages.topics import (
 class LabelStream:
     """What one model says of a stream of frames.
 
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    labelling : str
-        `live`, or another one, whose segments are not told in `/rosout`.
-    classifier : Classifier
-    embedding : EmbeddingSource, optional
-        Of the embeddings.
-
     Attributes
     ----------
     classes : tuple of str
         Names behind the columns of the probabilities.
-    by_names : bool
-        Whether it labels by what is logged of a network alone.
     segments_converged : bool
         Whether sound before the first frame would leave no trace in the segments to come.
     last : FrameLabels or None
@@ -85,10 +73,6 @@ class LabelStream:
             Of the last frames before it.
         floors : np.ndarray [shape=(m, b)], float64, or None
         stamps : np.ndarray [shape=(n,)], int64
-        frame : int
-            Number of the frame.
-        unlabelled : int
-            Number of the first frame that has no label yet.
         auxiliary : Auxiliary
             Of the last second before it, or more.
         """
@@ -107,18 +91,8 @@ class LabelStream:
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
-        floors : Floors or None
-        first : int
-            Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-        auxiliary : Auxiliary
-            That become known with these frames.
-
-        Returns
-        -------
-        list of EncodedMessage
-            Segments, then labels; each in the order of their log times.
         """
         self.last = None
         labels, segments = self._labeller.push(features, floors, first, stamps, auxiliary)

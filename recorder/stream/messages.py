@@ -37,18 +37,8 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
 
     Parameters
     ----------
-    microphone : str
-        Its name.
-    device : str
-        Name of the source.
-    features : FeatureSet
     model : Model or None
         The model that labels the sound; None for no labels.
-
-    Returns
-    -------
-    message
-        A `hearthlog_msgs/msg/AudioStreamInfo`.
     """
     return message(
         message_types.STREAM_INFO,
@@ -66,20 +56,7 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
 
 
 def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessage]:
-    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words.
-
-    Parameters
-    ----------
-    info : message
-        `AudioStreamInfo`, with the start of the file as its stamp.
-    lines : sequence of str, optional
-        What is said besides.
-
-    Returns
-    -------
-    list of EncodedMessage
-        All at that time.
-    """
+    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words."""
     stamp, microphone = nanoseconds(info.header.stamp), info.header.frame_id
     said = [rosout.notice_line(microphone, stamp, Notice(OK, line)) for line in lines]
     return [

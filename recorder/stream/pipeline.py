@@ -45,37 +45,16 @@ class Pipeline:
 
     Parameters
     ----------
-    microphone : str
-        Its name, which begins the topics and is the `frame_id` of every message.
-    features : FeatureSet
-        What is computed from each frame.
-    classifier : Classifier or None
-        For this feature set. Without one there are no labels.
-    statistics_every : int
-        Frames from one statistics message to the next: those of the frames whose number it divides.
-    beside : mapping of str to Classifier, optional
-        What labels beside it, for the same feature set, by labelling: `candidate`,
-        `scenario/<name>`.
     private : sequence of str
         Classes whose features are logged coarsely, as of `Veil`. With one, all messages come two
         seconds later at most, so that log time never runs backwards.
     array : ArrayGeometry or None
         Of an array of microphones; without one there are no directions.
-    embedder : Embedder or None
-        Of the network whose embeddings are logged.
-    embedding : EmbeddingSource, optional
-        Of the embeddings that `push_features` gets, where nothing is embedded here.
 
     Attributes
     ----------
-    microphone : str
-    feature_set : FeatureSet
-    most_ahead : int
-        Frames behind its window that a label may wait for.
     last_frames : Frames or None
         Those that were pushed last, without what is below hearing and stands out.
-    last_reports : list of SourceHealth
-        The health within them, as `judged`.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -148,17 +127,7 @@ class Pipeline:
         return None if self._live is None else self._live.last
 
     def push(self, event: Event) -> list[EncodedMessage]:
-        """Turn an event of a source into messages.
-
-        Parameters
-        ----------
-        event : Event
-
-        Returns
-        -------
-        list of EncodedMessage
-            In the order of their log times.
-        """
+        """Turn an event of a source into messages."""
         if isinstance(event, Frames):
             samples = self._infrasound(event.samples)
             self.last_frames = replace(event, samples=samples)
@@ -188,17 +157,8 @@ class Pipeline:
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
-        first : int
-            Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-        auxiliary : Auxiliary, optional
-            That become known with these frames.
-
-        Returns
-        -------
-        list of EncodedMessage
-            In the order of their log times.
         """
         floors = self._track_floor(features, first)
         if floors is not None:
@@ -320,13 +280,7 @@ class Pipeline:
         return messages
 
     def flush(self) -> list[EncodedMessage]:
-        """Return what is held, before the log ends.
-
-        Returns
-        -------
-        list of EncodedMessage
-            In the order of their log times.
-        """
+        """Return what is held, before the log ends."""
         return self.hold(self._unveil())
 
     def _unveil(self) -> list[EncodedMessage]:
@@ -334,13 +288,7 @@ class Pipeline:
         return [] if self._veil is None else self._veiled(self._veil.close())
 
     def finish(self) -> list[EncodedMessage]:
-        """End the open segment where the sound ends.
-
-        Returns
-        -------
-        list of EncodedMessage
-            What was held, and the last segments.
-        """
+        """End the open segment where the sound ends."""
         return self.hold([*self._unveil(), *self._close(self._end)])
 
     def change_model(
@@ -357,19 +305,8 @@ class Pipeline:
         ----------
         model : Model or None
             For the same feature set; None for no labels.
-        classifier : Classifier or None
-            Of that model.
         frame, stamp : int
             Number of the next frame, and its start in nanoseconds of UTC.
-        labelling : str
-            `live`, `candidate` or `scenario/<name>`.
-
-        Returns
-        -------
-        closing : list of EncodedMessage
-            Last messages of the log of the model before.
-        opening : list of EncodedMessage
-            First messages of the log of this model.
         """
         held = self.flush()
         earlier = self._streams.pop(labelling, None)
@@ -413,16 +350,8 @@ class Pipeline:
 
         Parameters
         ----------
-        subject : str
-            What it is about: "model" or "clips".
         stamp : int
             Time of the notice, in nanoseconds of UTC.
-        notice : Notice
-
-        Returns
-        -------
-        list of EncodedMessage
-            One for `/diagnostics`, one for `/rosout`.
         """
         subject = f"{self.microphone} {subject}"
         return self.hold(
@@ -433,12 +362,7 @@ class Pipeline:
         )
 
     def judged(self, health: SourceHealth) -> SourceHealth:
-        """Return the health of the source, or what is wrong with its sound.
-
-        Parameters
-        ----------
-        health : SourceHealth
-        """
+        """Return the health of the source, or what is wrong with its sound."""
         problem = self._watch.problem()
         if not problem and self._directions is not None:
             problem = self._directions.problem()

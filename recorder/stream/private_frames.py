@@ -30,13 +30,6 @@ class PrivateFrames:
         Those that are private; if there are none, no frame is.
     window_frames : int
         A second, or the length of the window of a label, if that is longer.
-    ahead : int
-        Frames behind the window that labels may wait for.
-
-    Attributes
-    ----------
-    delay : int
-        Frames from one to that with which it is certain.
     """
 
     def __init__(self, classes: Sequence[str], window_frames: int, ahead: int = 0) -> None:
@@ -56,8 +49,6 @@ class PrivateFrames:
         ----------
         count : int
             At least one.
-        labels : FrameLabels or None
-            That became known with these frames; their classes include all that are private.
 
         Returns
         -------

@@ -13,18 +13,7 @@ _LEVELS = {OK: _INFO, WARNING: _WARN}
 
 
 def info_line(info: Any) -> bytes:
-    """Say in a line of `/rosout` what is recorded.
-
-    Parameters
-    ----------
-    info : message
-        `AudioStreamInfo` of a file.
-
-    Returns
-    -------
-    bytes
-        CDR of a `rcl_interfaces/msg/Log`.
-    """
+    """Say in a line of `/rosout` what is recorded."""
     labels = "no model, no labels"
     if info.model:
         labels = f"{len(info.labels)} labels by {info.model} ({info.model_sha256[:12]})"
@@ -35,58 +24,20 @@ def info_line(info: Any) -> bytes:
 
 
 def segment_line(microphone: str, segment: Segment, label: str) -> bytes:
-    """Say in a line of `/rosout` which sound was labelled, and for how long.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    segment : Segment
-    label : str
-        Name of the segment's class.
-
-    Returns
-    -------
-    bytes
-        CDR of a `rcl_interfaces/msg/Log`.
-    """
+    """Say in a line of `/rosout` which sound was labelled, and for how long."""
     duration = _seconds(segment.end - segment.start)
     text = f"{label} for {duration} ({100 * segment.confidence:.0f} %)"
     return _line(segment.decided_at, microphone, _INFO, text)
 
 
 def gap_line(microphone: str, gap: Gap) -> bytes:
-    """Say in a line of `/rosout`, at the end of a gap, that there was one.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    gap : Gap
-
-    Returns
-    -------
-    bytes
-        CDR of a `rcl_interfaces/msg/Log`.
-    """
+    """Say in a line of `/rosout`, at the end of a gap, that there was one."""
     text = f"gap of {_seconds(gap.end - gap.start)}: {gap.reason}"
     return _line(gap.end, microphone, _WARN, text)
 
 
 def health_line(microphone: str, health: SourceHealth) -> bytes:
-    """Say in a line of `/rosout` what state the source is in.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    health : SourceHealth
-
-    Returns
-    -------
-    bytes
-        CDR of a `rcl_interfaces/msg/Log`.
-    """
+    """Say in a line of `/rosout` what state the source is in."""
     return _line(health.stamp, microphone, _LEVELS.get(health.level, _ERROR), health.summary)
 
 
@@ -95,17 +46,8 @@ def notice_line(microphone: str, stamp: int, notice: Notice) -> bytes:
 
     Parameters
     ----------
-    microphone : str
-        Its name.
     stamp : int
         Time of the notice, in nanoseconds of UTC.
-    notice : Notice
-        Of level `OK` or `WARNING`.
-
-    Returns
-    -------
-    bytes
-        CDR of a `rcl_interfaces/msg/Log`.
     """
     return _line(stamp, microphone, _LEVELS[notice.level], notice.text)
 

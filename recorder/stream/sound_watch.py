@@ -41,13 +41,7 @@ LOUD = "the room is as loud as most sounds: turn the microphone down, or put it 
 
 
 def problem_of_file(problem: str) -> str:
-    """Say what is wrong with the sound of an audio file.
-
-    Parameters
-    ----------
-    problem : str
-        As if a microphone were heard now.
-    """
+    """Say what is wrong with the sound of an audio file."""
     what = problem.partition(":")[0].replace("the microphone", "the file")
     return f"{what}: check with what it was recorded, and how"
 

@@ -12,13 +12,6 @@ class RollingStatistics:
     """Statistics of one stream of frames over its last frames.
 
     Every window is summed anew from its own frames, since running sums would drift over months.
-
-    Parameters
-    ----------
-    window_frames : int
-        Frames of the window.
-    width : int
-        Number of features of a frame.
     """
 
     def __init__(self, window_frames: int, width: int) -> None:

@@ -29,8 +29,6 @@ class LoggedFrames(NamedTuple):
     Attributes
     ----------
     features : np.ndarray [shape=(n, d)], float32
-    first : int
-        Number of the first frame.
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
     private : np.ndarray [shape=(n,)], bool
@@ -47,15 +45,6 @@ class Veil:
     """Holds features back until it is certain which are private, and makes those coarse.
 
     Seconds begin at frames whose numbers 20 divides, so they are the same in blocks of any size.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        Those that are private.
-    width : int
-        Number of features of a frame.
-    window_frames, ahead : int
-        As of `PrivateFrames`.
     """
 
     def __init__(
@@ -89,8 +78,6 @@ class Veil:
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
-        first : int
-            Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         labels : FrameLabels or None
@@ -114,12 +101,7 @@ class Veil:
         return self._release(max(len(self._private) - begun, 0))
 
     def close(self) -> LoggedFrames:
-        """Return what is held, as the frames to come do not follow those before.
-
-        Returns
-        -------
-        LoggedFrames
-        """
+        """Return what is held, as the frames to come do not follow those before."""
         self._private = np.append(self._private, self._guard.close())
         return self._release(len(self._private))
 
@@ -150,22 +132,11 @@ class EmbeddingVeil:
         self._private: Bool = np.ones(WINDOW_FRAMES - 1, bool)  # of the last frames released
 
     def push(self, embeddings: Embeddings) -> None:
-        """Add embeddings.
-
-        Parameters
-        ----------
-        embeddings : Embeddings
-        """
+        """Add embeddings."""
         self._held = self._held.followed_by(embeddings)
 
     def release(self, frames: LoggedFrames) -> Embeddings:
-        """Return the embeddings that may be logged, of those that end with some frames.
-
-        Parameters
-        ----------
-        frames : LoggedFrames
-            The next ones that the veil of features releases.
-        """
+        """Return the embeddings that may be logged, of those that end with some frames."""
         private = np.append(self._private, frames.private)
         self._private = private[1 - WINDOW_FRAMES :]
         ended = self._held.known_at(frames.first, len(frames.stamps))

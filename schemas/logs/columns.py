@@ -175,15 +175,8 @@ def iterate_columns(  # noqa: PLR0913
 
     Parameters
     ----------
-    logs : iterable of Path
-    topics : collection of str or callable, optional
-        Names of the topics, or what tells whether one is read; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
-    fields : collection of str, optional
-        Paths of the fields to read; all by default.
-    on_damage : callable, optional
-        As of `read_columns`.
 
     Yields
     ------
@@ -233,12 +226,6 @@ def decode_readable(
     Each topic that loses messages is named by a `HearthlogWarning`. In strings that are not UTF-8,
     U+FFFD stands for what cannot be read.
 
-    Parameters
-    ----------
-    messages : iterable of RawMessages
-    fields : collection of str, optional
-        Paths of the fields to read; all by default.
-
     Returns
     -------
     list of Columns
@@ -254,7 +241,6 @@ def unreadable(channel: Channel, schema: Schema | None) -> str:
 
     Parameters
     ----------
-    channel : Channel
     schema : Schema or None
         Of the channel; None if it has none.
     """
@@ -265,13 +251,7 @@ def unreadable(channel: Channel, schema: Schema | None) -> str:
 
 @lru_cache(_DEFINITIONS_KEPT)
 def definition_fault(name: str, encoding: str, text: bytes) -> str:
-    """Say why messages of a type cannot be decoded as it is defined; empty if they can.
-
-    Parameters
-    ----------
-    name, encoding, text
-        As of `message_type`.
-    """
+    """Say why messages of a type cannot be decoded as it is defined; empty if they can."""
     try:
         kind = message_type(name, encoding, text)
         fields_of(kind)
@@ -282,14 +262,7 @@ def definition_fault(name: str, encoding: str, text: bytes) -> str:
 
 
 def leave_out(topic: str, why: str) -> None:
-    """Warn that a topic is left out.
-
-    Parameters
-    ----------
-    topic : str
-    why : str
-        As `unreadable` says it.
-    """
+    """Warn that a topic is left out."""
     text = f"{why}: left out; --topics chooses others"
     warnings.warn(HearthlogWarning(text, topic, each=True), stacklevel=2)
 
@@ -316,11 +289,6 @@ def _decode_readable(raw: RawMessages, fields: Collection[str] | None) -> Column
 def faults(raw: RawMessages) -> dict[int, LogError]:
     """Say what is wrong with each message that is not of its type.
 
-    Parameters
-    ----------
-    raw : RawMessages
-        Of a channel that is not `unreadable`.
-
     Returns
     -------
     dict of int to LogError
@@ -332,13 +300,7 @@ def faults(raw: RawMessages) -> dict[int, LogError]:
 
 
 def without_unreadable(raw: RawMessages) -> RawMessages:
-    """Leave out messages that are not of their type; warn of the first of them.
-
-    Parameters
-    ----------
-    raw : RawMessages
-        Of a channel that is not `unreadable`.
-    """
+    """Leave out messages that are not of their type; warn of the first of them."""
     errors = faults(raw)
     if not errors:
         return raw

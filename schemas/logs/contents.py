@@ -73,17 +73,7 @@ class Contents:
     def add(self, batch: Sequence[RawMessages], readable: IsReadable | None = None) -> None:
         """Count some messages.
 
-        Parameters
-        ----------
-        batch : sequence of RawMessages
-            Those that follow.
-        readable : callable, optional
-            Tells whether the fields of a type can be read from a channel; by default `is_readable`.
-
-        Raises
-        ------
-        LogError
-            If a message is not of the type that its channel says.
+        Raise `LogError` if a message is not of the type that its channel says.
         """
         for raw in batch:
             self._add_topic(raw)
@@ -91,12 +81,7 @@ class Contents:
             self._add(columns)
 
     def differing(self, other: "Contents") -> list[str]:
-        """Name what is counted otherwise elsewhere; the order of gaps makes no difference.
-
-        Parameters
-        ----------
-        other : Contents
-        """
+        """Name what is counted otherwise elsewhere; the order of gaps makes no difference."""
         mine, theirs = (replace(each, gaps=sorted(each.gaps)) for each in (self, other))
         names = [each.name for each in fields(Contents) if each.compare]
         return [name for name in names if getattr(mine, name) != getattr(theirs, name)]
@@ -151,13 +136,7 @@ class Contents:
 
 
 def is_review(microphone: str) -> bool:
-    """Tell whether what stands for a microphone is a layer of marks.
-
-    Parameters
-    ----------
-    microphone : str
-        As `Contents` has it.
-    """
+    """Tell whether what stands for a microphone is a layer of marks."""
     return topics.is_review(microphone.partition("/")[2])
 
 
@@ -168,13 +147,8 @@ def is_readable(
 
     Parameters
     ----------
-    channel : Channel
     schema : Schema or None
         Of the channel; None if it has none.
-    type_ : str
-        Name of a message type, such as those in `message_types`.
-    paths : collection of str
-        Of the fields that the reader needs.
     """
     if schema is None or schema.name != type_ or channel.message_encoding != "cdr":
         return False
@@ -188,11 +162,8 @@ def has_contents(
 
     Parameters
     ----------
-    channel : Channel
     schema : Schema or None
         Of the channel; None if it has none.
-    readable : callable
-        As for `Contents.add`.
     """
     return any(readable(channel, schema, *kind) for kind in FIELDS.items())
 

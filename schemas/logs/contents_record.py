@@ -22,12 +22,7 @@ _MOST = 1 << 63
 
 
 def as_metadata(contents: Contents) -> dict[str, str] | None:
-    """Make the record; None if it would be large.
-
-    Parameters
-    ----------
-    contents : Contents
-    """
+    """Make the record; None if it would be large."""
     text = json.dumps(
         {
             "topics": contents.topics,
@@ -47,10 +42,6 @@ def as_metadata(contents: Contents) -> dict[str, str] | None:
 
 def stated_contents(file: LogFile) -> Contents | None:
     """Read what a finished log says of its messages.
-
-    Parameters
-    ----------
-    file : LogFile
 
     Returns
     -------

@@ -23,15 +23,6 @@ class CountedWriter(ChunkWriter):
 
     The record is left out where there would be nothing to say, where it or a chunk would be large,
     and where a message cannot be read.
-
-    Parameters
-    ----------
-    stream : binary file
-        Writable, and at its beginning.
-    definitions : Definitions, optional
-        Of the chunks that are copied; grows with them.
-    chunk_span : int, optional
-        As of `ChunkWriter`.
     """
 
     def __init__(
@@ -47,14 +38,7 @@ class CountedWriter(ChunkWriter):
         self._size = 0
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write a metadata record; that of another file's contents is left out.
-
-        Parameters
-        ----------
-        name : str
-        data : dict of str to str
-            Values by key.
-        """
+        """Write a metadata record; that of another file's contents is left out."""
         if name != METADATA:
             super().add_metadata(name, data)
 

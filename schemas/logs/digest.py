@@ -15,10 +15,6 @@ def log_digest(log: Path) -> str:
     The end of a log holds its index, or the end of that, and the index's checksum. So a log can be
     recognised without reading all of it.
 
-    Parameters
-    ----------
-    log : Path
-
     Returns
     -------
     str
@@ -38,14 +34,7 @@ def log_digest(log: Path) -> str:
 def earlier_digests(log: Path) -> list[str]:
     """Return the digests that a log had before it was thinned.
 
-    Parameters
-    ----------
-    log : Path
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read or is damaged.
+    Raise `LogError` if the log cannot be read or is damaged.
     """
     with LogFile(log) as file:
         records = provenance_records(file)

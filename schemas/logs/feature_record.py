@@ -14,8 +14,6 @@ def feature_entries(name: str, version: int, digest: str, distribution: str) -> 
 
     Parameters
     ----------
-    name : str
-    version : int
     digest : str
         SHA-256 of the network that computes it; empty for none.
     distribution : str
@@ -28,15 +26,7 @@ def feature_entries(name: str, version: int, digest: str, distribution: str) -> 
 def other_features(
     first: Mapping[str, str], other: Mapping[str, str], microphone: str
 ) -> dict[str, str]:
-    """Return what the record says of the features of another microphone than the first.
-
-    Parameters
-    ----------
-    first, other : mapping of str to str
-        What the records of both would say if each had a log of its own.
-    microphone : str
-        Name of the other.
-    """
+    """Return what the record says of the features of another microphone than the first."""
     return {
         f"/{microphone}/{key}": other.get(key, "")
         for key in _DETAILS
@@ -45,14 +35,7 @@ def other_features(
 
 
 def features_of_microphone(record: Mapping[str, str], microphone: str) -> dict[str, str]:
-    """Return a record with what it says of the features of one microphone.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `provenance_records` gives it.
-    microphone : str
-    """
+    """Return a record with what it says of the features of one microphone."""
     own = {key: record.get(f"/{microphone}/{key}", record.get(key, "")) for key in _DETAILS}
     others = {key: text for key, text in record.items() if key not in own}
     return others | {key: text for key, text in own.items() if text}

@@ -64,43 +64,13 @@ def is_node_name(name: str) -> bool:
 
 
 def log_path(root: Path, node: str, start: int) -> Path:
-    """Name the log of a node that begins at a time.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of the logs.
-    node : str
-        Name of the node.
-    start : int
-        In nanoseconds of UTC.
-
-    Returns
-    -------
-    Path
-        `<root>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`.
-    """
+    """Name the log of a node that begins at a time."""
     moment = datetime.fromtimestamp(start // NANOSECONDS, UTC)
     return root / f"{moment:%Y/%m/%d}" / f"{node}_{moment:%Y%m%dT%H%M%SZ}{SUFFIX}"
 
 
 def free_log_path(root: Path, node: str, start: int) -> Path:
-    """Name the log of a node that begins at a time, as no other log is named.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of the logs.
-    node : str
-        Name of the node.
-    start : int
-        In nanoseconds of UTC.
-
-    Returns
-    -------
-    Path
-        As `log_path`; if that is taken, `<node>_YYYYMMDDTHHMMSSZ_2.mcap`, `…_3.mcap` and so on.
-    """
+    """Name the log of a node that begins at a time, as no other log is named."""
     path = first = log_path(root, node, start)
     for number in count(2):
         if not (path.exists() or active_path(path).exists()):
@@ -110,13 +80,7 @@ def free_log_path(root: Path, node: str, start: int) -> Path:
 
 
 def log_readers(folder: Path) -> int:
-    """Return the rights of others to read new logs in a folder, as `readers_of` does.
-
-    Parameters
-    ----------
-    folder : Path
-        Of logs of a recorder: those of the folder of the latest year say it.
-    """
+    """Return the rights of others to read new logs in a folder, as `readers_of` does."""
     if not (is_local(folder) and folder.is_dir()):
         return 0
     years = [each for each in folder.iterdir() if re.fullmatch(r"\d{4}", each.name, re.ASCII)]
@@ -124,13 +88,7 @@ def log_readers(folder: Path) -> int:
 
 
 def active_path(path: Path) -> Path:
-    """Name a log while it is being written.
-
-    Parameters
-    ----------
-    path : Path
-        Name of the finished log.
-    """
+    """Name a log while it is being written."""
     return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
 
 
@@ -154,13 +112,7 @@ class LogName(NamedTuple):
 
 
 def log_name(path: Path) -> LogName:
-    """Split the name of a log or a layer into its parts.
-
-    Parameters
-    ----------
-    path : Path
-        Of a log or a layer, finished or not.
-    """
+    """Split the name of a log or a layer into its parts."""
     parts = _NAME.fullmatch(stem(path))
     if parts is None:  # nothing but a suffix
         return LogName("", "", "", "")
@@ -170,59 +122,27 @@ def log_name(path: Path) -> LogName:
 
 
 def audio_path(log: Path) -> Path:
-    """Name the layer of a log that has its clips of sound.
-
-    Parameters
-    ----------
-    log : Path
-        Finished or not.
-    """
+    """Name the layer of a log that has its clips of sound."""
     return log.with_name(stem(log) + AUDIO_SUFFIX)
 
 
 def review_path(log: Path) -> Path:
-    """Name the review layer of a log.
-
-    Parameters
-    ----------
-    log : Path
-        Finished or not.
-    """
+    """Name the review layer of a log."""
     return log.with_name(f"{stem(log)}.{REVIEW_LAYER}{SUFFIX}")
 
 
 def relabel_path(log: Path, model: str) -> Path:
-    """Name the layer of a log that has the labels of a model.
-
-    Parameters
-    ----------
-    log : Path
-        Finished or not.
-    model : str
-        Name of the model.
-    """
+    """Name the layer of a log that has the labels of a model."""
     return log.with_name(f"{stem(log)}.{RELABEL_LAYER}{model}{SUFFIX}")
 
 
 def log_of_layer(layer: Path) -> Path:
-    """Name the finished log to which a layer belongs.
-
-    Parameters
-    ----------
-    layer : Path
-        Finished or not.
-    """
+    """Name the finished log to which a layer belongs."""
     return layer.with_name(log_name(layer).log + SUFFIX)
 
 
 def stem(log: Path) -> str:
-    """Return the file name of a log without its suffix.
-
-    Parameters
-    ----------
-    log : Path
-        Finished or not.
-    """
+    """Return the file name of a log without its suffix."""
     return log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
 
 
@@ -281,10 +201,7 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
 def check_allowed(path: Path) -> None:
     """Check that this user may read a log, or list a folder; it need not exist.
 
-    Raises
-    ------
-    LogError
-        If this user may not.
+    Raise `LogError` if this user may not.
     """
     if is_local(path) and is_denied(path):
         raise LogError(f"{path}: {denied_text(path)}")
@@ -340,15 +257,6 @@ def walk_logs(
     ----------
     folder : Path
         Links to other folders in it are not followed; folders that cannot be read are left out.
-    denied : list of str, optional
-        Is appended to: folders that this user may not read.
-    compressed : list of str, optional
-        Is appended to: names of files that are compressed as a whole.
-
-    Yields
-    ------
-    os.DirEntry
-        Of regular files, and of what cannot be looked at, with the name of a log or a layer.
     """
     waiting = [os.fspath(folder)]
     while waiting:
@@ -366,10 +274,6 @@ class Inside(NamedTuple):
 
     Attributes
     ----------
-    folders, logs : list of os.DirEntry
-        As `walk_logs` finds them.
-    compressed : list of str
-        Names of logs that are compressed as a whole.
     is_all : bool
         Whether there is more or less only after a change of this folder. What a link leads to may
         change elsewhere.
@@ -382,13 +286,7 @@ class Inside(NamedTuple):
 
 
 def look_into(folder: str) -> Inside:
-    """List the folders and the logs in one folder of this machine.
-
-    Parameters
-    ----------
-    folder : str
-        If it cannot be read, there is nothing in it.
-    """
+    """List the folders and the logs in one folder of this machine."""
     folders: list[os.DirEntry[str]] = []
     named: list[os.DirEntry[str]] = []
     compressed: list[str] = []

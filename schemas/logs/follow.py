@@ -48,20 +48,11 @@ def follow(
     folder : Path
         Logs may lie at any depth. Files that are there but not being written are read first, if
         `start` asks for them.
-    topics : collection of str or callable, optional
-        Names of the topics, or what tells whether one is read; all by default.
     start : int, optional
         Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
         written from now on.
-    fields : collection of str, optional
-        Paths of the fields to read; all by default.
     stop : threading.Event, optional
         Ends the reading when it is set; by default it never ends.
-
-    Yields
-    ------
-    list of Columns
-        What was written since the last one. Of one log, in the order of time.
 
     Raises
     ------
@@ -95,10 +86,6 @@ def follow_messages(  # noqa: PLR0913
 
     Parameters
     ----------
-    folder : Path
-        Logs may lie at any depth.
-    topics : collection of str or callable, optional
-        Names of the topics, or what tells whether one is read; all by default.
     start : int, optional
         Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
         written from now on.
@@ -117,8 +104,6 @@ def follow_messages(  # noqa: PLR0913
 
     Yields
     ------
-    path : Path
-        A log.
     messages : list of RawMessages
         What was written to it since the last time, perhaps nothing: so after each log that is not
         being written, for the caller to have a turn.

@@ -35,11 +35,8 @@ class TopicBatch(NamedTuple):
 
     Attributes
     ----------
-    topic : str
     log_times : np.ndarray [shape=(n,)], int64
         Nanoseconds; the publish times are the same.
-    fields : mapping of str to column
-        As `hearthlog.schemas.messages.cdr_codec.encode_groups` takes them.
     """
 
     topic: str
@@ -48,16 +45,7 @@ class TopicBatch(NamedTuple):
 
 
 class LogStreamWriter:
-    """Writes a log to a stream.
-
-    Parameters
-    ----------
-    stream : BinaryIO
-        At its start; stays open.
-    topics : sequence of Topic
-    chunk_span : int, optional
-        As of `ChunkWriter`.
-    """
+    """Writes a log to a stream."""
 
     def __init__(self, stream: BinaryIO, topics: Sequence[Topic], chunk_span: int = LATEST) -> None:
         self._channels: dict[str, int] = {}
@@ -79,14 +67,7 @@ class LogStreamWriter:
             )
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
-        """Append a metadata record.
-
-        Parameters
-        ----------
-        name : str
-            Of the record, such as "hearthlog".
-        metadata : mapping of str to str
-        """
+        """Append a metadata record."""
         self._writer.add_metadata(name, dict(metadata))
 
     def add_attachment(self, attachment: Attachment, created: int) -> None:
@@ -94,7 +75,6 @@ class LogStreamWriter:
 
         Parameters
         ----------
-        attachment : Attachment
         created : int
             Time of the file, in nanoseconds of UTC.
         """
@@ -120,15 +100,7 @@ class LogStreamWriter:
 
         The file is the same as if they had been encoded and written one by one.
 
-        Parameters
-        ----------
-        batch : sequence of TopicBatch
-            Messages of one time are written in the order of the batch.
-
-        Raises
-        ------
-        LogError
-            If a message cannot be encoded; see `encode_groups`.
+        Raise `LogError` if a message cannot be encoded; see `encode_groups`.
         """
         blocks: list[Block] = []
         first = 0
@@ -147,13 +119,7 @@ class LogStreamWriter:
         self._writer.flush()
 
     def finish(self, name: str) -> None:
-        """Complete the log.
-
-        Parameters
-        ----------
-        name : str
-            Name that its file will have.
-        """
+        """Complete the log."""
         self._writer.flush()
         for topic, channel in self._channels.items():
             self._topics[topic].messages = self._writer.message_counts.get(channel, 0)

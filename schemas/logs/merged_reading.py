@@ -58,15 +58,9 @@ def time_spans(
 
     Parameters
     ----------
-    logs : iterable of Path
     span_of : callable
         Told a log; returns its first and last log time in nanoseconds of UTC, or None if it has no
         messages.
-
-    Returns
-    -------
-    list of (int, int, Path)
-        First and last log time, and the log, in the order of time.
 
     Raises
     ------
@@ -173,14 +167,8 @@ def iterate_messages(  # noqa: PLR0913
 
     Parameters
     ----------
-    logs : iterable of Path
-    topics : collection of str or callable, optional
-        Names of the topics, or what tells whether one is read; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
-    on_damage : callable, optional
-        Told of a log, and of a chunk of it that is damaged and left out, from the threads that
-        read. By default the error is raised.
     once : bool
         Leave out chunks that are byte for byte an earlier one of their log.
 
@@ -213,17 +201,12 @@ def iterate_pieces(  # noqa: PLR0913
 
     Parameters
     ----------
-    logs : iterable of Path
     topics : collection of str, callable or None
         Names of the topics, or what tells whether one is read; None for all.
     start, end : int or None
         Log times, in nanoseconds of UTC: from `start` on, before `end`. None for no limit.
-    function : callable
-        Told the messages of one span of time; returns pieces that can be cut by log time.
     every : int
         Of so many chunks of a log one is read, for a sample; 1 for all.
-    on_damage : callable, optional
-        As of `iterate_messages`.
 
     Yields
     ------

@@ -22,20 +22,7 @@ _LARGEST, _MOST = 1 << 20, 64 << 20  # bytes of one record, and of all; ours hav
 
 
 def provenance(node: str, **more: str) -> dict[str, str]:
-    """Make the record of a file that this version writes.
-
-    Parameters
-    ----------
-    node : str
-        Name of the node that the file is of.
-    **more : str
-        What this kind of file says besides.
-
-    Returns
-    -------
-    dict of str to str
-        `version` of hearthlog, `schema_version`, `node`, and `more`.
-    """
+    """Make the record of a file that this version writes."""
     return {"version": __version__, _KEY: str(SCHEMA_VERSION), "node": node, **more}
 
 
@@ -63,10 +50,7 @@ def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
 def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
     """Read the records of a file as `read_provenance` does, whatever their version.
 
-    Raises
-    ------
-    LogError
-        If a record is damaged.
+    Raise `LogError` if a record is damaged.
     """
     different: dict[frozenset[tuple[str, str]], Mapping[str, str]] = {}
     size = 0
@@ -80,23 +64,12 @@ def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
 
 
 def version_text(record: Mapping[str, str]) -> str:
-    """Return the schema version that a record names, which need not be a number.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `read_provenance` gives it.
-    """
+    """Return the schema version that a record names, which need not be a number."""
     return record.get(_KEY, _FIRST)
 
 
 def schema_version(record: Mapping[str, str]) -> int | None:
     """Return the schema version of a record.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `read_provenance` gives it.
 
     Returns
     -------
@@ -107,24 +80,13 @@ def schema_version(record: Mapping[str, str]) -> int | None:
 
 
 def describes_model(record: Mapping[str, str]) -> bool:
-    """Tell whether a log with such a record has `model.json`, if it has labels.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `read_provenance` gives it.
-    """
+    """Tell whether a log with such a record has `model.json`, if it has labels."""
     version = schema_version(record)
     return version is not None and version > 1
 
 
 def unknown_version(record: Mapping[str, str]) -> str:
     """Say that a record has a schema version that this version does not know.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `read_provenance` gives it.
 
     Returns
     -------
@@ -140,15 +102,7 @@ def unknown_version(record: Mapping[str, str]) -> str:
 
 
 def check_version(record: Mapping[str, str], path: Path) -> None:
-    """Give a `HearthlogWarning` if a file has a schema version that this version does not know.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `read_provenance` gives it.
-    path : Path
-        Name of the file, for the warning.
-    """
+    """Give a `HearthlogWarning` if a file has a schema version that this version does not know."""
     text = unknown_version(record)
     if text:
         warnings.warn(HearthlogWarning(text, path), stacklevel=2)

@@ -25,19 +25,7 @@ class TopicCount:
 
 
 def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
-    """Return the metadata that a ROS 2 channel must have.
-
-    Parameters
-    ----------
-    type_hash : str
-        RIHS01 hash of the topic's type.
-    quality : Quality
-
-    Returns
-    -------
-    dict of str to str
-        `offered_qos_profiles`, as JSON, which is a part of YAML, and `topic_type_hash`.
-    """
+    """Return the metadata that a ROS 2 channel must have."""
     seconds = quality.lifespan_seconds
     profile = {
         "history": "keep_last",
@@ -78,28 +66,14 @@ def file_metadata(
 
     Parameters
     ----------
-    name : str
-        Name of the file, without its folder.
-    topics : mapping of str to TopicCount
-        By name of the topic.
     span : (int, int)
         First and last log time, in nanoseconds of UTC.
-
-    Returns
-    -------
-    dict of str to str
-        `serialized_metadata`, as JSON.
     """
     return {"serialized_metadata": json.dumps(_information([FileCounts(name, topics, span)]))}
 
 
 def message_counts(record: Mapping[str, str]) -> dict[str, int]:
     """Read how many messages of each topic a file has by its `rosbag2` metadata record.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        Of any writer: JSON, or YAML in blocks as rosbag2 itself writes it.
 
     Returns
     -------

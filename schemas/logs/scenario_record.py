@@ -24,34 +24,13 @@ class RecordedScenario(NamedTuple):
 
 
 def scenario_entries(scenario: RecordedScenario) -> dict[str, str]:
-    """Return what the record says of a scenario.
-
-    Parameters
-    ----------
-    scenario : RecordedScenario
-
-    Returns
-    -------
-    dict of str to str
-        `scenario/<microphone>/<name>`, its model, and `…/sha256`.
-    """
+    """Return what the record says of a scenario."""
     key = f"{SCENARIO}/{scenario.microphone}/{scenario.name}"
     return {key: scenario.model, f"{key}/sha256": scenario.sha256}
 
 
 def recorded_scenarios(record: Mapping[str, str]) -> Iterator[RecordedScenario]:
-    """Yield the scenarios that a record names, in its order.
-
-    Parameters
-    ----------
-    record : mapping of str to str
-        As `provenance_records` gives it.
-
-    Yields
-    ------
-    RecordedScenario
-        Names that no recorder writes are passed over.
-    """
+    """Yield the scenarios that a record names, in its order."""
     for key, model in record.items():
         names = _KEY.fullmatch(key)
         if names is None:

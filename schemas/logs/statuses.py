@@ -21,20 +21,7 @@ class Status(NamedTuple):
 def statuses_of(columns: Columns) -> Iterator[Status]:
     """Yield each status of diagnostic messages.
 
-    Parameters
-    ----------
-    columns : Columns
-        Messages of type `diagnostic_msgs/DiagnosticArray`, with the field `status`.
-
-    Yields
-    ------
-    Status
-        In the order of the messages, at their log times.
-
-    Raises
-    ------
-    LogError
-        If the field is missing.
+    Raise `LogError` if the field is missing.
     """
     for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
         for status in statuses:

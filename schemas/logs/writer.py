@@ -26,17 +26,8 @@ class LogWriter:
     ----------
     path : Path
         Name of the finished log. Neither it nor its active name may exist.
-    topics : sequence of Topic
-    metadata : mapping of str to str
-        The `hearthlog` record: what made this log.
-    attachments : sequence of Attachment
     created : int
         Time of the attachments, in nanoseconds of UTC.
-
-    Attributes
-    ----------
-    active_path : Path
-        Name of the log while it is being written.
 
     Raises
     ------
@@ -81,37 +72,22 @@ class LogWriter:
     def write_messages(self, messages: Sequence[tuple[int, str, bytes]]) -> None:
         """Append encoded messages, as `LogStreamWriter.write_messages` does.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
+        Raise `OSError` if the file cannot be written.
         """
         self._content.write_messages(messages)
 
     def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, as `LogStreamWriter.write_columns` does.
 
-        Parameters
-        ----------
-        batch : sequence of TopicBatch
-            Messages of one time are written in the order of the batch.
-
-        Raises
-        ------
-        LogError
-            If a message cannot be encoded; see `encode_groups`.
-        OSError
-            If the file cannot be written.
+        Raise `LogError` if a message cannot be encoded; see `encode_groups`. Raise `OSError` if
+        the file cannot be written.
         """
         self._content.write_columns(batch)
 
     def flush(self) -> None:
         """End the chunk and hand it to the operating system.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
+        Raise `OSError` if the file cannot be written.
         """
         self._content.flush()
         self._stream.flush()
@@ -119,10 +95,7 @@ class LogWriter:
     def sync(self) -> None:
         """Wait until what was flushed is on the disk.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written, or has been deleted.
+        Raise `OSError` if the file cannot be written, or has been deleted.
         """
         os.fsync(self._stream.fileno())
         if not self._has_its_name():
@@ -132,10 +105,7 @@ class LogWriter:
     def complete(self) -> None:
         """Complete the log under its active name.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
+        Raise `OSError` if the file cannot be written.
         """
         self._content.finish(self.path.name)
         self._stream.flush()
@@ -145,10 +115,7 @@ class LogWriter:
     def finish(self) -> Path:
         """Complete the log, give it its name, and return that.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written or renamed.
+        Raise `OSError` if the file cannot be written or renamed.
         """
         self.complete()
         self.active_path.rename(self.path)
@@ -163,10 +130,7 @@ class LogWriter:
     def discard_unsynced(self) -> None:
         """Cut the abandoned file to what is known to be on the disk, or delete it if nothing is.
 
-        Raises
-        ------
-        OSError
-            If the disk refuses that too.
+        Raise `OSError` if the disk refuses that too.
         """
         if not self._has_its_name():
             return

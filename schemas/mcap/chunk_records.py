@@ -25,8 +25,6 @@ def iterate_records(
 
     Parameters
     ----------
-    content : bytes-like
-        Records, uncompressed.
     start : int
         Byte of the content at which the first record begins.
     end : int, optional
@@ -34,7 +32,6 @@ def iterate_records(
 
     Yields
     ------
-    opcode : int
     start, end : int
         Bytes of the content at which the record begins, with its opcode, and before which it ends.
 
@@ -62,8 +59,6 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
 
     Parameters
     ----------
-    content : bytes-like
-        Records of the chunk, uncompressed.
     starts : np.ndarray [shape=(n,)], int64
         Bytes of the content at which whole message records begin, with their opcodes, ascending.
 

@@ -70,13 +70,7 @@ class ChunkRow:
         return self.index_length < 0 and is_next and self.length < _RUN_LIMIT
 
     def extend(self, message: "ChunkRow") -> None:
-        """Add a message to this run.
-
-        Parameters
-        ----------
-        message : ChunkRow
-            Row of that one message, which begins where the run ends.
-        """
+        """Add a message to this run."""
         self.length += message.length
         self.size += message.size
         self.start = min(self.start, message.start)
@@ -87,14 +81,6 @@ class ChunkRow:
 
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     """Describe a chunk, or a message outside of chunks, from the beginning of its record.
-
-    Parameters
-    ----------
-    location : RecordLocation
-        Of the chunk or of the message.
-    head : bytes
-        Beginning of the record, with opcode and length: up to the compression's name, or to the
-        payload.
 
     Returns
     -------
@@ -122,17 +108,8 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
 def read_chunk_index(content: bytes) -> ChunkRow:
     """Describe a chunk from its chunk index.
 
-    Parameters
-    ----------
-    content : bytes
-        The chunk index's record, without opcode and length.
-
-    Raises
-    ------
-    McapError
-        If a place or a size is 2**63 or more.
-    struct.error
-        If the content is shorter than it claims, or holds a part of an index offset.
+    Raise `McapError` if a place or a size is 2**63 or more. Raise `struct.error` if the content
+    is shorter than it claims, or holds a part of an index offset.
     """
     start, end, offset, length, entries = formats.CHUNK_INDEX.unpack_from(content)
     first = formats.CHUNK_INDEX.size

@@ -40,8 +40,6 @@ class ChunkWriter:
 
     Parameters
     ----------
-    stream : binary file
-        Writable, and at its beginning.
     chunk_size : int
         Bytes of records, uncompressed; the message that goes beyond them is the last of its chunk.
     chunk_span : int, optional
@@ -73,38 +71,19 @@ class ChunkWriter:
         ----------
         profile : str
             Profile of the header: `ros2`, or empty for none.
-        library : str
-            Program that writes the file.
         """
         self._stream.write(formats.MAGIC)
         self._write(records.Header(profile, library))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write a metadata record.
-
-        Parameters
-        ----------
-        name : str
-        data : dict of str to str
-            Values by key.
-        """
+        """Write a metadata record."""
         offset, length = self._write(records.Metadata(name, data))
         self._metadata.append(records.MetadataIndex(offset, length, name))
 
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
-        """Write an attachment.
-
-        Parameters
-        ----------
-        create_time, log_time : int
-            Nanoseconds of UTC.
-        name : str
-        media_type : str
-            Such as `application/json`.
-        data : bytes
-        """
+        """Write an attachment."""
         record = records.Attachment(create_time, log_time, name, media_type, data)
         self.copy_attachment(
             [encode(record)],
@@ -118,8 +97,6 @@ class ChunkWriter:
 
         Parameters
         ----------
-        record : iterable of bytes-like
-            The whole record, with opcode and length, in one or more pieces.
         index : mcap.records.AttachmentIndex
             What the index will say of it; offset and length are replaced by those in this file.
         """
@@ -142,15 +119,6 @@ class ChunkWriter:
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Add a schema.
 
-        Parameters
-        ----------
-        name : str
-            Name of the message type.
-        encoding : str
-            Such as `ros2msg`.
-        data : bytes
-            Definition of the message type in this encoding.
-
         Returns
         -------
         int
@@ -168,13 +136,8 @@ class ChunkWriter:
 
         Parameters
         ----------
-        topic : str
-        message_encoding : str
-            Such as `cdr`.
         schema_id : int
             Number of its schema; 0 if it has none.
-        metadata : dict of str to str
-            Values by key.
 
         Returns
         -------
@@ -195,13 +158,6 @@ class ChunkWriter:
 
         They are not written anywhere else: chunks that were copied contain them, or
         `write_definition` has put them before their first message.
-
-        Parameters
-        ----------
-        schemas : sequence of mcap.records.Schema
-            With the numbers that the copied chunks use.
-        channels : sequence of mcap.records.Channel
-            With the numbers that the copied chunks use.
         """
         self._schemas = list(schemas)
         self._channels = list(channels)
@@ -217,14 +173,8 @@ class ChunkWriter:
 
         Parameters
         ----------
-        channel_id : int
-            Number of its channel.
         log_time : int
             Nanoseconds of UTC, 0 to 2**63 - 1.
-        data : bytes
-            Payload, encoded.
-        publish_time : int
-            Nanoseconds of UTC.
         sequence : int
             0 to 2**32 - 1.
         """
@@ -294,12 +244,8 @@ class ChunkWriter:
 
         Parameters
         ----------
-        chunk : StoredChunk
-            Its own data are not used.
         length : int
             Bytes of the data.
-        data : iterable of bytes
-            Pieces of the compressed records.
         """
         self.flush()
         self._put_pieces(chunk, length, data)
@@ -315,13 +261,8 @@ class ChunkWriter:
 
         Parameters
         ----------
-        chunk : StoredChunk
         span : int
             Nanoseconds of log time that the joined chunk may have; a longer one is not joined.
-        dropped : collection of int
-            Numbers of channels whose messages are left out.
-        gathered : collection of int
-            Numbers of channels whose messages get chunks of their own, of `GATHERED_SPAN`.
         """
         own = {number for number in chunk.entries if number in gathered} - set(dropped)
         rest = chunk.entries.keys() - own - set(dropped)

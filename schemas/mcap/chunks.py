@@ -54,18 +54,11 @@ def read_chunks(
 
     Parameters
     ----------
-    file : LogFile
-        Log of the chunks. Channels and schemas that the chunks define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
     topics : collection of str or callable, optional
         Topics to read, or what tells whether one is read: all of them if None; none if empty, which
         only adds definitions.
-
-    Returns
-    -------
-    list of RawMessages
-        One for each channel that has messages of these topics in the chunks.
 
     Raises
     ------
@@ -87,13 +80,6 @@ def read_sound(
     """Read messages as `read_chunks` does, without the chunks that cannot be read.
 
     The log must be `partial`: then channels that nothing defines are left out, too.
-
-    Parameters
-    ----------
-    file, chunks, topics
-        As of `read_chunks`.
-    on_damage : callable
-        Told each chunk that is left out.
     """
     try:
         return read_chunks(file, chunks, topics)
@@ -155,20 +141,11 @@ def read_in_batches(
 
     Parameters
     ----------
-    file : LogFile
-        Log of the chunks. Channels and schemas that the chunks define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
     topics : collection of str or callable, optional
         Topics to read, or what tells whether one is read: all of them if None; none if empty, which
         only adds definitions.
-    on_damage : callable, optional
-        Told each chunk that cannot be read and is left out; by default the error is raised.
-
-    Yields
-    ------
-    list of RawMessages
-        Messages of the next chunks, in the order of `chunks`: one for each channel that has some.
 
     Raises
     ------
@@ -192,11 +169,7 @@ def in_parts(
 
     Parameters
     ----------
-    file : LogFile
-        Log of the chunks. Channels and schemas that the divided ones define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-    on_damage : callable, optional
-        Told each large chunk that cannot be read and is left out; by default the error is raised.
 
     Returns
     -------
@@ -316,8 +289,6 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
 
     Parameters
     ----------
-    file : LogFile
-        Log of the chunks. Channels and schemas that the chunks define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
 
@@ -338,8 +309,6 @@ def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_
 
     Parameters
     ----------
-    file : LogFile
-        Log of the chunks.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
 
@@ -366,17 +335,7 @@ def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_
 def read_definitions(file: LogFile, on_damage: OnDamage | None = None) -> None:
     """Add to a log the schemas and channels that only its chunks define.
 
-    Parameters
-    ----------
-    file : LogFile
-        Its `schemas` and `channels` are added to.
-    on_damage : callable, optional
-        Told each chunk that cannot be read and is passed over; by default the error is raised.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, or one of these chunks is damaged.
+    Raise `LogError` if the log cannot be read, or one of these chunks is damaged.
     """
     chunks = not_empty(file.chunks[file.chunks["index_length"] >= 0])  # a run defines nothing
     for number, channels in enumerate(chunks["channels"].tolist()):

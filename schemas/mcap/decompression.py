@@ -35,9 +35,6 @@ def decompress_together(
         The records of all chunks, uncompressed, one behind the other.
     sizes : np.ndarray [shape=(n,)], int64
         Bytes of each chunk, uncompressed.
-
-    None is returned in place of both if any chunk is damaged, of another compression, or empty: one
-    by one, `decompress_into` says which, and what is wrong.
     """
     fixed = ZSTD_CHUNK_HEAD.itemsize
     if not _IS_POSSIBLE or (lengths < fixed).any():

@@ -17,37 +17,17 @@ class Definitions:
         self._doubtful: set[tuple[type, int]] = set()
 
     def add(self, record: Definition) -> bool:
-        """Add a definition, unless its number is taken.
-
-        Parameters
-        ----------
-        record : mcap.records.Schema or mcap.records.Channel
-
-        Returns
-        -------
-        bool
-            False if its number has another meaning already, which it keeps.
-        """
+        """Add a definition, unless its number is taken."""
         if isinstance(record, Schema):
             return self.schemas.setdefault(record.id, record) == record
         return self.channels.setdefault(record.id, record) == record
 
     def doubt(self, record: Definition) -> None:
-        """Note that a definition contradicts another one of its number.
-
-        Parameters
-        ----------
-        record : mcap.records.Schema or mcap.records.Channel
-        """
+        """Note that a definition contradicts another one of its number."""
         self._doubtful.add((type(record), record.id))
 
     def defines(self, number: int) -> bool:
         """Tell whether it is certain what the messages of a channel are.
-
-        Parameters
-        ----------
-        number : int
-            Number of the channel.
 
         Returns
         -------
@@ -62,16 +42,5 @@ class Definitions:
         return is_defined and (Schema, schema) not in self._doubtful
 
     def topic(self, number: int) -> str:
-        """Name the topic of a channel.
-
-        Parameters
-        ----------
-        number : int
-            Number of the channel.
-
-        Returns
-        -------
-        str
-            The topic, or `channel <number>` if `defines` is False.
-        """
+        """Name the topic of a channel."""
         return self.channels[number].topic if self.defines(number) else f"channel {number}"

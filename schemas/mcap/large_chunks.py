@@ -50,9 +50,6 @@ class ContentStream:
 
     Attributes
     ----------
-    offset : int
-    head : ChunkHead
-        Its `data` counts from the content of the chunk.
     position : int
         Bytes that were read, uncompressed.
 
@@ -80,10 +77,7 @@ class ContentStream:
     def read(self, length: int) -> bytes:
         """Read the next bytes; fewer at the end.
 
-        Raises
-        ------
-        McapError
-            If they cannot be decompressed.
+        Raise `McapError` if they cannot be decompressed.
         """
         parts = []
         left = min(length, self.head.size - self.position)
@@ -106,10 +100,8 @@ class ContentStream:
     def check(self) -> int:
         """Return the checksum of all that was read, which must be the whole content.
 
-        Raises
-        ------
-        McapError
-            If the content has another size or another checksum than the chunk claims.
+        Raise `McapError` if the content has another size or another checksum than the chunk
+        claims.
         """
         if self.position != self.head.size or self._stream.read(1):
             raise McapError("a chunk has another size than it claims")
@@ -185,8 +177,6 @@ class Part(NamedTuple):
         Byte of the content at which they begin.
     size : int
         Bytes of them.
-    content : bytes
-        The records; of one that is larger than `LIMIT` the head alone.
     messages : array of int
         Bytes of `content` at which messages begin.
     others : list of (int, int)
@@ -203,20 +193,7 @@ class Part(NamedTuple):
 def read_parts(stream: ContentStream) -> Iterator[Part]:
     """Read all records of a chunk, and compare them with its checksum at the end.
 
-    Parameters
-    ----------
-    stream : ContentStream
-        At its beginning.
-
-    Yields
-    ------
-    Part
-        A few megabytes each; a record that is larger than `LIMIT` is a part of its own.
-
-    Raises
-    ------
-    McapError
-        If the chunk is damaged.
+    Raise `McapError` if the chunk is damaged.
     """
     held, first = bytearray(), 0  # byte of the content at which `held` begins
     messages, others = array("q"), list[tuple[int, int]]()

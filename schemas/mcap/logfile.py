@@ -87,9 +87,6 @@ class LogFile:
 
     Parameters
     ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store, which is read by ranges. One that was
-        finished since its name was found is opened by its final name.
     indexed : bool
         Whether to look for the chunks at once; without that, `scan_new` finds them.
     partial : bool
@@ -98,12 +95,6 @@ class LogFile:
 
     Attributes
     ----------
-    path : Path
-        Name by which it was opened.
-    complete : bool
-        Whether the file was finished.
-    ended : bool
-        Whether `scan_new` came to the end of a finished log.
     header : mcap.records.Header or None
         None as long as none was met.
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
@@ -114,8 +105,6 @@ class LogFile:
         Channels with messages in a chunk; the empty set if the file does not tell which.
     late : bool
         Whether there may be messages with log times after `LAST_TIME`, which are not read.
-    record_locations : list of RecordLocation
-        Of metadata records and attachments.
     statistics : mcap.records.Statistics or None
         None unless the file has a sound index, with statistics.
 
@@ -196,11 +185,6 @@ class LogFile:
         length : int
             Bytes to read.
 
-        Returns
-        -------
-        bytes
-            Fewer than `length` at the end of the file.
-
         Raises
         ------
         LogError
@@ -228,10 +212,6 @@ class LogFile:
     def record(self, location: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages.
 
-        Parameters
-        ----------
-        location : RecordLocation
-
         Returns
         -------
         McapRecord or None
@@ -256,15 +236,7 @@ class LogFile:
     def parse(self, opcode: int, content: bytes) -> McapRecord | None:
         """Parse a record of this file; where a text is not UTF-8, warn of it, and read the rest.
 
-        Parameters
-        ----------
-        opcode, content
-            As of `hearthlog.schemas.mcap.records.parse`.
-
-        Raises
-        ------
-        McapError
-            If it is too short for what it claims to hold.
+        Raise `McapError` if it is too short for what it claims to hold.
         """
         record, escaped = parse_escaped(opcode, content)
         if escaped:
@@ -280,8 +252,6 @@ class LogFile:
         ----------
         chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
             Rows of `chunks`.
-        channels : set of int
-            Numbers of channels.
 
         Returns
         -------
@@ -298,13 +268,6 @@ class LogFile:
         ----------
         offset : int
             Byte of the file at which the damaged record begins.
-        what : object
-            What is wrong there: a text, or an error.
-
-        Returns
-        -------
-        LogError
-            For the caller to raise.
         """
         return LogError(f"{self.path}: damaged at byte {offset} ({what}){RECOVER}")
 
@@ -635,22 +598,7 @@ class LogFile:
 def open_log(path: Path) -> tuple[Path, LocalFile | StoredFile]:
     """Open the file of a log by its name, or by the final name that it has got since.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-
-    Returns
-    -------
-    path : Path
-        Name by which it was opened.
-    file : LocalFile or StoredFile
-        For the caller to close.
-
-    Raises
-    ------
-    LogError
-        If it cannot be opened.
+    Raise `LogError` if it cannot be opened.
     """
     try:
         return path, open_file(path)

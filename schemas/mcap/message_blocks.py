@@ -17,8 +17,6 @@ class Block(NamedTuple):
 
     Attributes
     ----------
-    channel : int
-        Number of the channel in the file that is written.
     log_times, publish_times : np.ndarray [shape=(n,)], int64
         Nanoseconds of UTC.
     sequences : np.ndarray [shape=(n,)], uint32
@@ -56,21 +54,7 @@ class Block(NamedTuple):
 
 
 def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
-    """Group messages by the sizes of their payloads, to write them unchanged to a channel.
-
-    Parameters
-    ----------
-    messages : RawMessages
-    channel : int
-        Number of the channel in the file that is written.
-    first_rank : int
-        Rank of the first message; those of the others count up from it, in the order of `messages`.
-
-    Yields
-    ------
-    Block
-        Messages of one size, in the order of their log times; sizes ascend.
-    """
+    """Group messages by the sizes of their payloads, to write them unchanged to a channel."""
     for size in np.unique(messages.sizes).tolist():
         rows = np.flatnonzero(messages.sizes == size)
         heads = messages.heads[rows]
@@ -119,7 +103,6 @@ def join_messages(
         Number of the channel of each; one message at least.
     times : sequence of int
         Log time of each, which is also its publish time, in nanoseconds; ascending.
-    payloads : sequence of bytes
     """
     heads = np.empty(len(payloads), MESSAGE_HEAD)
     heads["opcode"] = Opcode.MESSAGE

@@ -37,13 +37,7 @@ class RawMessages:
         return self.heads["log_time"]
 
     def payload(self, row: int) -> bytes:
-        """Return one message as it was written: CDR, with its header.
-
-        Parameters
-        ----------
-        row : int
-            Place among these messages.
-        """
+        """Return one message as it was written: CDR, with its header."""
         start = int(self.offsets[row])
         return self.buffer[start : start + int(self.sizes[row])].tobytes()
 
@@ -60,11 +54,6 @@ class RawMessages:
             Nanoseconds of UTC; None for the first message on.
         end : int or None
             Nanoseconds of UTC; None for up to the last message.
-
-        Returns
-        -------
-        RawMessages
-            With the same buffer.
         """
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
@@ -73,19 +62,7 @@ class RawMessages:
 
 
 def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages, int]]:
-    """Go through the messages of several channels in the order of their log times.
-
-    Parameters
-    ----------
-    parts : sequence of RawMessages
-
-    Yields
-    ------
-    part : RawMessages
-        The channel of the next message.
-    row : int
-        Its place there.
-    """
+    """Go through the messages of several channels in the order of their log times."""
     times = [part.log_times for part in parts]
     part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     rows = np.concatenate([np.arange(0), *(np.arange(len(part)) for part in parts)])

@@ -23,8 +23,6 @@ def walk_records(
     ----------
     read : callable
         Returns bytes of the file from an offset on, fewer than asked for at its end.
-    start : int
-        Offset of the first record.
 
     Yields
     ------
@@ -54,15 +52,8 @@ def read_records(
 
     Parameters
     ----------
-    file : LocalFile or StoredFile
     start, end : int
         Of the section, in bytes.
-
-    Yields
-    ------
-    location : RecordLocation
-    record : bytes
-        Opcode and length included.
 
     Raises
     ------

@@ -59,9 +59,6 @@ def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord |
 
     Parameters
     ----------
-    opcode : int
-    content : bytes
-        The record, without opcode and length.
     escaped : bool
         Put `\xNN` in the place of bytes of a text that are not UTF-8, so that two names stay two,
         and raise no error.
@@ -86,15 +83,7 @@ def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord |
 def parse_escaped(opcode: int, content: bytes) -> tuple[McapRecord | None, bool]:
     """Parse a record as `parse` does; return whether a text in it had to be escaped, too.
 
-    Parameters
-    ----------
-    opcode, content
-        As of `parse`.
-
-    Raises
-    ------
-    McapError
-        If it is too short for what it claims to hold.
+    Raise `McapError` if it is too short for what it claims to hold.
     """
     try:
         return parse(opcode, content), False
@@ -157,15 +146,7 @@ class ChunkHead(NamedTuple):
 def chunk_head(content: bytes | memoryview) -> ChunkHead:
     """Read the head of a chunk from its content.
 
-    Parameters
-    ----------
-    content : bytes-like
-        The chunk's record, without opcode and length.
-
-    Raises
-    ------
-    McapError
-        If it is shorter than it claims, or claims records larger than `LIMIT`.
+    Raise `McapError` if it is shorter than it claims, or claims records larger than `LIMIT`.
     """
     head = begun_chunk_head(content)
     if head.data.stop > len(content):
@@ -202,12 +183,6 @@ def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
 def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
     """Decompress the records of a chunk, and compare them with its checksum.
 
-    Parameters
-    ----------
-    head : ChunkHead
-    content : bytes-like
-        The chunk's record, without opcode and length.
-
     Returns
     -------
     bytes
@@ -230,9 +205,6 @@ def decompress_into(out: memoryview, head: ChunkHead, content: bytes | memoryvie
     ----------
     out : memoryview
         Exactly `head.size` bytes, which are overwritten.
-    head : ChunkHead
-    content : bytes-like
-        The chunk's record, without opcode and length.
 
     Raises
     ------

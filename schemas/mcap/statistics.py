@@ -25,13 +25,6 @@ _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
 def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
     """Find the first and the last log time of a log.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-    partial : bool
-        As of `LogFile`.
-
     Returns
     -------
     tuple of int, or None
@@ -51,11 +44,6 @@ def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
 
 def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
     """Read the first and the last log time of a log from its statistics alone.
-
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
 
     Returns
     -------
@@ -84,11 +72,6 @@ def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
 
 def topic_counts(path: Path) -> Counter[str]:
     """Count the messages of each topic by the statistics of a finished log.
-
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
 
     Returns
     -------

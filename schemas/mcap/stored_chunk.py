@@ -39,10 +39,7 @@ class StoredChunk(NamedTuple):
     def content(self) -> bytes:
         """Decompress the records.
 
-        Raises
-        ------
-        McapError
-            If they are damaged.
+        Raise `McapError` if they are damaged.
         """
         head = ChunkHead(0, 0, self.size, 0, self.compression, slice(None))
         return decompress(head, self.data)
@@ -66,8 +63,6 @@ class ChunkBuilder:
 
     Attributes
     ----------
-    content : bytearray
-        Its records, uncompressed, one behind the other.
     entries : dict of int to bytearray
         Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
     start, end : int
@@ -104,7 +99,6 @@ class ChunkBuilder:
 
         Parameters
         ----------
-        chunk : StoredChunk
         dropped : collection of int
             Numbers of the channels; if there are no others, nothing is appended.
         """
@@ -127,14 +121,7 @@ class ChunkBuilder:
             self.content += content[first:last]
 
     def gather(self, chunk: StoredChunk, channels: Collection[int]) -> None:
-        """Append the messages of some channels of a chunk, and nothing else that it holds.
-
-        Parameters
-        ----------
-        chunk : StoredChunk
-        channels : collection of int
-            Numbers of the channels.
-        """
+        """Append the messages of some channels of a chunk, and nothing else that it holds."""
         content = chunk.content()
         for channel, rows in chunk.entries.items():
             if channel not in channels:
@@ -161,8 +148,6 @@ def compress_chunk(
 
     Parameters
     ----------
-    content : bytes-like
-        The records, one behind the other.
     span : (int, int)
         First and last log time of its messages, in nanoseconds.
     entries : mapping of int to bytes-like

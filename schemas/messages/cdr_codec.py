@@ -35,15 +35,11 @@ def encode_groups(
 
     Parameters
     ----------
-    typename : str
-        ROS 2 name of the type, such as "hearthlog_msgs/msg/AudioLabel".
     columns : mapping from field path, such as "header.frame_id", to its values
         An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
         for an array of numbers, and (count, 0) for an array of messages, which must be empty; for
         a string, one for all messages or a sequence of `count`. Fields that were appended to the
         type may be left out.
-    count : int
-        Number of messages.
 
     Yields
     ------
@@ -81,24 +77,7 @@ def encode_groups(
 def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
     """Encode `count` messages, given as one column for each field, into one `bytes` each.
 
-    Parameters
-    ----------
-    typename : str
-        ROS 2 name of the type, such as "hearthlog_msgs/msg/AudioLabel".
-    columns : mapping of str to column
-        As `encode_groups` takes them.
-    count : int
-        Number of messages.
-
-    Returns
-    -------
-    list of bytes
-        One payload for each message, in the order of the rows.
-
-    Raises
-    ------
-    LogError
-        As `encode_groups`.
+    Raise `LogError` as `encode_groups`.
     """
     payloads: list[bytes] = [b""] * count
     for rows, block in encode_groups(typename, columns, count):
@@ -198,13 +177,10 @@ def decode_rows(  # noqa: PLR0913
 
     Parameters
     ----------
-    kind : MessageType
     buffer : np.ndarray [shape=(b,)], uint8
         Bytes that contain the payloads.
     offsets, sizes : np.ndarray [shape=(n,)], int64
         First byte of each payload in the buffer, and its number of bytes.
-    fields : collection of str, optional
-        Paths of the fields to read; all by default.
     undecodable : str
         What becomes of a string that is not UTF-8: "strict" raises an error, "replace" puts U+FFFD
         in the place of what cannot be read.
@@ -232,18 +208,7 @@ def decode_rows(  # noqa: PLR0913
 def unreadable_rows(
     kind: MessageType, buffer: Bytes, offsets: Int64, sizes: Int64
 ) -> dict[int, LogError]:
-    """Find the messages that are not of their type.
-
-    Parameters
-    ----------
-    kind, buffer, offsets, sizes
-        As of `decode_rows`.
-
-    Returns
-    -------
-    dict of int to LogError
-        By row, what is wrong with it.
-    """
+    """Find the messages that are not of their type."""
     errors: dict[int, LogError] = {}
     for _ in rows_by_layout(kind, buffer, offsets, sizes, errors):
         pass
@@ -261,7 +226,6 @@ def rows_by_layout(
 
     Parameters
     ----------
-    kind : MessageType
     buffer : np.ndarray [shape=(b,)], uint8
         Bytes that contain the payloads.
     offsets, sizes : np.ndarray [shape=(n,)], int64
@@ -272,7 +236,6 @@ def rows_by_layout(
 
     Yields
     ------
-    layout : Layout
     rows : np.ndarray [shape=(m,)], intp
         Which messages have it.
     payloads : np.ndarray [shape=(m,)], of the dtype of the layout

@@ -65,8 +65,6 @@ class Layout(NamedTuple):
     dtype : np.dtype
         Of the whole payload. A field has its path as its name. The word before a string or a
         sequence, which holds its length, has that name and " length".
-    leaves : tuple of Leaf, MessageArray or Default
-        What is read of each message, in the order of the fields.
     fixed : dict of str to int or np.void
         What every payload of this layout has in common: byte order, lengths, ends of strings.
     """
@@ -103,22 +101,7 @@ _SAME = Growth(frozenset(), ())
 
 
 def default_rows(name: str, fields: Sequence[tuple[str, Any]], prefix: str = "") -> list[Default]:
-    """Make the default values of fields, for messages that do not have these fields.
-
-    Parameters
-    ----------
-    name : str
-        ROS 2 name of the type that has the fields.
-    fields : sequence of (str, Any)
-        Name and description of each field, as rosbags has them.
-    prefix : str
-        Put before the path of each field, such as "header.".
-
-    Returns
-    -------
-    list of Default
-        One for each field, or one for each field of a message that a field holds.
-    """
+    """Make the default values of fields, for messages that do not have these fields."""
     appended = APPENDED.get(name, {})
     return [
         leaf
@@ -166,7 +149,6 @@ class LayoutWalk:
 
     Parameters
     ----------
-    definition : TypeDefinition
     order : str
         Byte order, as numpy has it: "<" or ">".
     length_at : callable
@@ -203,8 +185,6 @@ class LayoutWalk:
 
         Parameters
         ----------
-        leaves : tuple of Leaf, MessageArray or Default
-            What `message` returned.
         size : int
             Bytes of a payload.
         """
@@ -219,23 +199,8 @@ class LayoutWalk:
     def message(self, name: str, prefix: str = "") -> tuple[AnyLeaf, ...]:
         """Walk through the fields of a message and return their leaves.
 
-        Parameters
-        ----------
-        name : str
-            ROS 2 name of the type.
-        prefix : str
-            Put before the path of each field, such as "header.".
-
-        Returns
-        -------
-        tuple of Leaf, MessageArray or Default
-            In the order of the fields; those with defaults come last.
-
-        Raises
-        ------
-        LogError
-            If the type is not defined, contains itself, or has a field of an unsupported type; if
-            the message ends before one of its fields, or has too many of them.
+        Raise `LogError` if the type is not defined, contains itself, or has a field of an
+        unsupported type; if the message ends before one of its fields, or has too many of them.
         """
         if name not in self._types:
             raise LogError(f"{self._name}: builds on {name}, which is not defined")

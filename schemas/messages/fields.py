@@ -43,15 +43,8 @@ class Field(NamedTuple):
 def fields_of(kind: MessageType) -> dict[str, Field]:
     """List all fields of a message type by path, with the fields of the messages inside it.
 
-    Returns
-    -------
-    dict of str to Field
-        By path, such as "header.stamp", in the order of the definition.
-
-    Raises
-    ------
-    LogError
-        If the type contains itself, builds on one that is not defined, or has too many fields.
+    Raise `LogError` if the type contains itself, builds on one that is not defined, or has too
+    many fields.
     """
     return dict(_fields(kind, kind.name, "", 0, iter(range(_FIELDS_LIMIT))))
 
@@ -146,13 +139,6 @@ def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
 
     A field that was appended to one of our types is not lacking: it has a default.
 
-    Parameters
-    ----------
-    kind : MessageType
-        As the file defines it.
-    paths : collection of str
-        Paths of fields, such as "header.stamp".
-
     Returns
     -------
     list of str
@@ -170,17 +156,7 @@ def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
 
 @lru_cache
 def missing_fields(type_: str, encoding: str, text: bytes, paths: frozenset[str]) -> str:
-    """Say which fields of ours cannot be read by a definition; empty if all can.
-
-    Parameters
-    ----------
-    type_, encoding : str
-        Name of the message type, and what its definition is written in.
-    text : bytes
-        The definition.
-    paths : frozenset of str
-        Of fields that this version of the type has.
-    """
+    """Say which fields of ours cannot be read by a definition; empty if all can."""
     try:
         return ", ".join(lacking(message_type(type_, encoding, text), paths))
     except LogError:
@@ -266,10 +242,7 @@ def _base(details: tuple[str, int]) -> str:
 def type_hash_of(kind: MessageType) -> str:
     """Return the RIHS01 hash of a type as a file defines it.
 
-    Raises
-    ------
-    LogError
-        If the type contains itself, or builds on one that is not defined.
+    Raise `LogError` if the type contains itself, or builds on one that is not defined.
     """
     store = get_typestore(Stores.EMPTY)
     store.fielddefs.update({name: ([], list(fields)) for name, fields in kind.types.items()})

@@ -14,17 +14,7 @@ QUIET_HOURS, PAUSED = ON_PURPOSE = "quiet hours", "paused"  # nobody was to be l
 
 
 def encode_gap(microphone: str, start: int, end: int, reason: str, frames_lost: int) -> bytes:
-    """Encode an `AudioGap` as CDR.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    start, end : int
-        In nanoseconds of UTC.
-    reason : str
-    frames_lost : int
-    """
+    """Encode an `AudioGap` as CDR."""
     return encode(
         message(
             GAP,

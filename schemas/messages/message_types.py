@@ -102,13 +102,7 @@ def _types_here() -> dict[str, Any]:
 
 
 def store_of(typename: str) -> Typestore:
-    """Return a typestore that has a type, if any has: of what a recorder writes, a small one.
-
-    Parameters
-    ----------
-    typename : str
-        ROS 2 name of the type.
-    """
+    """Return a typestore that has a type, if any has: of what a recorder writes, a small one."""
     recorded = recorded_types()
     return recorded if typename in recorded.fielddefs else typestore()
 
@@ -118,16 +112,9 @@ def message(typename: str, **fields: Any) -> Any:
 
     Parameters
     ----------
-    typename : str
-        ROS 2 name of the type, such as "std_msgs/msg/Header".
     **fields : Any
         Values by name of the field, as rosbags has them. Fields that were appended to the type may
         be left out, and have their defaults then.
-
-    Returns
-    -------
-    message
-        Of the typestore's class for this type.
     """
     absent = APPENDED.get(typename, {}).keys() - fields.keys()
     if absent:
@@ -166,15 +153,7 @@ def number_type(name: str) -> np.dtype[Any]:
 
 
 def header(stamp: int, frame_id: str) -> Any:
-    """Make a `std_msgs/Header`.
-
-    Parameters
-    ----------
-    stamp : int
-        In nanoseconds of UTC.
-    frame_id : str
-        Name of the microphone.
-    """
+    """Make a `std_msgs/Header`."""
     return message("std_msgs/msg/Header", stamp=time_message(stamp), frame_id=frame_id)
 
 
@@ -191,35 +170,18 @@ def time_message(nanoseconds: int) -> Any:
 
 
 def duration_message(nanoseconds: int) -> Any:
-    """Make a `builtin_interfaces/Duration`.
-
-    Parameters
-    ----------
-    nanoseconds : int
-    """
+    """Make a `builtin_interfaces/Duration`."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=rest)
 
 
 def nanoseconds(stamp: Any) -> int:
-    """Convert a `builtin_interfaces` Time or Duration to nanoseconds.
-
-    Parameters
-    ----------
-    stamp : message
-        A Time or a Duration.
-    """
+    """Convert a `builtin_interfaces` Time or Duration to nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def encode(fields: Any) -> bytes:
-    """Encode one message as little-endian CDR.
-
-    Parameters
-    ----------
-    fields : message
-        As `message` makes it.
-    """
+    """Encode one message as little-endian CDR."""
     store = store_of(fields.__msgtype__)
     return bytes(store.serialize_cdr(fields, fields.__msgtype__, little_endian=True))
 
@@ -231,36 +193,17 @@ def decode(data: bytes | memoryview, typename: str) -> Any:
     ----------
     data : bytes or memoryview
         The payload, of either byte order.
-    typename : str
-        ROS 2 name of the type.
-
-    Returns
-    -------
-    message
-        Of the typestore's class for this type.
     """
     return store_of(typename).deserialize_cdr(data, typename)
 
 
 @cache
 def definition(typename: str) -> str:
-    """Return the definitions of a type and of those that it builds on, as MCAP's `ros2msg` text.
-
-    Parameters
-    ----------
-    typename : str
-        ROS 2 name of the type.
-    """
+    """Return the definitions of a type and of those that it builds on, as MCAP's `ros2msg` text."""
     return store_of(typename).generate_msgdef(typename, ros_version=2)[0]
 
 
 @cache
 def type_hash(typename: str) -> str:
-    """Return the RIHS01 hash of a type, by which ROS 2 compares the types of two sides.
-
-    Parameters
-    ----------
-    typename : str
-        ROS 2 name of the type.
-    """
+    """Return the RIHS01 hash of a type, by which ROS 2 compares the types of two sides."""
     return store_of(typename).hash_rihs01(typename)

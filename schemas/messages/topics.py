@@ -42,15 +42,8 @@ class Topic:
 
     Attributes
     ----------
-    name : str
-        Such as "/mic/features".
-    type : str
-        ROS 2 name of the type.
-    quality : Quality
     array_names : mapping of str to sequence of str
         Names of the elements of an array, by the name of the field that holds the array.
-    metadata : mapping of str to str
-        What the channel says besides.
     """
 
     name: str
@@ -61,14 +54,7 @@ class Topic:
 
 
 class EmbeddingSpace(NamedTuple):
-    """Network and projection of embeddings; only those of the same space can be compared.
-
-    Attributes
-    ----------
-    network, projection_sha256 : str
-    width : int
-        Number of the values of a window.
-    """
+    """Network and projection of embeddings; only those of the same space can be compared."""
 
     network: str
     projection_sha256: str
@@ -76,18 +62,7 @@ class EmbeddingSpace(NamedTuple):
 
 
 class EmbeddingSource(NamedTuple):
-    """The network and the projection behind the embeddings of a microphone.
-
-    Attributes
-    ----------
-    network, network_sha256 : str
-        Its name, and the digest of its file.
-    projection_sha256 : str
-        Embeddings of two projections cannot be compared.
-    names : tuple of str
-    steps : tuple of float
-        Of the logged integers.
-    """
+    """The network and the projection behind the embeddings of a microphone."""
 
     network: str
     network_sha256: str
@@ -111,13 +86,7 @@ class EmbeddingSource(NamedTuple):
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "EmbeddingSource | None":
-        """Read what a channel says of its embeddings; None where it does not.
-
-        Parameters
-        ----------
-        metadata : mapping of str to str
-            Of the channel.
-        """
+        """Read what a channel says of its embeddings; None where it does not."""
         try:
             names = json.loads(metadata["values_names"])
             steps = tuple(float(step) for step in json.loads(metadata["values_steps"]))
@@ -132,15 +101,7 @@ class EmbeddingSource(NamedTuple):
 def check_microphone_name(name: str) -> str:
     """Return the name of a microphone if it can be part of a ROS topic.
 
-    Parameters
-    ----------
-    name : str
-        Lower-case letters, digits and single underscores, starting with a letter.
-
-    Raises
-    ------
-    LogError
-        If the name has another form.
+    Raise `LogError` if the name has another form.
     """
     if not re.fullmatch(_MICROPHONE, name):
         raise LogError(
@@ -173,35 +134,17 @@ def check_scenario_name(name: str) -> str:
 
 
 def scenario_labelling(name: str) -> str:
-    """Name the labelling of a scenario: `scenario/<name>`.
-
-    Parameters
-    ----------
-    name : str
-        As `check_scenario_name` takes it.
-    """
+    """Name the labelling of a scenario: `scenario/<name>`."""
     return f"{SCENARIO}/{name}"
 
 
 def is_scenario(labelling: str) -> bool:
-    """Tell whether a labelling is that of a scenario.
-
-    Parameters
-    ----------
-    labelling : str
-        Such as `live` or `scenario/<name>`.
-    """
+    """Tell whether a labelling is that of a scenario."""
     return labelling.startswith(f"{SCENARIO}/")
 
 
 def scenario_name(labelling: str) -> str:
-    """Return the name of the scenario that a labelling is of; empty if it is of none.
-
-    Parameters
-    ----------
-    labelling : str
-        Such as `scenario/<name>`, `review/scenario/<name>` or `live`.
-    """
+    """Return the name of the scenario that a labelling is of; empty if it is of none."""
     parts = labelling.removeprefix(f"{REVIEW}/").partition("/")
     return parts[2] if parts[0] == SCENARIO else ""
 
@@ -218,26 +161,12 @@ def review_labelling(scenario: str = "") -> str:
 
 
 def is_review(labelling: str) -> bool:
-    """Tell whether a labelling is that of a reviewer.
-
-    Parameters
-    ----------
-    labelling : str
-        Such as `review` or `review/scenario/<name>`.
-    """
+    """Tell whether a labelling is that of a reviewer."""
     return labelling.partition("/")[0] == REVIEW
 
 
 def topic(microphone: str, kind: str) -> str:
-    """Name the topic of one kind of a microphone: `/<microphone>/<kind>`.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    kind : str
-        `info`, `features`, `label` …
-    """
+    """Name the topic of one kind of a microphone: `/<microphone>/<kind>`."""
     return f"/{microphone}/{kind}"
 
 
@@ -250,39 +179,17 @@ class TopicName(NamedTuple):
 
 
 def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
-    """Name the topic of one kind of a labelling.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    labelling : str
-        `live`, `candidate`, `review`, `scenario/<name>`, `review/scenario/<name>` or
-        `relabel/<model>`.
-    kind : str
-        `label`, `segment` or `mark`.
-    """
+    """Name the topic of one kind of a labelling."""
     return topic(microphone, kind if labelling == LIVE else f"{labelling}/{kind}")
 
 
 def relabelling(model: str) -> str:
-    """Name the labelling of a model that relabelled logs: `relabel/<model>`.
-
-    Parameters
-    ----------
-    model : str
-        Name of the model; what cannot be in a topic becomes `_`.
-    """
+    """Name the labelling of a model that relabelled logs: `relabel/<model>`."""
     return f"{RELABEL}/{re.sub('[^A-Za-z0-9_]', '_', model)}"
 
 
 def parse_topic(name: str) -> TopicName | None:
     """Split the name of a topic into its parts.
-
-    Parameters
-    ----------
-    name : str
-        Such as "/mic/features" or "/mic/review/segment".
 
     Returns
     -------
@@ -310,16 +217,8 @@ def label_topics(microphone: str, labelling: str, classes: Sequence[str]) -> tup
 
     Parameters
     ----------
-    microphone : str
-        Its name.
-    labelling : str
-        `live`, `candidate`, `scenario/<name>` or `relabel/<model>`.
     classes : sequence of str
         Names of the classes, in the order of the probabilities.
-
-    Returns
-    -------
-    labels, segments : Topic
     """
     label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
     return (
@@ -341,15 +240,9 @@ def topics_of(  # noqa: PLR0913
 
     Parameters
     ----------
-    microphone : str
-        Its name.
-    feature_names : sequence of str
-        Names of the values of a frame, in their order.
     classes : sequence of str or None
         Names of the classes, in the order of the probabilities; None for a recorder without a
         model, which writes no labels and no segments.
-    beside : mapping of str to sequence of str, optional
-        The same of the labellings beside it, such as `candidate` or `scenario/<name>`.
     directions : bool
         Whether it is an array, and has directions.
     embedding : EmbeddingSource, optional
@@ -387,11 +280,5 @@ def topics_of(  # noqa: PLR0913
 
 
 def audio_topic(microphone: str) -> Topic:
-    """Return the only topic of a layer of sound.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    """
+    """Return the only topic of a layer of sound."""
     return Topic(topic(microphone, "audio"), message_types.RAW_AUDIO)

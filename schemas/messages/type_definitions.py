@@ -38,13 +38,7 @@ _WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")  # which rosbags does not read
 
 
 class EndlessTextError(LogError):
-    """A string in a message does not end where its length says.
-
-    Attributes
-    ----------
-    layout : Layout
-        What the message would have, if it did.
-    """
+    """A string in a message does not end where its length says."""
 
     def __init__(self, text: str, layout: Layout) -> None:
         super().__init__(text)
@@ -55,11 +49,6 @@ class MessageType:
     """A ROS 2 message type as a file defines it.
 
     Of our own types, the fields of this version are read, whichever version wrote them.
-
-    Parameters
-    ----------
-    name, types, growth
-        As in `TypeDefinition`; by default no type has grown.
     """
 
     def __init__(
@@ -71,18 +60,7 @@ class MessageType:
         self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
 
     def read_fields(self, name: str) -> list[tuple[str, Any]]:
-        """List the fields that are read of this type, or of one that it builds on.
-
-        Parameters
-        ----------
-        name : str
-            ROS 2 name of that type.
-
-        Returns
-        -------
-        list of (str, Any)
-            Name and description of each field, as rosbags has them.
-        """
+        """List the fields that are read of this type, or of one that it builds on."""
         if name not in self.growth:
             return list(self.types[name])
         later, absent = self.growth[name]
@@ -110,10 +88,6 @@ class MessageType:
         ----------
         payload : memoryview
             CDR of either byte order.
-        words : dict of int to bytes, optional
-            Is filled with what the layout depends on, by place in the payload: a payload of the
-            same size that has the same there has the same layout, or the same fault, but for
-            the ends of strings.
 
         Raises
         ------
@@ -174,8 +148,6 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
 
     Parameters
     ----------
-    name : str
-        ROS 2 name of the type.
     encoding : str
         `ros2msg` or `ros2idl`; empty for the definition of ROS 2 or hearthlog.
     text : bytes
@@ -198,11 +170,6 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
 
 def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
     """Read a message type, and those that it builds on, as a file defines them.
-
-    Parameters
-    ----------
-    name, encoding, text
-        As of `message_type`.
 
     Returns
     -------

@@ -77,8 +77,6 @@ class DamageList:
 
         Parameters
         ----------
-        damage : Damage
-            Its own `messages` are replaced.
         messages : dict of int to int, optional
             Lost messages by channel; None for none.
         """
@@ -96,10 +94,6 @@ class DamageList:
 
         Parameters
         ----------
-        channel : int
-            Number of the channel.
-        messages : int
-            How many there are.
         times : tuple of int
             First and last log time of them, in nanoseconds.
         whole : WholeRecord
@@ -116,8 +110,6 @@ class DamageList:
 
         Parameters
         ----------
-        unmet : iterable of UnmetChunks
-            All chunks of the index that were not met.
         names : sequence of str
             All metadata records and attachments of the index that were not met.
         """
@@ -146,13 +138,7 @@ class DamageList:
         self._insert(more)
 
     def add_claims(self, claims: Iterable[Claim]) -> None:
-        """Add what message indexes list and no chunk has.
-
-        Parameters
-        ----------
-        claims : iterable of Claim
-            In the order of the file.
-        """
+        """Add what message indexes list and no chunk has."""
         why = "message indexes list more than there is"
         self._insert(
             [(Damage(start, start, why, times=times), dict(lost)) for start, lost, times in claims]
@@ -170,18 +156,7 @@ class DamageList:
         self._damages = sorted([*self._damages, *more], key=lambda each: each[0].start)
 
     def resolve(self, definitions: Definitions) -> list[Damage]:
-        """List the damages, then the messages without a definition, with the names of topics.
-
-        Parameters
-        ----------
-        definitions : Definitions
-            Tell the topics of channels.
-
-        Returns
-        -------
-        list of Damage
-            Damages by offset, then one for each channel that was added as unnamed.
-        """
+        """List the damages, then the messages without a definition, with the names of topics."""
         damages = []
         for damage, lost in self._damages:
             messages: dict[str, int] = {}
@@ -236,9 +211,6 @@ def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) 
 
     Parameters
     ----------
-    reader : RecordVerifier
-        Of the file.
-    damaged : DamagedRange
     index : Index or None
         Index of the file. None if the file has none that is whole: the bytes of the range and the
         message indexes behind it then tell what was lost, as where the index has moved.

@@ -49,8 +49,6 @@ class Index(NamedTuple):
 
     Attributes
     ----------
-    reader : RecordVerifier
-        Of the whole file.
     start : int
         Byte at which it begins.
     moved : bool
@@ -61,8 +59,6 @@ class Index(NamedTuple):
     chunks : np.ndarray [shape=(n, 6)], int64
         Offset, length, length of the message indexes, first and last log time of each chunk, and
         the byte at which its record in the index begins; in the order of the file.
-    names : dict of int to str
-        Metadata records and attachments, by offset.
     """
 
     reader: RecordVerifier
@@ -74,13 +70,7 @@ class Index(NamedTuple):
     names: dict[int, str]
 
     def messages_of(self, first: int, last: int) -> Counter[int]:
-        """Count the messages of successive chunks, by channel.
-
-        Parameters
-        ----------
-        first, last : int
-            Rows of `chunks`: from `first` on, before `last`.
-        """
+        """Count the messages of successive chunks, by channel."""
         messages: Counter[int] = Counter()
         for place in self.chunks[first:last, 5].tolist():
             record = self.reader.whole(place).record
@@ -94,8 +84,6 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
 
     Parameters
     ----------
-    reader : RecordVerifier
-        Of the file, up to its end, where it stays.
     limit : int
         Bytes; a larger index is not read.
 
@@ -223,12 +211,7 @@ class UnmetChunks(NamedTuple):
 
 
 class MetRecords:
-    """Which records of an index were met in the file, wherever bytes before them are missing.
-
-    Parameters
-    ----------
-    index : Index
-    """
+    """Which records of an index were met in the file, wherever bytes before them are missing."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
@@ -241,13 +224,7 @@ class MetRecords:
         self._keys = np.ascontiguousarray(keys[self._order, ::-1])
 
     def meet(self, whole: WholeRecord) -> None:
-        """Note that a record was met.
-
-        Parameters
-        ----------
-        whole : WholeRecord
-            Of any kind.
-        """
+        """Note that a record was met."""
         record = whole.record
         if isinstance(record, records.Metadata | WholeAttachment | LargeAttachment):
             self._names[_name_of(record)] -= 1
@@ -269,23 +246,11 @@ class MetRecords:
         self._ends[row] = whole.end
 
     def unmet_names(self) -> list[str]:
-        """List the metadata records and attachments that were not met, as `Index.names` has them.
-
-        Returns
-        -------
-        list of str
-            In the order of the index.
-        """
+        """List the metadata records and attachments that were not met, as in `Index.names`."""
         return list((+self._names).elements())
 
     def unmet(self) -> Iterator[UnmetChunks]:
-        """Go through the chunks that were not met.
-
-        Yields
-        ------
-        UnmetChunks
-            In the order of the index.
-        """
+        """Go through the chunks that were not met."""
         missing = np.concatenate([[False], self._places == _UNMET, [False]])
         borders = np.flatnonzero(missing[1:] != missing[:-1]).reshape(-1, 2)
         for first, last in borders.tolist():

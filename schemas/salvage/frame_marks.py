@@ -44,12 +44,6 @@ class Mark(NamedTuple):
 def read_marks(piece: WholeChunk | Message, definitions: Definitions) -> dict[str, list[Mark]]:
     """Read the gaps of a piece, and the first and the last of its frames.
 
-    Parameters
-    ----------
-    piece : WholeChunk or mcap.records.Message
-    definitions : Definitions
-        Define all channels of the piece.
-
     Returns
     -------
     dict of str to list of Mark

@@ -20,8 +20,6 @@ def gap_channel(definitions: Definitions, microphone: str) -> int | None:
     ----------
     definitions : Definitions
         Are added to if there is none.
-    microphone : str
-        Its name.
 
     Returns
     -------

@@ -44,8 +44,6 @@ class IndexClaims:
         ----------
         end : int
             Byte of the file at which it ends.
-        chunk : StoredChunk
-            With the entries that its index should have.
         """
         self._spans.extend([chunk.start, chunk.end])
         self._begin(end)
@@ -57,7 +55,6 @@ class IndexClaims:
 
         Parameters
         ----------
-        channel : int
         entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
         """
         if self._own is None or not len(entries):

@@ -39,18 +39,7 @@ class FrameSearch:
         self._followers: dict[str, _FrameFollower] = {}
 
     def before(self, piece: WholeChunk | Message) -> list[LostFrames]:
-        """Find the frames that are missing before the first frames of a piece.
-
-        Parameters
-        ----------
-        piece : WholeChunk or mcap.records.Message
-            The next piece that was saved.
-
-        Returns
-        -------
-        list of LostFrames
-            In the order of their ends.
-        """
+        """Find the frames that are missing before the first frames of a piece."""
         lost: list[LostFrames] = []
         for microphone, marks in read_marks(piece, self._salvage.definitions).items():
             if microphone not in self._followers:

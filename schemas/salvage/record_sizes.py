@@ -37,11 +37,6 @@ LARGEST[[Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX]] = LIMIT
 def find_record_heads(window: bytes) -> list[int]:
     """Search for the heads of records, damaged or not.
 
-    Parameters
-    ----------
-    window : bytes
-        Any part of a file.
-
     Returns
     -------
     list of int

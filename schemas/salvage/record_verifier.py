@@ -68,8 +68,6 @@ class RecordVerifier:
 
     Parameters
     ----------
-    file : LocalFile
-        Stays open.
     end : int
         Byte of the file before which reading ends.
 
@@ -77,8 +75,6 @@ class RecordVerifier:
     ----------
     work : int
         Bytes that were read and decompressed so far.
-    inner : int
-        Records inside of chunks that were gone through so far.
     """
 
     def __init__(self, file: LocalFile, end: int) -> None:
@@ -96,11 +92,6 @@ class RecordVerifier:
             Byte of the file.
         length : int
             Bytes to read.
-
-        Returns
-        -------
-        bytes
-            Fewer than `length` at the end of what is read of the file.
 
         Raises
         ------
@@ -121,7 +112,6 @@ class RecordVerifier:
 
         Returns
         -------
-        opcode : int
         length : int
             Bytes of its content, by its own claim.
 
@@ -143,8 +133,6 @@ class RecordVerifier:
         ----------
         offset : int
             Byte of the file at which the record begins.
-        kind : int, optional
-            Opcode of a record of this kind; by default the one that it has.
 
         Returns
         -------
@@ -278,11 +266,6 @@ class RecordVerifier:
         ----------
         offset : int
             Byte of the file at which the chunk should begin.
-
-        Returns
-        -------
-        WholeRecord
-            With a WholeChunk, whose times and message index are made from its content.
 
         Raises
         ------
@@ -497,8 +480,6 @@ class RecordVerifier:
 
         Returns
         -------
-        channel : int
-            Number of its channel.
         entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
             Those with log times up to `LAST_TIME`.
         end : int

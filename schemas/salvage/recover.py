@@ -46,21 +46,10 @@ def recover_log(
 
     Parameters
     ----------
-    source : Path
-        Damaged log, on this machine.
-    copy : Path
-        New log, on this machine, in the place of a file of this name.
-    name : str
-        File name that the copy will have in the end.
     progress : callable, optional
         Called with the share that is done, 0 to 1; starts again if a second attempt is needed.
     chunk_span : int
         Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged.
-
-    Returns
-    -------
-    Recovery
-        What was saved, and what was lost.
 
     Raises
     ------
@@ -105,17 +94,8 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
 
     Parameters
     ----------
-    log : Path
-        Damaged log, on this machine, finished or not.
     progress : callable, optional
         Called with the share that is done, 0 to 1.
-
-    Returns
-    -------
-    path : Path
-        Name of the log, without `.active`.
-    recovery : Recovery
-        What was saved, and what was lost.
 
     Raises
     ------
@@ -160,17 +140,8 @@ def _keep(log: Path, name: Path) -> None:
 def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
     """Read a recovered log with all its checksums, and count its messages.
 
-    Parameters
-    ----------
-    path : Path
-        The recovered log.
-    topics : dict of str to TopicRecovery
-        What was saved and stated, by topic.
-
-    Raises
-    ------
-    LogError
-        If it is damaged or cannot be read, or does not hold the messages that were recovered.
+    Raise `LogError` if it is damaged or cannot be read, or does not hold the messages that were
+    recovered.
     """
     expected = Counter(
         {name: each.messages + each.stated - each.unread for name, each in topics.items()}
@@ -195,20 +166,7 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
 def lock_abandoned(path: Path) -> Iterator[bool]:
     """Hold the lock of a log, unless the process that writes the log holds it.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine.
-
-    Yields
-    ------
-    bool
-        Whether the lock is held, so that nobody writes the log, and it is still there.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read.
+    Raise `LogError` if the log cannot be read.
     """
     try:
         stream = os.fdopen(open_regular(path), "rb")

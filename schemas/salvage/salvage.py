@@ -64,25 +64,8 @@ class _Places(NamedTuple):
 class Salvage:
     """Reads the whole pieces of an MCAP file that was cut or damaged.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine.
-    definitions : iterable of mcap.records.Schema and mcap.records.Channel, optional
-        What an earlier salvage of the same file met too late.
-
     Attributes
     ----------
-    is_mcap : bool
-        Whether it begins as such a file does.
-    complete : bool
-        Whether it is finished, and its index is whole and where it should be.
-    header : mcap.records.Header or None
-        The first one met so far.
-    definitions : Definitions
-        Those met so far.
-    expected : dict of int to int, or None
-        How many messages each channel should have, if an index says so that is whole.
     unnamed : dict of int to tuple
         By channel that was not defined when its messages were met: how many these are, their first
         and last log time, and the bytes of the file between which they are.

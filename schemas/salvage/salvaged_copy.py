@@ -88,17 +88,9 @@ class SalvagedCopy:
 
     Parameters
     ----------
-    stream : binary file
-        The new log: writable, and at its beginning.
-    salvage : Salvage
-        Of the damaged log; `write` goes through all its pieces.
-    profile : str
-        What the header of the new log says if that of the old one is lost.
     chunk_span : int
         Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged. Where they
         are joined, embeddings get chunks of their own.
-    selection : Selection or None
-        What is left out; chunks are joined then.
     """
 
     def __init__(
@@ -130,8 +122,6 @@ class SalvagedCopy:
 
         Parameters
         ----------
-        name : str
-            File name that the new log will have in the end, for rosbag2.
         progress : callable
             Called after each piece with the share of the damaged log that is passed, 0 to 1.
         """

@@ -26,15 +26,7 @@ _KEPT = {"info", "label", "segment", "gap"}
 
 
 class Thinning(NamedTuple):
-    """A step of thinning.
-
-    Attributes
-    ----------
-    step : int
-        A place in `STEPS`.
-    note : mapping of str to str
-        What the `hearthlog` record of the log says from then on.
-    """
+    """A step of thinning."""
 
     step: int
     note: Mapping[str, str]
@@ -50,32 +42,15 @@ class Thinning(NamedTuple):
 
 
 def dropped_kinds(text: str | None) -> set[str]:
-    """Return which of a log's frame by frame messages were dropped.
-
-    Parameters
-    ----------
-    text : str or None
-        What the log says it was thinned of.
-
-    Returns
-    -------
-    set of str
-        Of `statistics`, `features` and `embedding`.
-    """
+    """Return which of a log's frame by frame messages were dropped."""
     return _DROPPED[STEPS.index(text)] if text in STEPS else set()
 
 
 def thinned_step(log: Path) -> int:
     """Return how far a log was thinned already, a place in `STEPS`.
 
-    Parameters
-    ----------
-    log : Path
-
-    Raises
-    ------
-    LogError
-        If it cannot be read or is damaged, or a newer version has thinned it otherwise.
+    Raise `LogError` if it cannot be read or is damaged, or a newer version has thinned it
+    otherwise.
     """
     with LogFile(log) as file:
         texts = {record.get(THINNED, "") for record in provenance_records(file)}
@@ -90,21 +65,8 @@ def thin_log(source: Path, copy: Path, step: int) -> None:
 
     All other messages stay as they are, in their order. Channels stay defined, without messages.
 
-    Parameters
-    ----------
-    source : Path
-        A finished log, on this machine.
-    copy : Path
-        New file, on this machine, in the place of one of this name.
-    step : int
-        A place in `STEPS`.
-
-    Raises
-    ------
-    LogError
-        If the log is damaged, or the copy does not hold what was written to it.
-    OSError
-        If the copy cannot be written.
+    Raise `LogError` if the log is damaged, or the copy does not hold what was written to it.
+    Raise `OSError` if the copy cannot be written.
     """
     with LogFile(source) as file:
         before = [record.get(THINNED_OF, "") for record in provenance_records(file)]

@@ -85,11 +85,6 @@ Whole = WholeChunk | LargeChunk | WholeAttachment | LargeAttachment | UnknownRec
 def split_content(content: bytes) -> tuple[Int64, Int64]:
     """Find where the messages and the definitions of a chunk begin.
 
-    Parameters
-    ----------
-    content : bytes
-        Records of the chunk, uncompressed.
-
     Returns
     -------
     messages : np.ndarray [shape=(m,)], int64
@@ -123,9 +118,6 @@ def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChu
 
     Parameters
     ----------
-    chunk : WholeChunk
-    content : bytes
-        Its records, uncompressed.
     messages : np.ndarray [shape=(m,)], int64
         As `split_content` returns it.
     """
@@ -147,9 +139,6 @@ def with_definitions(chunk: WholeChunk, content: bytes, starts: Int64) -> tuple[
 
     Parameters
     ----------
-    chunk : WholeChunk
-    content : bytes
-        Its records, uncompressed.
     starts : np.ndarray [shape=(d,)], int64
         Bytes of the content at which its definitions begin, with their opcodes.
     """
@@ -172,17 +161,8 @@ def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], l
 
     Parameters
     ----------
-    content : bytes
-        Records of the chunk, uncompressed.
     starts : np.ndarray [shape=(d,)], int64
         Bytes of the content at which they begin, with their opcodes.
-
-    Returns
-    -------
-    definitions : list of mcap.records.Schema and mcap.records.Channel
-        In the order of `starts`.
-    escaped : list of str
-        Names of those with texts that are not UTF-8.
 
     Raises
     ------
@@ -232,18 +212,7 @@ def span_of(entries: Mapping[int, bytes | bytearray]) -> tuple[int, int]:
 
 
 def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
-    """Read the messages of a chunk one by one.
-
-    Parameters
-    ----------
-    chunk : StoredChunk
-        A chunk whose content is proved.
-
-    Yields
-    ------
-    mcap.records.Message
-        In the order of the chunk.
-    """
+    """Read the messages of a chunk one by one."""
     content = chunk.content()
     for opcode, start, end in iterate_records(content):
         if opcode == Opcode.MESSAGE:
@@ -251,13 +220,7 @@ def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
 
 
 def read_message(raw: bytes) -> records.Message:
-    """Read a message from its record.
-
-    Parameters
-    ----------
-    raw : bytes
-        The whole record, with opcode and length.
-    """
+    """Read a message from its record."""
     _, _, channel, sequence, log_time, publish_time = MESSAGE.unpack_from(raw)
     return records.Message(channel, log_time, raw[MESSAGE.size :], publish_time, sequence)
 
@@ -278,15 +241,7 @@ class AttachmentHead(NamedTuple):
 def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
     """Read an attachment from its record; return whether a text in it is not UTF-8, too.
 
-    Parameters
-    ----------
-    raw : bytes
-        The whole record, with opcode and length; the lengths inside of it add up to that.
-
-    Raises
-    ------
-    McapError
-        If its checksum is wrong.
+    Raise `McapError` if its checksum is wrong.
     """
     record = memoryview(raw)
     (crc,) = UINT32.unpack(record[-UINT32.size :])
@@ -301,15 +256,7 @@ def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
 def attachment_head(raw: bytes) -> AttachmentHead:
     """Read what stands before the data of an attachment.
 
-    Parameters
-    ----------
-    raw : bytes
-        The record up to the data of the attachment, or more of it.
-
-    Raises
-    ------
-    McapError
-        If the record ends before that.
+    Raise `McapError` if the record ends before that.
     """
     record = memoryview(raw)
     try:
@@ -331,15 +278,7 @@ def attachment_head(raw: bytes) -> AttachmentHead:
 def encode_attachment(
     index: records.AttachmentIndex, data: Iterable[bytes | memoryview]
 ) -> Iterator[bytes | memoryview]:
-    """Encode an attachment of any size, in pieces.
-
-    Parameters
-    ----------
-    index : mcap.records.AttachmentIndex
-        Its times, names and size.
-    data : iterable of bytes-like
-        Pieces of its data.
-    """
+    """Encode an attachment of any size, in pieces."""
     name, media = index.name.encode(), index.media_type.encode()
     start = ATTACHMENT.pack(index.log_time, index.create_time, len(name)) + name
     start += UINT32.pack(len(media)) + media + UINT64.pack(index.data_size)

@@ -20,32 +20,12 @@ Result = TypeVar("Result")
 
 
 def is_local(path: object) -> bool:
-    """Tell whether a path is one of this machine.
-
-    Parameters
-    ----------
-    path : Path or upath.UPath
-        A `upath.UPath` is a path of a store.
-    """
+    """Tell whether a path is one of this machine."""
     return isinstance(path, Path)
 
 
 def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterable[Result]:
-    """Apply a function to logs, in their order.
-
-    Parameters
-    ----------
-    function : callable
-        Called with the path of each log; in several threads at once if a log is in a store.
-    logs : sequence of Path
-        Logs of this machine or of a store.
-
-    Returns
-    -------
-    iterable
-        Results in the order of the logs, made while they are consumed. An error of the function
-        comes out in the place of its result.
-    """
+    """Apply a function to logs, in their order."""
     if all(map(is_local, logs)):
         return map(function, logs)
     return prefetch(function, logs, _ASKED)
@@ -55,15 +35,8 @@ def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterab
 def store_errors(path: object) -> Iterator[None]:
     """Turn errors of a store into LogError while its file or folder is used.
 
-    Parameters
-    ----------
-    path : object
-        File or folder that the message names.
-
-    Raises
-    ------
-    LogError
-        If the block raises any error but HearthlogError and ImportError, which pass unchanged.
+    Raise `LogError` if the block raises any error but HearthlogError and ImportError, which
+    pass unchanged.
     """
     try:
         yield
@@ -84,10 +57,7 @@ def _line(error: Exception) -> str:
 class LocalFile:
     """A file of this machine, open for reading.
 
-    Raises
-    ------
-    LogError
-        If it cannot be opened, or is no regular file.
+    Raise `LogError` if it cannot be opened, or is no regular file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -122,11 +92,6 @@ class LocalFile:
             Byte of the file.
         length : int
             Bytes to read.
-
-        Returns
-        -------
-        bytes
-            Fewer than `length` at the end of the file.
 
         Raises
         ------
@@ -170,10 +135,7 @@ class LocalFile:
 class StoredFile:
     """A file of a store, as it is when this is made; may be read from several threads.
 
-    Raises
-    ------
-    LogError
-        If the store does not answer, refuses, or has no file of this name.
+    Raise `LogError` if the store does not answer, refuses, or has no file of this name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -202,11 +164,6 @@ class StoredFile:
             Byte of the file.
         length : int
             Bytes to read.
-
-        Returns
-        -------
-        bytes
-            Fewer than `length` at the end of the file.
 
         Raises
         ------
@@ -273,15 +230,7 @@ def _identity(path: Any) -> dict[str, Any]:
 def open_file(path: Path) -> LocalFile | StoredFile:
     """Open a file for reading by ranges.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-
-    Raises
-    ------
-    LogError
-        If the file cannot be opened.
+    Raise `LogError` if the file cannot be opened.
     """
     return LocalFile(path) if is_local(path) else StoredFile(path)
 
@@ -291,8 +240,6 @@ class Section(io.RawIOBase):
 
     Parameters
     ----------
-    file : LocalFile or StoredFile
-        Stays open when the stream is closed.
     start : int
         Byte of the file at which the stream begins.
     """

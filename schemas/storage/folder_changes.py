@@ -15,11 +15,6 @@ class FolderChanges:
 
     Where the file system does not tell, as one of the network, or on a system without inotify,
     `wait` lasts as long as it is asked to.
-
-    Attributes
-    ----------
-    tells : bool
-        Whether the system can tell.
     """
 
     def __init__(self) -> None:
@@ -57,7 +52,6 @@ class FolderChanges:
 
         Parameters
         ----------
-        seconds : float
         stop : threading.Event
             Ends the waiting when it is set, at the latest after `seconds`.
         """

@@ -51,17 +51,7 @@ def readers_of(path: Path) -> int:
 def private_folder(path: Path, *, readers: int = 0) -> None:
     """Make a folder, and those around it, for this account alone; those that are there stay.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine.
-    readers : int, optional
-        Rights of others to read what is in it, as of `readers_of`.
-
-    Raises
-    ------
-    OSError
-        If it cannot be made.
+    Raise `OSError` if it cannot be made.
     """
     make_folders(path, 0o700 | readers | readers >> 2)
 
@@ -69,17 +59,7 @@ def private_folder(path: Path, *, readers: int = 0) -> None:
 def make_folders(path: Path, mode: int | None = None) -> None:
     """Make a folder, and those around it; those that are there stay.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine.
-    mode : int, optional
-        The rights of what is made; by default those that the umask leaves.
-
-    Raises
-    ------
-    OSError
-        If it cannot be made.
+    Raise `OSError` if it cannot be made.
     """
     if path.is_dir():
         return
@@ -91,18 +71,8 @@ def make_folders(path: Path, mode: int | None = None) -> None:
 def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
     """Create a file of this machine for writing, never one that a link leads to.
 
-    Parameters
-    ----------
-    path : Path
-    mode : int, optional
-        Its rights, of which the umask takes some away.
-
-    Raises
-    ------
-    FileExistsError
-        If something of this name exists, even a link that leads nowhere.
-    OSError
-        If it cannot be created.
+    Raise `FileExistsError` if something of this name exists, even a link that leads nowhere.
+    Raise `OSError` if it cannot be created.
     """
     descriptor, folder = _open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     _set_owner(descriptor, folder)
@@ -112,20 +82,7 @@ def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
 def open_lock(path: Path) -> int:
     """Open a file to lock it, for reading and writing; make it if it is not there.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine.
-
-    Returns
-    -------
-    int
-        The file's descriptor, for the caller to lock and to close.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened, is a link or no regular file.
+    Raise `OSError` if it cannot be opened, is a link or no regular file.
     """
     descriptor, folder = _open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600)
     opened = os.fstat(descriptor)
@@ -145,8 +102,6 @@ def hand_over(path: Path, mode: int | None = None) -> None:
     ----------
     path : Path
         A file or a folder of this machine; a link is not followed.
-    mode : int, optional
-        Its rights; by default they stay.
 
     Raises
     ------
@@ -216,16 +171,9 @@ def check_new(path: Path) -> None:
 
     Whether a store lets us write is known only when we do.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-
-    Raises
-    ------
-    LogError
-        If something of this name exists; on this machine, also if the folder around it does not
-        exist or cannot be written to; in a store, also if it does not answer or refuses.
+    Raise `LogError` if something of this name exists; on this machine, also if the folder
+    around it does not exist or cannot be written to; in a store, also if it does not answer or
+    refuses.
     """
     if not is_local(path):
         stored: Any = path
@@ -255,22 +203,7 @@ def new_file(path: Path, *, readers: int = 0) -> Iterator[Path]:
     every store: between a last look and the end of putting, another file of this name may be
     replaced, and a store that has real folders may keep a part of a file when it is cut off.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-    readers : int, optional
-        Rights of others to read it, as of `readers_of`.
-
-    Yields
-    ------
-    Path
-        Temporary name, of this machine, to write the file to.
-
-    Raises
-    ------
-    LogError
-        If there is such a file already, or if it cannot be written.
+    Raise `LogError` if there is such a file already, or if it cannot be written.
     """
     check_new(path)
     put = (
@@ -284,22 +217,7 @@ def new_file(path: Path, *, readers: int = 0) -> Iterator[Path]:
 def replaced_file(path: Path, *, readers: int | None = None) -> Iterator[Path]:
     """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-    readers : int, optional
-        Rights of others to read it, as of `readers_of`; by default those of the one that is there.
-
-    Yields
-    ------
-    Path
-        Temporary name, of this machine, to write the file to.
-
-    Raises
-    ------
-    LogError
-        If it cannot be written.
+    Raise `LogError` if it cannot be written.
     """
     rights = readers_of(path) if readers is None else readers
     put = (
@@ -313,20 +231,7 @@ def replaced_file(path: Path, *, readers: int | None = None) -> Iterator[Path]:
 def new_folder(path: Path) -> Iterator[Path]:
     """Make a folder under a temporary name, and give it its own if the block raises no error.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine.
-
-    Yields
-    ------
-    Path
-        The temporary folder, for files but no folders.
-
-    Raises
-    ------
-    LogError
-        If something of this name exists, or the folder cannot be written.
+    Raise `LogError` if something of this name exists, or the folder cannot be written.
     """
     check_new(path)
     with _temporary(path) as temporary:

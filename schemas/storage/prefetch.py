@@ -19,16 +19,8 @@ def prefetch(
     function : callable
         Called with one item. Should spend its time where the interpreter is not needed: reading,
         decompressing, numpy.
-    items : iterable
-        Is consumed in the caller's thread.
     workers : int
         Threads, 1 or more; one item more than these is worked on, or waits for the consumer.
-
-    Yields
-    ------
-    object
-        Results in the order of the items. An error of the function comes out in the place of its
-        result.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()

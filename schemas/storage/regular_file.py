@@ -11,19 +11,7 @@ from pathlib import Path
 def open_regular(path: Path) -> int:
     """Open a regular file of this machine for reading.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    int
-        The file's descriptor, for the caller to close.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened, or is no regular file.
+    Raise `OSError` if it cannot be opened, or is no regular file.
     """
     mode = os.stat(path).st_mode  # noqa: PTH116  goes with what follows
     if stat.S_ISDIR(mode):
@@ -34,13 +22,7 @@ def open_regular(path: Path) -> int:
 
 
 def exposed_secret(path: Path) -> str:
-    """Return the line that says that everybody may read a file of secrets; empty if that is not so.
-
-    Parameters
-    ----------
-    path : Path
-        If it cannot be looked at, nothing is said.
-    """
+    """Return a warning if everybody may read a file of secrets; empty otherwise."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -53,10 +35,6 @@ def exposed_secret(path: Path) -> str:
 
 def may_be_regular(path: Path) -> bool:
     """Tell whether a path is that of a regular file, or of one whose kind cannot be found out.
-
-    Parameters
-    ----------
-    path : Path
 
     Returns
     -------

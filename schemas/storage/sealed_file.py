@@ -15,14 +15,7 @@ _ALIGNMENT = 8  # bytes, of the arrays of a safetensors file
 
 
 def write_sealed(arrays: Mapping[str, NDArray[Any]], key: str, text: str) -> bytes:
-    """Return the safetensors file of arrays, with a text and a digest of both.
-
-    Parameters
-    ----------
-    arrays : mapping of str to numpy.ndarray
-    key, text : str
-        A value of its metadata.
-    """
+    """Return the safetensors file of arrays, with a text and a digest of both."""
     data = save(dict(arrays), {key: text})
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
@@ -36,17 +29,8 @@ def write_sealed(arrays: Mapping[str, NDArray[Any]], key: str, text: str) -> byt
 def read_sealed(path: Path, data: bytes, key: str) -> tuple[dict[str, NDArray[Any]], str, str]:
     """Read the bytes of a file; one of before there were digests has none to differ from.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for the message.
-    data : bytes
-    key : str
-        Of the text.
-
     Returns
     -------
-    arrays : dict of str to numpy.ndarray
     text : str
         Empty if there is none.
     damage : str

@@ -46,14 +46,8 @@ def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -
 
     Parameters
     ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-    what : str
-        What it should be, for the message: `scenario file`.
     limit : int
         Bytes, at most.
-    error : type of HearthlogError
-        Type of the error that is raised.
 
     Raises
     ------
@@ -81,20 +75,6 @@ def _opened(path: Path) -> IO[bytes]:
 
 def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:
     """Read a TOML file of at most 1 MB.
-
-    Parameters
-    ----------
-    path : Path
-        On this machine, or a `upath.UPath` of a store.
-    what : str
-        What it should be, for the message: `scenario file`.
-    error : type of HearthlogError
-        Type of the error that is raised.
-
-    Returns
-    -------
-    dict of str to object
-        The content, tables as dictionaries.
 
     Raises
     ------

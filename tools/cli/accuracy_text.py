@@ -21,12 +21,7 @@ _EVER = 1 << 61
 
 
 class Accuracy:
-    """What reviews of a home say of the recorder's labels.
-
-    Parameters
-    ----------
-    logs : HomeLogs
-    """
+    """What reviews of a home say of the recorder's labels."""
 
     def __init__(self, logs: HomeLogs) -> None:
         self.losses: list[str] = []

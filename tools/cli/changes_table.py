@@ -11,14 +11,7 @@ _SHOWN = 8  # changes
 
 
 def print_changes(changes: "Changes", before: str, after: str) -> None:
-    """Print the longest changes, and the minutes of each class.
-
-    Parameters
-    ----------
-    changes : Changes
-    before, after : str
-        Names of the models that labelled.
-    """
+    """Print the longest changes, and the minutes of each class."""
     from hearthlog.analyzer.gate.changes import time_words
 
     for change in changes.pairs()[:_SHOWN]:

@@ -227,10 +227,7 @@ def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
 def check_output(option: str, path: Path | None, suffix: str, what: str) -> None:
     """End with the exit status of wrong use unless a new file may have this name.
 
-    Raises
-    ------
-    LogError
-        If the file exists.
+    Raise `LogError` if the file exists.
     """
     from hearthlog.schemas.storage.new_files import check_new
 

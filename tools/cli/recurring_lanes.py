@@ -12,18 +12,7 @@ if TYPE_CHECKING:
 def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
     """Add the sounds of the groups in a file to a timeline.
 
-    Parameters
-    ----------
-    timeline : Timeline
-        Of these logs; it is changed.
-    logs : list of Path
-        Logs, or folders of logs.
-    file : Path
-
-    Raises
-    ------
-    DataError
-        If there is no such file.
+    Raise `DataError` if there is no such file.
     """
     from hearthlog.analyzer.discover.group_spans import group_spans
     from hearthlog.analyzer.discover.groups_file import load_groups
@@ -46,18 +35,7 @@ def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
 def add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
     """Add the turns of the voices in a file to a timeline.
 
-    Parameters
-    ----------
-    timeline : Timeline
-        Of these logs; it is changed.
-    logs : list of Path
-        Logs, or folders of logs.
-    file : Path
-
-    Raises
-    ------
-    DataError
-        If there is no such file.
+    Raise `DataError` if there is no such file.
     """
     from hearthlog.analyzer.discover.home_voices import find_voices
     from hearthlog.analyzer.discover.read_speech import read_speech

@@ -159,13 +159,7 @@ class ReviewCommand(TyperCommand):
     """The command, whose option --queue may be without a value."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Parse arguments, with the ranking named where none is.
-
-        Parameters
-        ----------
-        ctx : typer.Context
-        args : list of str
-        """
+        """Parse arguments, with the ranking named where none is."""
         from hearthlog.analyzer.review.queue.ranking import USEFUL
 
         if _QUEUE in args:

@@ -19,8 +19,6 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     ----------
     head : sequence of str
         Empty for a table without heads.
-    rows : iterable of sequence of str
-        Without rows, nothing is printed.
     words : int
         Number of columns, from the left, that are words. The others are figures: aligned to the
         right, and wrapped only after the words.

@@ -18,16 +18,7 @@ _WHOLE_DAY = 0.95 * 24 * 60  # minutes
 
 
 def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
-    """Print what would change, how to hear that, and on what it is seen.
-
-    Parameters
-    ----------
-    verdict : Verdict
-    home : sequence of Path
-        Logs that it is by.
-    model : str
-        As `hearthlog review --queue` takes it.
-    """
+    """Print what would change, how to hear that, and on what it is seen."""
     evidence = verdict.evidence
     if evidence is None:
         return

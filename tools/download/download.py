@@ -66,14 +66,10 @@ def download(
 
     Parameters
     ----------
-    url : str
-        https, or http of this machine.
     path : Path
         Where it is put, readable by all; what is there is replaced.
     size : int
         Of the file, in bytes; no more is read.
-    sha256 : str
-    progress : Progress, optional
 
     Raises
     ------
@@ -101,15 +97,7 @@ def download(
 def put(data: bytes, path: Path) -> None:
     """Write a file that all may read, whole or not at all; what is there is replaced.
 
-    Parameters
-    ----------
-    data : bytes
-    path : Path
-
-    Raises
-    ------
-    DownloadError
-        If it cannot be written.
+    Raise `DownloadError` if it cannot be written.
     """
     sha256 = hashlib.sha256(data).hexdigest()
     with _writing(path), _part(path, sha256) as part:
@@ -302,13 +290,7 @@ class _Redirects(HTTPRedirectHandler):
     """Follows an address to others that are as safe."""
 
     def redirect_request(self, *arguments: Any) -> Request | None:
-        """Make the request for another address.
-
-        Parameters
-        ----------
-        *arguments
-            As of `HTTPRedirectHandler`; the last one is the new address.
-        """
+        """Make the request for another address."""
         request, answer, address = arguments[0], arguments[1], arguments[-1]
         try:
             _check_address(address, of_here=request.type == "http")

@@ -51,13 +51,7 @@ _SUSTAINED = {MUSIC, SHOWER, TAP_WATER, PHONE_RING}  # may go on for longer than
 
 
 class Cast:
-    """Who sounds how: which clips are whose.
-
-    Parameters
-    ----------
-    library : ClipLibrary
-    rng : np.random.Generator
-    """
+    """Who sounds how: which clips are whose."""
 
     def __init__(self, library: ClipLibrary, rng: np.random.Generator) -> None:
         self._library = library
@@ -71,10 +65,6 @@ class Cast:
     def of(self, origin: str, label: str) -> Sequence[Clip]:
         """Return the clips of a label that may sound from an origin.
 
-        Parameters
-        ----------
-        origin, label : str
-
         Returns
         -------
         sequence of Clip
@@ -84,15 +74,7 @@ class Cast:
 
 
 class Voices:
-    """One course of sounds of which none overlaps another.
-
-    Parameters
-    ----------
-    cast : Cast
-    rng : np.random.Generator
-    end : int
-        The frame at which no sound goes on.
-    """
+    """One course of sounds of which none overlaps another."""
 
     def __init__(self, cast: Cast, rng: np.random.Generator, end: int) -> None:
         self.now = 0
@@ -102,22 +84,11 @@ class Voices:
         self._end = end
 
     def wait(self, seconds: Range) -> None:
-        """Let a random time pass.
-
-        Parameters
-        ----------
-        seconds : (float, float)
-            Its limits.
-        """
+        """Let a random time pass."""
         self.now += round(self._rng.uniform(*seconds) / FRAME_SECONDS)
 
     def wait_until(self, frame: int) -> None:
-        """Let time pass, if it is not that late already.
-
-        Parameters
-        ----------
-        frame : int
-        """
+        """Let time pass, if it is not that late already."""
         self.now = max(self.now, frame)
 
     def sound(
@@ -128,17 +99,7 @@ class Voices:
         seconds: float | None = None,
         origin: str = RESIDENT,
     ) -> None:
-        """Add a clip, or as many as last for some seconds.
-
-        Parameters
-        ----------
-        label : str
-            Nothing is added where there are no clips of it.
-        room, activity : str
-        seconds : float, optional
-        origin : str, optional
-            Whose sound it is.
-        """
+        """Add a clip, or as many as last for some seconds."""
         clips = self._cast.of(origin, label)
         if not clips:
             return

@@ -61,19 +61,10 @@ class Clip:
 
     Attributes
     ----------
-    name : str
-        Path of the recording and, of a part of it, where that begins; another name if made up.
-    label : str
-    source_group : str
-        The original recording or speaker.
     path : Path or None
         None for a made-up sound.
-    frames : int
-        Its length, in whole frames.
     start : float
         Where it begins in the recording, in seconds.
-    seed : int
-        Of a made-up sound.
     """
 
     name: str
@@ -92,11 +83,6 @@ class ClipLibrary:
     ----------
     manifest : Path or None
         As of `hearthlog train`, with any labels; None for made-up sounds alone.
-
-    Attributes
-    ----------
-    made_up : list of str
-        Labels that there are no recordings of.
 
     Raises
     ------
@@ -118,10 +104,6 @@ class ClipLibrary:
     def of(self, label: str) -> Sequence[Clip]:
         """Return the clips of a label.
 
-        Parameters
-        ----------
-        label : str
-
         Returns
         -------
         sequence of Clip
@@ -134,14 +116,8 @@ class ClipLibrary:
 
         Parameters
         ----------
-        label : str
         count : int
             Groups, at most.
-        rng : np.random.Generator
-
-        Returns
-        -------
-        sequence of Clip
         """
         groups = sorted({clip.source_group for clip in self.of(label)})
         chosen = {groups[place] for place in rng.permutation(len(groups))[:count]}
@@ -152,8 +128,6 @@ class ClipLibrary:
 
         Parameters
         ----------
-        clip : Clip
-            Of this library.
         frames : int
             At least 1.
 
@@ -190,20 +164,7 @@ class ArrayCache:
         self._arrays: OrderedDict[object, Float32] = OrderedDict()
 
     def __call__(self, key: object, make: Callable[[], Float32]) -> Float32:
-        """Return the array of a key.
-
-        Parameters
-        ----------
-        key : object
-            Hashable.
-        make : callable
-            Makes it if it is not kept.
-
-        Returns
-        -------
-        np.ndarray
-            Not to be written to.
-        """
+        """Return the array of a key."""
         if key in self._arrays:
             self._arrays.move_to_end(key)
             return self._arrays[key]

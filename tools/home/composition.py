@@ -25,7 +25,6 @@ class HeardSound(NamedTuple):
 
     Attributes
     ----------
-    plan : PlannedSound
     power : np.ndarray [shape=(n,)], float64
         Mean square in each frame from its start on, pauses filled up.
     """
@@ -35,15 +34,7 @@ class HeardSound(NamedTuple):
 
 
 class Composition:
-    """What a microphone hears of a plan.
-
-    Parameters
-    ----------
-    plan : Plan
-    library : ClipLibrary
-        That the plan was made of.
-    rooms : Rooms
-    """
+    """What a microphone hears of a plan."""
 
     def __init__(self, plan: Plan, library: ClipLibrary, rooms: Rooms) -> None:
         self.plan = plan
@@ -62,11 +53,6 @@ class Composition:
     def samples(self, first: int, count: int) -> Int16:
         """Compose frames.
 
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many; inside of the plan.
-
         Returns
         -------
         np.ndarray [shape=(count, FRAME_SAMPLES)], int16
@@ -80,37 +66,17 @@ class Composition:
         return _quantised(mix)
 
     def features(self, features: FeatureSet) -> "FeatureStream":
-        """Begin a stream of the features of the composed sound.
-
-        Parameters
-        ----------
-        features : FeatureSet
-        """
+        """Begin a stream of the features of the composed sound."""
         return FeatureStream(self, features)
 
     def heard(self, first: int, count: int) -> Iterator[HeardSound]:
-        """Yield the sounds that begin in some frames, as loud as they are heard.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
-
-        Yields
-        ------
-        HeardSound
-        """
+        """Yield the sounds that begin in some frames, as loud as they are heard."""
         places = np.searchsorted(self._starts, (first, first + count))
         for sound in self.plan.sounds[places[0] : places[1]]:
             yield HeardSound(sound, np.float64(self._gain(sound) ** 2) * self._loudness(sound)[0])
 
     def floor_power(self, first: int, count: int) -> Float64:
         """Return the mean square of what is steady.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
 
         Returns
         -------
@@ -123,11 +89,6 @@ class Composition:
 
     def busy(self, first: int, count: int) -> Bool:
         """Tell which frames hold more than noise that repeats itself.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many.
 
         Returns
         -------
@@ -146,11 +107,6 @@ class Composition:
 
     def steady(self, state: tuple[str, ...]) -> Int16:
         """Compose a period of steady noise alone.
-
-        Parameters
-        ----------
-        state : tuple of str
-            The noises that are on, as of `state`.
 
         Returns
         -------
@@ -225,7 +181,6 @@ class FeatureStream:
 
     Parameters
     ----------
-    composition : Composition
     features : FeatureSet
         The features of a frame must depend on it and the frame before alone.
     """
@@ -238,11 +193,6 @@ class FeatureStream:
 
     def __call__(self, first: int, count: int) -> Float32:
         """Return the features of frames: the same bits as those of their samples.
-
-        Parameters
-        ----------
-        first, count : int
-            Number of the first frame, and how many; inside of the plan.
 
         Returns
         -------

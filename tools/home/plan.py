@@ -22,18 +22,8 @@ class PlannedSound:
 
     Attributes
     ----------
-    start, frames : int
-        First frame, and how many.
-    clip : Clip
-        Cut or repeated to that length.
-    origin : str
-        Whose it is: `resident`, `visitor`, `television`, `radio`, `phone` or `outside`.
-    room : str
-        Where it sounds.
     level : float
         In dBFS, for a microphone in the same room.
-    activity : str
-        What it is part of.
     """
 
     start: int
@@ -56,8 +46,6 @@ class SteadyNoise:
 
     Attributes
     ----------
-    name : str
-        `fridge`, `street` or `fan`.
     start, end : int
         First frame, and the frame after the last one; it comes and goes within a second each,
         inside of them.
@@ -70,17 +58,7 @@ class SteadyNoise:
 
 @dataclass(frozen=True)
 class Plan:
-    """What sounds in a home.
-
-    Attributes
-    ----------
-    frames : int
-        Length.
-    sounds : sequence of PlannedSound
-        By their start.
-    steady : sequence of SteadyNoise
-        By their start; those of one name do not overlap.
-    """
+    """What sounds in a home."""
 
     frames: int
     sounds: Sequence[PlannedSound]

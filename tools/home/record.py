@@ -41,21 +41,11 @@ def record_composition(
 
     Parameters
     ----------
-    composition : Composition
     settings : Settings
         Its model labels the sound, by embeddings of its network if it takes any; clips are not
         kept.
     start : int
         Time of the first sample, in nanoseconds of UTC.
-    device : str
-        Name of the source of sound in the logs.
-    progress : callable
-        Told the share that is done.
-
-    Returns
-    -------
-    list of Path
-        The logs.
 
     Raises
     ------
@@ -88,14 +78,7 @@ def record_composition(
 def embedder_of(model: Model | None) -> Embedder | None:
     """Load the network of the embeddings that a model takes, if it takes any.
 
-    Parameters
-    ----------
-    model : Model or None
-
-    Raises
-    ------
-    ModelError
-        If it is not there, or cannot be used.
+    Raise `ModelError` if it is not there, or cannot be used.
     """
     space = None if model is None else model.description.embedding_space
     return None if space is None else load_embedder(space.network, network_path(space.network))
@@ -110,22 +93,8 @@ def write_sound(
 ) -> None:
     """Write some of a composition as a FLAC file, 16 kHz mono.
 
-    Parameters
-    ----------
-    composition : Composition
-    path : Path
-        Must not exist.
-    first, frames : int
-        Number of the first frame, and how many.
-    progress : callable
-        Told the share that is done.
-
-    Raises
-    ------
-    OSError
-        If the file exists or cannot be written.
-    LibsndfileError
-        If it cannot be encoded.
+    Raise `OSError` if the file exists or cannot be written. Raise `LibsndfileError` if it
+    cannot be encoded.
     """
     with (
         path.open("xb") as file,

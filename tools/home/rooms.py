@@ -44,17 +44,7 @@ _LOWEST_HERTZ = 20.0
 
 
 def attenuation(room: str, microphone: str) -> float:
-    """Return by how many dB a sound of a room is weaker where the microphone is.
-
-    Parameters
-    ----------
-    room, microphone : str
-        Two rooms, or the same one; the first may be outside.
-
-    Returns
-    -------
-    float
-    """
+    """Return by how many dB a sound of a room is weaker where the microphone is."""
     if room == microphone:
         return 0.0
     return _WALLS.get(frozenset({room, microphone}), _WINDOW)
@@ -63,19 +53,10 @@ def attenuation(room: str, microphone: str) -> float:
 class Rooms:
     """What a microphone hears of a home.
 
-    Parameters
-    ----------
-    microphone : str
-        The room that it stands in.
-    seed : int
-        The home: its floors, colours and walls.
-
     Attributes
     ----------
     floor : np.ndarray [shape=(PERIOD_FRAMES, FRAME_SAMPLES)], float32
         Noise of the room, which repeats itself.
-    steady : mapping of str to np.ndarray
-        The same of noises that come and go, by name.
 
     Raises
     ------
@@ -102,7 +83,6 @@ class Rooms:
         Parameters
         ----------
         sound : np.ndarray [shape=(n * FRAME_SAMPLES,)], float32
-        room : str
 
         Returns
         -------

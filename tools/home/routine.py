@@ -79,8 +79,6 @@ def plan_days(days: int, library: ClipLibrary, habits: Habits) -> Plan:
     ----------
     days : int
         From 1 to 3660. Fewer days give the beginning of more.
-    library : ClipLibrary
-    habits : Habits
 
     Raises
     ------

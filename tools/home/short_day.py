@@ -104,7 +104,6 @@ def plan_short_day(minutes: float, library: ClipLibrary, seed: int) -> Plan:
     ----------
     minutes : float
         At least a frame, at most 1440.
-    library : ClipLibrary
     seed : int
         Not negative.
 

@@ -112,13 +112,7 @@ def write_day(path: Path, minutes: float, seed: int, manifest: Path | None = SHI
 
 @contextmanager
 def reported(path: Path) -> Iterator[None]:
-    """Turn errors of the file system and of the encoder into one line.
-
-    Parameters
-    ----------
-    path : Path
-        What cannot be written then.
-    """
+    """Turn errors of the file system and of the encoder into one line."""
     try:
         yield
     except OSError as error:

@@ -39,13 +39,7 @@ class SimulationError(HearthlogError):
 
 
 class RoomTone:
-    """Background noise of one room, -65 to -60 dBFS, as one endless stream.
-
-    Parameters
-    ----------
-    rng : np.random.Generator
-        Chooses level and colour, and is drawn from with every call.
-    """
+    """Background noise of one room, -65 to -60 dBFS, as one endless stream."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -56,11 +50,6 @@ class RoomTone:
 
     def __call__(self, samples: int) -> Float64:
         """Return the next samples.
-
-        Parameters
-        ----------
-        samples : int
-            Their number.
 
         Returns
         -------
@@ -77,8 +66,6 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
 
     Parameters
     ----------
-    label : str
-        One of `LABELS`.
     seconds : float
         More than 0, at most 300.
     seed : int
@@ -124,12 +111,8 @@ def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
 
     Parameters
     ----------
-    label : str
-        One of `LABELS`.
     samples : int
         At least 1, at 16 kHz.
-    rng : np.random.Generator
-        Drawn from.
 
     Returns
     -------

@@ -28,11 +28,8 @@ class Event(NamedTuple):
 
     Attributes
     ----------
-    plan : PlannedSound
     level : float
         Of its loudest frame as it is heard, in dBFS.
-    heard_frames : int
-        In which it is the loudest sound, and audible.
     """
 
     plan: PlannedSound
@@ -48,8 +45,6 @@ class Truth(NamedTuple):
     spans : list of LabelledSpan
         Without gaps: a frame has the label of the loudest sound that is audible in it, which is
         that as loud as all steady noise; silence where there is none.
-    events : list of Event
-        Every sound, by its start.
     """
 
     spans: list[LabelledSpan]
@@ -57,12 +52,7 @@ class Truth(NamedTuple):
 
 
 def truth_of(composition: Composition) -> Truth:
-    """Tell the truth of a composition, without composing its sound.
-
-    Parameters
-    ----------
-    composition : Composition
-    """
+    """Tell the truth of a composition, without composing its sound."""
     events: list[Event] = []
     runs: list[tuple[int, int, str]] = []
     held: list[tuple[int, HeardSound]] = []  # that go on from one day to the next
@@ -86,16 +76,7 @@ def truth_of(composition: Composition) -> Truth:
 def write_truth(truth: Truth, spans: Path, events: Path) -> None:
     """Write a label track for Audacity, and a table of the sounds.
 
-    Parameters
-    ----------
-    truth : Truth
-    spans, events : Path
-        Text and CSV, overwritten.
-
-    Raises
-    ------
-    OSError
-        If one cannot be written.
+    Raise `OSError` if one cannot be written.
     """
     with spans.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(f"{start:.6f}\t{end:.6f}\t{label}\n" for start, end, label in truth.spans)

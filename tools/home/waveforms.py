@@ -24,14 +24,10 @@ class Train:
 
     Parameters
     ----------
-    rng : np.random.Generator
-        Draws the rhythm.
     samples : int
         Samples of the sound, at 16 kHz.
     length, gap : (float, float)
         Shortest and longest element, and gap between two elements of a run, in seconds.
-    run : (int, int)
-        Least and most elements of a run.
     pause : (float, float)
         Shortest and longest pause between two runs, in seconds.
 
@@ -41,8 +37,6 @@ class Train:
         Samples at which the elements start.
     lengths : np.ndarray [shape=(count,)], float64
         Samples that they last.
-    count : int
-        Number of elements.
     """
 
     def __init__(  # noqa: PLR0913 - five ranges describe a rhythm
@@ -123,14 +117,8 @@ def voiced(  # noqa: PLR0913 - a voice is these
 
     Parameters
     ----------
-    rng : np.random.Generator
-        Draws breath, vowels and the size of the vocal tract.
-    train : Train
-        Syllables, each of which has one vowel.
     pitch : np.ndarray [shape=(samples,)], float64
         In hertz.
-    vowels : str
-        Of "aeiou", those that may come.
     tract : float
         Factor of the formants; 1 for a man.
     breath : float
@@ -210,8 +198,6 @@ def impulses(samples: int, at: Indices, gains: Float64) -> Float64:
 
     Parameters
     ----------
-    samples : int
-        Samples of the sound.
     at : np.ndarray [shape=(n,)], intp
         Samples of the impulses, below `samples`.
     gains : np.ndarray [shape=(n,)], float64
@@ -253,7 +239,6 @@ def band_noise(rng: np.random.Generator, samples: int, low: float, high: float) 
 
     Parameters
     ----------
-    rng : np.random.Generator
     samples : int
         Samples of the sound, at 16 kHz.
     low, high : float
@@ -272,13 +257,10 @@ def wander(rng: np.random.Generator, samples: int, rate: float, depth: float) ->
 
     Parameters
     ----------
-    rng : np.random.Generator
     samples : int
         Samples of the sound, at 16 kHz.
     rate : float
         New values a second, between which the factor glides.
-    depth : float
-        Standard deviation of the factor's natural logarithm.
 
     Returns
     -------

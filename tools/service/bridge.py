@@ -29,8 +29,6 @@ def install_bridge(config: Path, account: str | None) -> Installed:
 
     Parameters
     ----------
-    config : Path
-        The configuration of the recorder, with a table `bridge`.
     account : str or None
         The user that it is run by; by default one of its own, who may read logs that the group of
         the recorder may read, and write none.

@@ -34,19 +34,8 @@ _REHEARSAL_SECONDS = 120
 def install_for_system(account: str, config: Path | None) -> Installed:
     """Make the recorder a service of this machine, and start it, or start it anew.
 
-    Parameters
-    ----------
-    account : str
-        The user that it is run by.
-    config : Path or None
-        Its configuration.
-
-    Raises
-    ------
-    ConfigurationError
-        If the configuration is wrong.
-    ServiceError
-        If it cannot be for another reason. Nothing was written then, unless it did not start.
+    Raise `ConfigurationError` if the configuration is wrong. Raise `ServiceError` if it cannot
+    be for another reason. Nothing was written then, unless it did not start.
     """
     check_root()
     unit = place_of(SYSTEM_UNITS, NAME)
@@ -65,15 +54,7 @@ def install_for_system(account: str, config: Path | None) -> Installed:
 def install_for_user(config: Path | None) -> Installed:
     """Make the recorder a service of the user, in the current folder, and start it or again.
 
-    Parameters
-    ----------
-    config : Path or None
-        Its configuration.
-
-    Raises
-    ------
-    ConfigurationError, ServiceError
-        As `install_for_system`.
+    Raise `ConfigurationError, ServiceError` as `install_for_system`.
     """
     unit = place_of(user_units(), NAME)
     config = None if config is None else config.absolute()

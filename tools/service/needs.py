@@ -8,19 +8,7 @@ STATE = Path("/var/lib/hearthlog")  # what systemd calls the state directory of 
 
 @dataclass(frozen=True)
 class Needs:
-    """What a recorder needs by its configuration.
-
-    Attributes
-    ----------
-    output : str
-        The absolute folder of logs.
-    models : list of str
-        The absolute files that are configured.
-    has_network : bool
-        Whether a microphone is in the network.
-    readable_by : str
-        As in the configuration.
-    """
+    """What a recorder needs by its configuration."""
 
     output: str
     models: list[str]

@@ -20,18 +20,7 @@ _SOUND_GROUP = "audio"  # whose members may open sound cards
 def system_unit(command: Sequence[str], account: str, needs: Needs) -> str:
     """Return the unit of a service of the machine.
 
-    Parameters
-    ----------
-    command : sequence of str
-        That records.
-    account : str
-        The user that it is run by.
-    needs : Needs
-
-    Raises
-    ------
-    ServiceError
-        If a name cannot stand in a unit.
+    Raise `ServiceError` if a name cannot stand in a unit.
     """
     has_state = Path(needs.output).is_relative_to(STATE)
     isolated = f"PrivateNetwork=yes\n{_NO_NETWORK}\nIPAddressDeny=any"
@@ -50,18 +39,7 @@ def system_unit(command: Sequence[str], account: str, needs: Needs) -> str:
 def user_unit(command: Sequence[str], folder: Path, needs: Needs) -> str:
     """Return the unit of a service of a user.
 
-    Parameters
-    ----------
-    command : sequence of str
-        That records.
-    folder : Path
-        In which it is run.
-    needs : Needs
-
-    Raises
-    ------
-    ServiceError
-        If a name cannot stand in a unit.
+    Raise `ServiceError` if a name cannot stand in a unit.
     """
     return _filled(
         "user.service",
@@ -78,15 +56,8 @@ def bridge_unit(
 
     Parameters
     ----------
-    command : sequence of str
-        That follows the log.
     account : str or None
         The user that it is run by; None for one that systemd makes for it.
-    recorder : str
-        The user of the recorder, whose group may read the logs.
-    logs : Path
-    written : sequence of Path
-        Other folders that it writes to.
 
     Raises
     ------

@@ -19,15 +19,7 @@ _SYSTEMD = Path("/run/systemd/system")  # is there as long as it runs
 
 @dataclass(frozen=True)
 class Installed:
-    """A service that was installed.
-
-    Attributes
-    ----------
-    unit : Path
-        Its unit.
-    started : bool
-        Whether it runs, or will only when systemd does.
-    """
+    """A service that was installed."""
 
     unit: Path
     started: bool
@@ -53,17 +45,7 @@ def is_user_manager_running() -> bool:
 def place_of(folder: Path, name: str) -> Path:
     """Return where a unit is to be, if it may be there.
 
-    Parameters
-    ----------
-    folder : Path
-        Of units.
-    name : str
-        Of the unit.
-
-    Raises
-    ------
-    ServiceError
-        If there is another one, or no systemd.
+    Raise `ServiceError` if there is another one, or no systemd.
     """
     if shutil.which("systemctl") is None:
         raise ServiceError(
@@ -78,17 +60,7 @@ def place_of(folder: Path, name: str) -> Path:
 def check_seen(what: str, path: Path | None) -> None:
     """Check that a service of the machine sees a file.
 
-    Parameters
-    ----------
-    what : str
-        That it is, in words.
-    path : Path or None
-        Nothing is checked without one.
-
-    Raises
-    ------
-    ServiceError
-        If it is where the service sees nothing.
+    Raise `ServiceError` if it is where the service sees nothing.
     """
     if path is not None and any(path.is_relative_to(folder) for folder in _UNSEEN):
         raise ServiceError(
@@ -109,19 +81,7 @@ def write_unit(unit: Path, text: str) -> None:
 def start_unit(name: str, *options: str, is_running: bool) -> bool:
     """Enable a service, and start it anew if systemd runs; return whether it does.
 
-    Parameters
-    ----------
-    name : str
-        Of the unit.
-    *options : str
-        Of systemctl, such as `--user`.
-    is_running : bool
-        Whether systemd runs.
-
-    Raises
-    ------
-    ServiceError
-        If it does not start.
+    Raise `ServiceError` if it does not start.
     """
     if not is_running:
         _systemctl(*options, "enable", name, env={"SYSTEMD_OFFLINE": "1"})
@@ -153,10 +113,7 @@ def _systemctl(*arguments: str, env: dict[str, str] | None = None) -> None:
 def check_root() -> None:
     """Check that a service of the machine may be installed.
 
-    Raises
-    ------
-    ServiceError
-        If somebody else than root asks for it.
+    Raise `ServiceError` if somebody else than root asks for it.
     """
     if os.geteuid():
         raise ServiceError(
@@ -167,10 +124,7 @@ def check_root() -> None:
 def check_program_seen() -> None:
     """Check that a service of the machine sees hearthlog and its Python.
 
-    Raises
-    ------
-    ServiceError
-        If one of them is where the service sees nothing.
+    Raise `ServiceError` if one of them is where the service sees nothing.
     """
     check_seen("hearthlog", Path(hearthlog.recorder.__file__).resolve())
     check_seen("its Python", Path(sys.executable).absolute())
@@ -178,14 +132,7 @@ def check_program_seen() -> None:
 
 
 def verb_command(verb: str, config: Path | None) -> list[str]:
-    """Return the command of a verb.
-
-    Parameters
-    ----------
-    verb : str
-    config : Path or None
-        The configuration that it is given.
-    """
+    """Return the command of a verb."""
     program = Path(sys.executable).with_name("hearthlog")
     command = [str(program)] if program.exists() else module_command("hearthlog.tools.cli.main")
     return [*command, verb, *([] if config is None else ["--config", str(config)])]

@@ -17,7 +17,6 @@ def more_than_alarms(rule: MoreThan, heard: HomeHeard, until: int) -> list[Alarm
 
     Parameters
     ----------
-    rule : MoreThan
     heard : HomeHeard
         From the length of the window before the first time that matters.
     until : int
@@ -29,15 +28,7 @@ def more_than_alarms(rule: MoreThan, heard: HomeHeard, until: int) -> list[Alarm
 
 
 def more_than_text(rule: MoreThan, heard: HomeHeard, time: int) -> str:
-    """Say how much there was in the window that ends with a time.
-
-    Parameters
-    ----------
-    rule : MoreThan
-    heard : HomeHeard
-    time : int
-        In nanoseconds of UTC.
-    """
+    """Say how much there was in the window that ends with a time."""
     window = duration_words(rule.window)
     if rule.minutes is not None:
         return f"{rule.words}: more than {rule.minutes:g} min in the last {window}"

@@ -12,11 +12,8 @@ def wall_times(day: date, minute: int, zone: tzinfo) -> tuple[int, int]:
 
     Parameters
     ----------
-    day : date
     minute : int
         0 to 1439.
-    zone : tzinfo
-        Of the home.
 
     Returns
     -------
@@ -44,14 +41,7 @@ def _change_between(before: int, after: int, zone: tzinfo) -> int:
 
 
 def days_around(start: int, end: int, zone: tzinfo) -> list[date]:
-    """List the days of the home from the one before a time to the one of a later time.
-
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-    """
+    """List the days of the home from the one before a time to the one of a later time."""
     first = local_time(start, zone).date() - timedelta(days=1)
     last = local_time(end, zone).date()
     return [first + timedelta(days=number) for number in range((last - first).days + 1)]
@@ -59,14 +49,6 @@ def days_around(start: int, end: int, zone: tzinfo) -> list[date]:
 
 def end_of_quiet(hours: list[QuietHours], time: int, zone: tzinfo) -> int:
     """Return when quiet hours are over; the time itself outside of them.
-
-    Parameters
-    ----------
-    hours : list of QuietHours
-    time : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
 
     Returns
     -------

@@ -21,17 +21,7 @@ _MINUTE = 60 * NANOSECONDS
 def none_by_alarms(
     rule: NoneBy, heard: HomeHeard, start: int, end: int, zone: tzinfo
 ) -> list[Alarm]:
-    """Find the days on which nothing of a class was heard by a time, or too little to tell.
-
-    Parameters
-    ----------
-    rule : NoneBy
-    heard : HomeHeard
-    start, end : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
-    """
+    """Find the days on which nothing of a class was heard by a time, or too little to tell."""
     windows = [
         (first, last)
         for day in days_around(start, end, zone)
@@ -78,13 +68,8 @@ def unlike_alarms(
 
     Parameters
     ----------
-    rule : UnlikeUsual
     heard : HomeHeard
         From 31 days before the start on.
-    start, end : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
     """
     days = judged_days(rule, start, end, zone)
     if not days:
@@ -101,14 +86,6 @@ def unlike_alarms(
 
 def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tuple[date, int]]:
     """List the days on which a rule is to be evaluated in a span of time, and when.
-
-    Parameters
-    ----------
-    rule : UnlikeUsual or UnusualDay
-    start, end : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
 
     Returns
     -------

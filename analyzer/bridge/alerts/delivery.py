@@ -22,14 +22,6 @@ class Delivery:
 
     Parameters
     ----------
-    outbox : Outbox
-    targets : sequence of Target
-    node : str
-        Name of the recorder, for the titles.
-    zone : tzinfo
-        Of the home.
-    say : callable
-        Told why somebody cannot be told, in a line.
     first_pause, longest_pause : float, optional
         Seconds after the first failure, and at most; each pause is twice the one before.
     """
@@ -54,12 +46,7 @@ class Delivery:
         self.set_targets(targets)
 
     def set_targets(self, targets: Sequence[Target]) -> None:
-        """Tell these from now on; who was told before goes on as he was.
-
-        Parameters
-        ----------
-        targets : sequence of Target
-        """
+        """Tell these from now on; who was told before goes on as he was."""
         names = {target.name for target in targets}
         for name in self._threads.keys() - names:
             self._threads.pop(name)[1].set()
@@ -117,9 +104,6 @@ def message(ring: Ring, zone: tzinfo, now: int | None = None) -> str:
 
     Parameters
     ----------
-    ring : Ring
-    zone : tzinfo
-        Of the home.
     now : int, optional
         In nanoseconds of UTC; by default it is now.
     """

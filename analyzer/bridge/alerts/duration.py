@@ -14,15 +14,7 @@ _FORM = re.compile(r"(?:(\d{1,3})d)?(?:(\d{1,4})h)?(?:(\d{1,5})m)?(?:(\d{1,6})s)
 def read_duration(text: object) -> int:
     """Read a duration, in nanoseconds.
 
-    Parameters
-    ----------
-    text : object
-        A text such as `20m`.
-
-    Raises
-    ------
-    ValueError
-        If it is written otherwise.
+    Raise `ValueError` if it is written otherwise.
     """
     found = _FORM.fullmatch(text) if isinstance(text, str) else None
     if found is None or not any(found.groups()):

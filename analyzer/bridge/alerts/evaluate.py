@@ -45,22 +45,10 @@ def rings(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    rule : AlertRule
-    heard : HomeHeard
-        What was heard, from `history(rule)` before the start on.
     start, end : int
         In nanoseconds of UTC: from the start on, before the end.
-    zone : tzinfo
-        Of the home.
     state : RuleState, optional
         What an evaluation up to the start has returned; by default there was none.
-
-    Returns
-    -------
-    list of Ring
-        In the order of time; of successive spans together, as of all at once.
-    RuleState
-        For the evaluation from the end on.
     """
     found: list[Ring] = []
     last, has_rung = state.last, False

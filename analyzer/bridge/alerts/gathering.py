@@ -77,13 +77,7 @@ class _GrowingSpans:
 
 
 class Gathered:
-    """What was heard, as far as segments say.
-
-    Attributes
-    ----------
-    classes : dict of str to set of str
-        By listener, those that its model knows.
-    """
+    """What was heard, as far as segments say."""
 
     def __init__(self) -> None:
         self.classes: dict[str, set[str]] = {}
@@ -93,14 +87,7 @@ class Gathered:
         self._written = _GrowingSpans()
 
     def add_segments(self, listener: str, columns: Columns) -> None:
-        """Add segments, with the fields `SEGMENT_FIELDS`.
-
-        Parameters
-        ----------
-        listener : str
-        columns : Columns
-            Of one topic, in the order of the log.
-        """
+        """Add segments, with the fields `SEGMENT_FIELDS`."""
         rows = zip(*(columns[name].tolist() for name in SEGMENT_FIELDS), strict=True)
         for start, duration, label, confidence in rows:
             if duration > 0:
@@ -109,16 +96,7 @@ class Gathered:
     def add_segment(
         self, listener: str, start: int, end: int, label: str, confidence: float
     ) -> None:
-        """Add a segment.
-
-        Parameters
-        ----------
-        listener : str
-        start, end : int
-            In nanoseconds of UTC.
-        label : str
-        confidence : float
-        """
+        """Add a segment."""
         covered = self._coverage.setdefault(listener, _GrowingSpans())
         covered.add(start, end, FRAME_NANOSECONDS)
         self._written.add(start, end, _PAUSE)  # a long one has a message at its end alone
@@ -140,7 +118,6 @@ class Gathered:
 
         Parameters
         ----------
-        listener : str
         names : iterable of str
             None: nothing is known of them.
         """
@@ -163,13 +140,7 @@ class Gathered:
             self.add_written_span(start, end)
 
     def add_written_span(self, start: int, end: int) -> None:
-        """Add a span of time in which the recorder wrote at least once a minute.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC.
-        """
+        """Add a span of time in which the recorder wrote at least once a minute."""
         self._written.add(start, end, _PAUSE)
 
     @property
@@ -178,13 +149,7 @@ class Gathered:
         return self._written.last_start
 
     def heard(self, others: Sequence[tuple[str, int, int, str, float]] = ()) -> HomeHeard:
-        """Return what was heard.
-
-        Parameters
-        ----------
-        others : sequence of (str, int, int, str, float)
-            Segments that go on, as `add_segment` takes them.
-        """
+        """Return what was heard."""
         sounds = {label: rows.sounds() for label, rows in self._rows.items()}
         of_scenarios = {label: rows.sounds() for label, rows in self._scenario_rows.items()}
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
@@ -211,8 +176,6 @@ class Gathered:
 
         Parameters
         ----------
-        time : int
-            In nanoseconds of UTC.
         pause : int
             Within an event, at most.
         """

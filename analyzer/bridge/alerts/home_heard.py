@@ -46,8 +46,6 @@ class Sounds:
 
         Parameters
         ----------
-        start, end : int
-            In nanoseconds of UTC.
         pause : int
             Within an event, at most.
         """
@@ -63,12 +61,7 @@ NO_SOUNDS = Sounds(NONE.starts, NONE.ends, np.empty(0, np.float32), np.empty(0, 
 
 
 def sounds_of(parts: Iterable[Sounds]) -> Sounds:
-    """Put segments together, in the order of time.
-
-    Parameters
-    ----------
-    parts : iterable of Sounds
-    """
+    """Put segments together, in the order of time."""
     parts = list(parts)
     if not parts:
         return NO_SOUNDS
@@ -88,12 +81,6 @@ class HomeHeard:
     ----------
     sounds : mapping of str to Sounds
         By class, of the models of the home; silence is none.
-    scenario_sounds : mapping of str to Sounds
-        By class, of the models of scenarios, which label the same sound.
-    coverage : mapping of str to Spans
-        By listener, when it heard.
-    classes : mapping of str to frozenset of str
-        By listener, the classes that its model knows; a microphone that is missing knows all.
     written : Spans
         When the recorder wrote; no more than a minute apart is one span.
     """
@@ -105,12 +92,7 @@ class HomeHeard:
     written: Spans
 
     def of(self, label: str) -> Sounds:
-        """Return the segments of a class, or of any sound.
-
-        Parameters
-        ----------
-        label : str
-        """
+        """Return the segments of a class, or of any sound."""
         return sounds_of(self.sounds.values()) if label == ANY_SOUND else self._of(label)
 
     def _of(self, label: str) -> Sounds:
@@ -123,8 +105,6 @@ class HomeHeard:
 
         Parameters
         ----------
-        label : str
-            The class, or any sound.
         microphone : str
             Empty: any of those whose models know the class.
         """
@@ -146,8 +126,6 @@ class HomeHeard:
 
         Parameters
         ----------
-        start, end : int
-            In nanoseconds of UTC.
         pause : int
             Within an event, at most.
         """

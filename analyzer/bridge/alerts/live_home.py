@@ -25,13 +25,7 @@ _CUT = 1_000_000_000  # ns of a run that no segment has, where a gap follows
 
 
 def is_of_alerts(topic: str) -> bool:
-    """Tell whether alerts need a topic.
-
-    Parameters
-    ----------
-    topic : str
-        Its name.
-    """
+    """Tell whether alerts need a topic."""
     if topic == DIAGNOSTICS:
         return True
     name = parse_topic(topic)
@@ -58,13 +52,7 @@ class LiveHome:
         self._runs: dict[str, OpenRun] = {}
 
     def push(self, columns: Sequence[Columns]) -> None:
-        """Add messages, with the fields of `FIELDS`.
-
-        Parameters
-        ----------
-        columns : sequence of Columns
-            Of one log, in the order in which it was written.
-        """
+        """Add messages, with the fields of `FIELDS`."""
         for part in (each for each in columns if len(each)):
             self._gathered.add_written(part.log_times)
             name = parse_topic(part.topic)
@@ -80,15 +68,7 @@ class LiveHome:
                     self._add_gap(listener, start, start + max(duration, 0))
 
     def add_label(self, listener: str, label: Label, classes: Sequence[str]) -> None:
-        """Add a label of a listener.
-
-        Parameters
-        ----------
-        listener : str
-        label : Label
-        classes : sequence of str
-            Those of its model.
-        """
+        """Add a label of a listener."""
         run = self._run(listener)
         if label.time > run.last:
             self._gathered.add_classes(listener, classes)
@@ -98,13 +78,7 @@ class LiveHome:
             run.begin(max(self._start, self._gathered.recorder_began or 0))
 
     def known_until(self, now: int) -> int:
-        """Return up to when everything is known that can have been heard.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-        """
+        """Return up to when everything is known that can have been heard."""
         until = now
         for listener, open_run in self._runs.items():
             run = open_run.run()

@@ -10,13 +10,7 @@ from hearthlog.analyzer.bridge.alerts.sound_events import events_of_rule
 
 
 def longer_than_alarms(rule: LongerThan, heard: HomeHeard) -> list[Alarm]:
-    """Find when a class had gone on for too long, until its pause is longer than one may be.
-
-    Parameters
-    ----------
-    rule : LongerThan
-    heard : HomeHeard
-    """
+    """Find when a class had gone on for too long, until its pause is longer than one may be."""
     events = events_of_rule(rule, heard)
     limits = events.starts + rule.longer_than
     rows = np.flatnonzero(limits < events.ends)
@@ -32,8 +26,6 @@ def longer_than_start(rule: LongerThan, heard: HomeHeard, time: int) -> int:
 
     Parameters
     ----------
-    rule : LongerThan
-    heard : HomeHeard
     time : int
         In nanoseconds of UTC, at which one does.
     """
@@ -46,7 +38,6 @@ def longer_than_text(rule: LongerThan, since: str) -> str:
 
     Parameters
     ----------
-    rule : LongerThan
     since : str
         Time of day.
     """
@@ -60,8 +51,6 @@ def silent_alarms(
 
     Parameters
     ----------
-    rule : RecorderSilent
-    heard : HomeHeard
     start, end : int
         In nanoseconds of UTC; where nothing was written in as long before the start, nothing was
         from ever on.
@@ -80,10 +69,5 @@ def silent_alarms(
 
 
 def silent_text(rule: RecorderSilent) -> str:
-    """Say that the recorder is silent.
-
-    Parameters
-    ----------
-    rule : RecorderSilent
-    """
+    """Say that the recorder is silent."""
     return f"Nothing from the recorder for {duration_words(rule.silent_for)}"

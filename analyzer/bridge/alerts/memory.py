@@ -23,7 +23,6 @@ class Progress:
     ----------
     until : int
         Log time, in nanoseconds of UTC; 0 for one that is new.
-    state : RuleState
     """
 
     until: int = 0
@@ -31,27 +30,14 @@ class Progress:
 
 
 class Memory:
-    """Remembers how far each rule is evaluated; one that was changed begins anew.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    say : callable
-        Told what is wrong, in a line.
-    """
+    """Remembers how far each rule is evaluated; one that was changed begins anew."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self._path = path
         self._say = say
 
     def load(self, rules: Sequence[AlertRule]) -> dict[str, Progress]:
-        """Return how far rules are evaluated, by name.
-
-        Parameters
-        ----------
-        rules : sequence of AlertRule
-        """
+        """Return how far rules are evaluated, by name."""
         known = {}
         try:
             if self._path.exists():
@@ -62,14 +48,7 @@ class Memory:
         return {rule.name: known.get(rule.fingerprint, Progress()) for rule in rules}
 
     def save(self, rules: Sequence[AlertRule], progress: dict[str, Progress]) -> None:
-        """Keep how far rules are evaluated; it is on the disk on return.
-
-        Parameters
-        ----------
-        rules : sequence of AlertRule
-        progress : dict of str to Progress
-            By name of the rule.
-        """
+        """Keep how far rules are evaluated; it is on the disk on return."""
         content = {
             rule.fingerprint: {"until": own.until, **own.state._asdict()}
             for rule in rules
@@ -83,19 +62,7 @@ class Memory:
 
 
 class KnownLines:
-    """Remembers the lines of the file of addresses, by the names of their targets.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file in which they are kept.
-    say : callable
-        Told what is wrong, in a line.
-
-    Attributes
-    ----------
-    names : list of str
-    """
+    """Remembers the lines of the file of addresses, by the names of their targets."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self._path = path

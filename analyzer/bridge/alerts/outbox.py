@@ -24,14 +24,7 @@ _DAMAGED = (ValueError, TypeError, KeyError, RecursionError, HearthlogError)
 
 @dataclass
 class Waiting:
-    """A ring, and who was told of it.
-
-    Attributes
-    ----------
-    ring : Ring
-    told : set of str
-        Names of targets.
-    """
+    """A ring, and who was told of it."""
 
     ring: Ring
     told: set[str] = field(default_factory=set)
@@ -42,12 +35,6 @@ class Outbox:
 
     Parameters
     ----------
-    folder : Path
-        A file for each ring; it is made where it is missing.
-    targets : sequence of str
-        Names of those who are to be told.
-    say : callable
-        Told what is wrong, in a line.
     most : int, optional
         Rings, at most: beyond them the oldest are dropped.
 
@@ -81,21 +68,13 @@ class Outbox:
         ----------
         targets : iterable of str
             With `UNREAD` rings wait for a day, and are there for a target that comes.
-        now : int
-            In nanoseconds of UTC.
         """
         with self._lock:
             self._targets = frozenset(targets)
             self._remove_done(now)
 
     def replace_targets(self, former: Mapping[str, str]) -> None:
-        """Take targets for those whose place they have now: they know what those were told.
-
-        Parameters
-        ----------
-        former : mapping of str to str
-            Name of the target before, by its name now.
-        """
+        """Take targets for those whose place they have now: they know what those were told."""
         with self._lock:
             for waiting in self._waiting.values():
                 told = {now for now, before in former.items() if before in waiting.told}
@@ -113,12 +92,7 @@ class Outbox:
         return not missing or (is_old and missing == {UNREAD})
 
     def put(self, rings: Iterable[Ring]) -> None:
-        """Keep rings, unless they are known; they are on the disk on return.
-
-        Parameters
-        ----------
-        rings : iterable of Ring
-        """
+        """Keep rings, unless they are known; they are on the disk on return."""
         with self._lock:
             self._remove_done(time.time_ns())
             for ring in rings:
@@ -128,26 +102,13 @@ class Outbox:
             self._drop_oldest()
 
     def waiting_for(self, target: str, now: int) -> list[Ring]:
-        """Return the rings of which a target is to be told now, the oldest first.
-
-        Parameters
-        ----------
-        target : str
-        now : int
-            In nanoseconds of UTC.
-        """
+        """Return the rings of which a target is to be told now, the oldest first."""
         with self._lock:
             rings = [each.ring for each in self._waiting.values() if target not in each.told]
         return sorted((ring for ring in rings if ring.due <= now), key=lambda ring: ring.time)
 
     def note_told(self, target: str, ring: Ring) -> None:
-        """Note that a target was told of a ring, which is removed when all of them were.
-
-        Parameters
-        ----------
-        target : str
-        ring : Ring
-        """
+        """Note that a target was told of a ring, which is removed when all of them were."""
         with self._lock:
             waiting = self._waiting.get(ring.id)
             if waiting is None:
@@ -159,13 +120,7 @@ class Outbox:
                 self._write(waiting)
 
     def forget_after(self, time: int) -> None:
-        """Forget the rings of a time to come, which rang while the clock was ahead.
-
-        Parameters
-        ----------
-        time : int
-            In nanoseconds of UTC.
-        """
+        """Forget the rings of a time to come, which rang while the clock was ahead."""
         with self._lock:
             for name in [n for n, each in self._waiting.items() if each.ring.time > time]:
                 self._remove(name)

@@ -52,13 +52,6 @@ class AlertsOutput:
 
     Parameters
     ----------
-    rules : sequence of AlertRule
-    delivery : DeliverySettings
-    home : Home
-    state_folder : Path
-        Of what the bridge remembers.
-    say : callable
-        Told what is wrong, in a line.
     on_ring : callable, optional
         Told the name of the rule, the text and the time (nanoseconds of UTC) of each ring, in the
         thread of `update`; told the same at each update, and nothing else, until it returns that

@@ -35,13 +35,8 @@ def read_heard(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    logs : HomeLogs
-    node : str
-        Name of the recorder.
     start, end : int
         In nanoseconds of UTC; of what ends later, the beginning is there, too.
-    lose : callable
-        Told what cannot be read, a log in a line.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
     others : sequence of (str, int, int, str, float), optional
@@ -88,12 +83,7 @@ def _add_classes(gathered: Gathered, listener: str, channels: Sequence[Described
 
 
 def nodes_of(logs: HomeLogs) -> list[str]:
-    """List the names of the recorders of some logs.
-
-    Parameters
-    ----------
-    logs : HomeLogs
-    """
+    """List the names of the recorders of some logs."""
     entries: Sequence[str] = [entry.node for entry in logs.entries if not entry.layer]
     return sorted(set(entries))
 
@@ -101,16 +91,7 @@ def nodes_of(logs: HomeLogs) -> list[str]:
 def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
     """Return when the logs of a recorder begin and end, in nanoseconds of UTC.
 
-    Parameters
-    ----------
-    logs : HomeLogs
-    node : str
-        Name of the recorder.
-
-    Raises
-    ------
-    LogError
-        If none of them has a message that can be read.
+    Raise `LogError` if none of them has a message that can be read.
     """
     own = [entry.path for entry in logs.entries if entry.node == node and not entry.layer]
     first, last = _first_span(own), _first_span(reversed(own))

@@ -11,14 +11,8 @@ class Ring(NamedTuple):
 
     Attributes
     ----------
-    rule : str
-        Name of the rule.
     time : int
         When it rang, by the time of the log, in nanoseconds of UTC.
-    text : str
-        What was the case, in a sentence.
-    is_known : bool
-        False where too little was heard to tell.
     due : int
         From when on it is told: the time, or the end of quiet hours.
     """
@@ -42,8 +36,6 @@ class RuleState(NamedTuple):
     ----------
     last : int
         When it rang last, in nanoseconds of UTC.
-    has_rung : bool
-        Whether it has rung for what is the case where its evaluation ended.
     since : int
         From when on it is in force, in nanoseconds of UTC: of the time before nobody knows whether
         there was a recorder.
@@ -63,7 +55,6 @@ class Alarm(NamedTuple):
         In nanoseconds of UTC; the end is not part of it.
     text : str
         In words; empty where they depend on when it rings.
-    is_known : bool
     """
 
     start: int

@@ -25,9 +25,6 @@ def rule_doubts(
 
     Parameters
     ----------
-    rules : sequence of AlertRule
-    settings : Settings
-        Of the recorder.
     microphones : sequence of str
         The names of those that are configured; without any nothing is known of them.
     """
@@ -37,12 +34,7 @@ def rule_doubts(
 
 
 def impossible_amount(rule: AlertRule) -> str:
-    """Say that a window cannot hold what a rule asks for; empty if it can.
-
-    Parameters
-    ----------
-    rule : AlertRule
-    """
+    """Say that a window cannot hold what a rule asks for; empty if it can."""
     if not isinstance(rule, MoreThan):
         return ""
     if rule.minutes is not None and rule.minutes * MINUTE >= rule.window:
@@ -59,14 +51,7 @@ def impossible_amount(rule: AlertRule) -> str:
 
 
 def unkept_days(rule: AlertRule, settings: Settings) -> str:
-    """Say that logs are deleted before there are enough days to compare with; empty if not.
-
-    Parameters
-    ----------
-    rule : AlertRule
-    settings : Settings
-        Of the recorder.
-    """
+    """Say that logs are deleted before there are enough days to compare with; empty if not."""
     if isinstance(rule, UnlikeUsual):
         fewest = FEWEST_USUAL
     elif isinstance(rule, UnusualDay):

@@ -235,10 +235,6 @@ def pause_of(rule: SoundRule) -> int:
 def history(rule: AlertRule) -> int:
     """Return how long before a time the sound has to be known that a rule judges it by.
 
-    Parameters
-    ----------
-    rule : AlertRule
-
     Returns
     -------
     int
@@ -254,14 +250,7 @@ def history(rule: AlertRule) -> int:
 
 
 def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> str:
-    """Say that no model knows the class of a rule; empty if one does, or if nothing is known.
-
-    Parameters
-    ----------
-    rule : AlertRule
-    classes : mapping of str to collection of str
-        By listener, those that its model knows.
-    """
+    """Say that no model knows the class of a rule; empty if one does, or if nothing is known."""
     if not isinstance(rule, _SoundRule) or rule.label == ANY_SOUND:
         return ""
     own = [
@@ -295,9 +284,6 @@ def unknown_microphone(
 
     Parameters
     ----------
-    rule : AlertRule
-    microphones : collection of str
-        Those that there are; without any nothing is known.
     recorded : bool, optional
         Whether these are the ones that logs have something of, not those that are configured.
     """
@@ -313,14 +299,7 @@ def unknown_microphone(
 
 
 def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
-    """Say that nothing labels what the microphone of a rule hears; empty if something does.
-
-    Parameters
-    ----------
-    rule : AlertRule
-    microphones : collection of str
-        Those without a model.
-    """
+    """Say that nothing labels what the microphone of a rule hears; empty if something does."""
     if not isinstance(rule, _SoundRule) or rule.microphone not in microphones:
         return ""
     return (
@@ -331,10 +310,6 @@ def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
 
 def live_history(rule: AlertRule) -> int:
     """Return how long before a time a rule needs what is followed, and not read from the logs.
-
-    Parameters
-    ----------
-    rule : AlertRule
 
     Returns
     -------

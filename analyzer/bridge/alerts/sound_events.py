@@ -20,8 +20,6 @@ class SoundEvents(NamedTuple):
         In nanoseconds of UTC.
     counted : np.ndarray [shape=(n,)], int64
         When each had lasted as long as it must: from then on it counts.
-    heard : Spans
-        When one of them was heard, without the pauses.
     """
 
     starts: Int64
@@ -45,11 +43,6 @@ class SoundEvents(NamedTuple):
 
 def events_of_rule(rule: SoundRule, heard: HomeHeard) -> SoundEvents:
     """Find the events that a rule counts.
-
-    Parameters
-    ----------
-    rule : SoundRule
-    heard : HomeHeard
 
     Returns
     -------

@@ -44,17 +44,7 @@ class Target(Protocol):
 
 
 class AppriseTarget:
-    """An address of Apprise.
-
-    Parameters
-    ----------
-    plugin : apprise.NotifyBase
-        The address, as Apprise has read it.
-    address : str
-        A secret.
-    line : int
-        Number of its line in the file.
-    """
+    """An address of Apprise."""
 
     def __init__(self, plugin: Any, address: str, line: int) -> None:
         self._plugin = plugin
@@ -62,12 +52,7 @@ class AppriseTarget:
         self.place = f"line {line}, {_scheme_and_host(plugin, address)}"
 
     def deliver(self, title: str, text: str) -> str:
-        """Tell, within the seconds that the address allows; return why it could not be told.
-
-        Parameters
-        ----------
-        title, text : str
-        """
+        """Tell, within the seconds that the address allows; return why it could not be told."""
         import apprise  # noqa: PLC0415  takes half a second, and few need it
 
         with apprise.LogCapture(level=logging.WARNING, fmt=_FORM) as said:
@@ -103,13 +88,10 @@ class Addresses(NamedTuple):
 
     Attributes
     ----------
-    targets : list of AppriseTarget
     problems : list of str
         Why somebody who was meant cannot be told, a line each, without any address.
     names : list of str
         What names the target of each line, whether it can be read or not.
-    lacks_package : bool
-        Whether nothing could be read, for a package is missing.
     """
 
     targets: list[AppriseTarget]
@@ -121,17 +103,8 @@ class Addresses(NamedTuple):
 def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
     """Read a file of addresses, one a line; `#` begins a line that is none.
 
-    Parameters
-    ----------
-    file : Path
-        As `secret_path` finds it.
-    say : callable
-        Told in a line that others may read the file.
-
-    Raises
-    ------
-    BridgeError
-        If the file cannot be read, a line is no address that Apprise knows, or none is there.
+    Raise `BridgeError` if the file cannot be read, a line is no address that Apprise knows, or
+    none is there.
     """
     found = find_targets(file, say)
     if found.problems:
@@ -140,15 +113,7 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
 
 
 def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
-    """Read a file of addresses as `read_targets` does, as far as it can be read.
-
-    Parameters
-    ----------
-    file : Path
-        As `secret_path` finds it.
-    say : callable
-        Told in a line that others may read the file.
-    """
+    """Read a file of addresses as `read_targets` does, as far as it can be read."""
     file = secret_path(file)
     try:
         importlib.invalidate_caches()  # it may have been installed since the last time
@@ -186,13 +151,7 @@ def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
 
 
 def replaced_names(before: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Return which lines of a file of addresses were edited: the name of each now, and before.
-
-    Parameters
-    ----------
-    before, names : sequence of str
-        `Addresses.names`.
-    """
+    """Return which lines of a file of addresses were edited: the name of each now, and before."""
     matcher = SequenceMatcher(None, before, names, autojunk=False)
     edited = [
         pair

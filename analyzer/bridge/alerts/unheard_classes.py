@@ -17,16 +17,7 @@ from hearthlog.recorder.embedder_probe import likely_network
 def unheard_classes(
     rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
 ) -> Iterator[str]:
-    """Say which rules have a class that no model knows, or a microphone without a model.
-
-    Parameters
-    ----------
-    rules : sequence of AlertRule
-    settings : Settings
-        Of the recorder, with its model.
-    microphones : sequence of str
-        As of `rule_doubts`.
-    """
+    """Say which rules have a class that no model knows, or a microphone without a model."""
     models = {
         each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
         for each in settings.microphone

@@ -25,13 +25,8 @@ def unusual_alarms(
 
     Parameters
     ----------
-    rule : UnusualDay
     heard : HomeHeard
         From 34 days before the start on.
-    start, end : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
     """
     mornings = judged_days(rule, start, end, zone)
     if not mornings:
@@ -49,12 +44,7 @@ def unusual_alarms(
 
 
 def home_sound(heard: HomeHeard) -> HomeSound:
-    """Return what routines are learned from.
-
-    Parameters
-    ----------
-    heard : HomeHeard
-    """
+    """Return what routines are learned from."""
     coverage = heard.listened(ANY_SOUND, "")
     parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
     parts += [_labelled(name, own.starts, own.ends) for name, own in heard.sounds.items()]

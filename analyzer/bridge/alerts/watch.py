@@ -22,18 +22,6 @@ AHEAD = 5 * SECOND  # that make a clock one that was set back
 class RuleWatch:
     """Evaluates rules, keeps what rings, and remembers how far it is.
 
-    Parameters
-    ----------
-    rules : sequence of AlertRule
-    zone : tzinfo
-        Of the home.
-    outbox : Outbox
-    memory : Memory
-    say : callable
-        Told what is wrong, in a line.
-    now : int
-        In nanoseconds of UTC.
-
     Attributes
     ----------
     start : int
@@ -60,13 +48,7 @@ class RuleWatch:
         self.start = self.needed_from(now)
 
     def set_right(self, now: int) -> None:
-        """Let rules begin anew that are evaluated up to a time to come, or up to long ago.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-        """
+        """Let rules begin anew that are evaluated up to a time to come, or up to long ago."""
         is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
         self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
         if is_ahead:
@@ -75,13 +57,7 @@ class RuleWatch:
             self.save(now)
 
     def needed_from(self, now: int) -> int:
-        """Return from when on what was heard has to be known, in nanoseconds of UTC.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-        """
+        """Return from when on what was heard has to be known, in nanoseconds of UTC."""
         return min(
             (self._progress[rule.name].until - live_history(rule) for rule in self._rules),
             default=now,
@@ -98,18 +74,8 @@ class RuleWatch:
 
         Parameters
         ----------
-        heard : callable
-            Returns what was heard, from `start` on.
-        weeks : callable
-            Returns the same of a span of weeks, from the logs.
         until : int
             In nanoseconds of UTC: up to then all is known.
-        now : int
-            In nanoseconds of UTC.
-
-        Returns
-        -------
-        list of Ring
         """
         self.set_right(now)
         found: list[Ring] = []
@@ -134,13 +100,7 @@ class RuleWatch:
         return found
 
     def save(self, now: int) -> None:
-        """Remember how far the rules are evaluated.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-        """
+        """Remember how far the rules are evaluated."""
         self._memory.save(self._rules, self._progress)
         self._saved = now
 

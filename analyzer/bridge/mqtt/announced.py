@@ -43,28 +43,7 @@ class _IsRenamed(Protocol):
 
 
 class Announced:
-    """The topics that a broker keeps of this bridge, classes it is not told of, events it knows.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the state of the bridge; two bridges of one recorder cannot share one.
-    node : str
-        Name of the recorder.
-    broker : str
-        Host and port.
-    is_renamed : callable
-        Given the name of another recorder, and as `is_first` whether nothing was remembered of
-        this one, returns whether it has this name now: what was remembered of it is taken over.
-    say : callable
-        Told what is wrong, in a line.
-
-    Attributes
-    ----------
-    topics : dict of str to Place
-    is_new : bool
-        Whether nothing was remembered.
-    """
+    """The topics that a broker keeps of this bridge, classes it is not told of, events it knows."""
 
     def __init__(
         self,

@@ -54,19 +54,7 @@ class _Command(BaseModel):
 
 
 class Commands:
-    """Carries commands out, one after the other, in a thread of its own.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the logs.
-    node : str
-        Name of the recorder.
-    switch : callable
-        Told a class, and whether the broker is to be told of it.
-    answered : callable
-        Told what became of each, in that thread.
-    """
+    """Carries commands out, one after the other, in a thread of its own."""
 
     def __init__(
         self,
@@ -84,15 +72,7 @@ class Commands:
         self._thread.start()
 
     def add(self, payload: bytes, find_event: FindEvent) -> None:
-        """Have a command carried out.
-
-        Parameters
-        ----------
-        payload : bytes
-            JSON, as docs/mqtt.md has it.
-        find_event : callable
-            Told an id; returns the event, if it is known.
-        """
+        """Have a command carried out."""
         try:
             self._waiting.put_nowait((payload[: _LONGEST + 1], find_event))
         except queue.Full:

@@ -44,23 +44,7 @@ class Connection:
     The broker never holds up who publishes: a value is remembered, the newest of each topic, and
     said when there is a connection; an event is dropped when it is a minute old.
 
-    Parameters
-    ----------
-    settings : MqttSettings
-    client_id : str
-    alive_topic : str
-        Where the broker says `offline` when the connection is lost, and this one `online`.
-    say : callable
-        Told what is wrong with the connection, in a line.
-    subscriptions : sequence of str
-        Filters of topics.
-    received : callable
-        Told each message that comes, in the thread of the connection.
-
-    Raises
-    ------
-    BridgeError
-        If a file of the settings cannot be used.
+    Raise `BridgeError` if a file of the settings cannot be used.
     """
 
     def __init__(  # noqa: PLR0913
@@ -315,10 +299,7 @@ def _port(settings: MqttSettings) -> int:
 def tls_context(settings: MqttSettings) -> ssl.SSLContext:
     """Load the certificates of a connection.
 
-    Raises
-    ------
-    BridgeError
-        If one of the files cannot be used.
+    Raise `BridgeError` if one of the files cannot be used.
     """
     names = "ca_file", "certificate_file", "key_file"
     ca, certificate, key = paths = [getattr(settings, name) for name in names]
@@ -347,10 +328,7 @@ def _no_password() -> str:
 def read_password(settings: MqttSettings) -> str | None:
     """Read the password of the user of a broker; None if none is configured.
 
-    Raises
-    ------
-    BridgeError
-        If its file cannot be used.
+    Raise `BridgeError` if its file cannot be used.
     """
     if settings.password_file is None:
         return None

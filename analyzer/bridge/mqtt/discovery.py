@@ -31,18 +31,8 @@ def discovery(
 
     Parameters
     ----------
-    topics : Topics
     microphone : str
         Its name, or `<microphone>-<scenario>`, whose device has no level and no health.
-    classes : sequence of str
-        Those of its model.
-    gone : sequence of str, optional
-        Classes that an earlier model had, whose entities are removed.
-
-    Returns
-    -------
-    dict
-        The payload of the topic `<prefix>/device/<id>/config`, for JSON.
     """
     own = device_id(topics.node, microphone)
     sounds = [name for name in classes if name != SILENCE]
@@ -70,21 +60,7 @@ def discovery(
 def command_discovery(
     topics: Topics, classes: Sequence[str], gone: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Describe the device of a recorder, by which Home Assistant commands the bridge.
-
-    Parameters
-    ----------
-    topics : Topics
-    classes : sequence of str
-        Those of the models of all microphones.
-    gone : sequence of str, optional
-        Classes that earlier models had, whose switches are removed.
-
-    Returns
-    -------
-    dict
-        As `discovery`, of the topic `<prefix>/device/<home id>/config`.
-    """
+    """Describe the device of a recorder, by which Home Assistant commands the bridge."""
     own = home_id(topics.node)
     command = {"command_topic": topics.of_home("command")}
     components: dict[str, dict[str, Any]] = {
@@ -126,14 +102,7 @@ def command_discovery(
 
 
 def described(topics: Topics, payload: bytes) -> list[Place]:
-    """Return the places of a device that a bridge of this recorder described; of others none.
-
-    Parameters
-    ----------
-    topics : Topics
-    payload : bytes
-        As `discovery` and `command_discovery` make it, or anything else.
-    """
+    """Return the places of a device that a bridge of this recorder described; of others none."""
     try:
         content = json.loads(payload)
         (own,) = content["device"]["identifiers"]

@@ -52,19 +52,7 @@ _RESTART_SECONDS = 2.0  # so near to each other, two logs were not written at on
 class MqttPublisher:
     """Says everything that a broker is to know of a recorder.
 
-    Parameters
-    ----------
-    settings : MqttSettings
-    home : Home
-    state_folder : Path
-        Of what the bridge remembers.
-    say : callable
-        Told what is wrong, in a line.
-
-    Raises
-    ------
-    BridgeError
-        If a file of the settings cannot be used.
+    Raise `BridgeError` if a file of the settings cannot be used.
     """
 
     def __init__(
@@ -174,10 +162,6 @@ class MqttPublisher:
 
         Parameters
         ----------
-        name : str
-            Of its rule.
-        text : str
-            What is the case.
         time : int
             Since when, in nanoseconds of UTC.
         """
@@ -367,13 +351,8 @@ def class_values(
 
     Parameters
     ----------
-    microphone : MicrophoneState
-    label : str
-        The class.
     news : News
         Of whose day and night events are counted.
-    known : Known
-        Of these.
     """
     yield "on", _ON[microphone.heard.is_heard(label)]
     counts = microphone.counts(label, news.today, known)
@@ -404,9 +383,6 @@ def _is_renamed(home: Home, former: str, *, is_first: bool) -> bool:
 
     Parameters
     ----------
-    home : Home
-    former : str
-        Name of the other recorder.
     is_first : bool
         Whether no bridge of this recorder ran before: it may have no log yet.
     """

@@ -20,15 +20,7 @@ class Place(NamedTuple):
 
 
 class Topics(NamedTuple):
-    """Names the topics of one recorder.
-
-    Attributes
-    ----------
-    base : str
-        `hearthlog`, unless it is configured.
-    node : str
-        Name of the recorder.
-    """
+    """Names the topics of one recorder."""
 
     base: str
     node: str
@@ -51,11 +43,9 @@ class Topics(NamedTuple):
 
         Parameters
         ----------
-        microphone : str
         label : str
             The class; what a topic may not have, or what is no ASCII, is written `%2B`, as in
             addresses.
-        kind : str
         """
         return f"{self.root}/{microphone}{_CLASS_PART}{_part(label)}/{kind}"
 
@@ -99,12 +89,6 @@ def _part(label: str) -> str:
 
 
 def identifier(text: str) -> str:
-    """Make a text part of an identifier, which no other text gives.
-
-    Parameters
-    ----------
-    text : str
-        Other characters than `a-z0-9_` become `_2b_`, and so does a `_` that could be read so.
-    """
+    """Make a text part of an identifier, which no other text gives."""
     escaped = r"[^a-z0-9_]|_(?=[0-9a-f]+[^a-z0-9])"
     return re.sub(escaped, lambda match: f"_{ord(match[0]):x}_", text)

@@ -27,12 +27,6 @@ class PageAdmission:
 
     Attributes
     ----------
-    bind : str
-        Address that is listened on.
-    port : int
-    token : str
-    key : bytes
-        Of the passes that browsers get for the token: with another key they are void.
     names : frozenset of str
         Names by which the page may be asked for, with or without a port.
     """
@@ -76,17 +70,6 @@ class PageAdmission:
         has_pass: bool = False,
     ) -> str:
         """Judge a request.
-
-        Parameters
-        ----------
-        target : str
-            Of the request.
-        fields : mapping of str to sequence of str
-            All values of `Host`, `Origin` and `Cookie`.
-        changes : bool
-            Whether the request changes something; it needs an origin then.
-        has_pass : bool, optional
-            Whether the target had a pass.
 
         Returns
         -------

@@ -45,8 +45,6 @@ class Board:
 
         Parameters
         ----------
-        known : mapping of str to int
-            Numbers of the parts that the reader has.
         seconds : float
             To wait, at most.
 

@@ -34,15 +34,7 @@ class Day(NamedTuple):
 
 
 def day_picture(microphones: Iterable[MicrophoneState], today: Today, zone: tzinfo) -> Any:
-    """Describe the picture of a day for JSON.
-
-    Parameters
-    ----------
-    microphones : iterable of MicrophoneState
-    today : Today
-    zone : tzinfo
-        Of the home.
-    """
+    """Describe the picture of a day for JSON."""
     date = local_time(today.midnight, zone).date()
     day = Day(*day_span(date, zone), zone)
     hours = range(day.start, day.end, _HOUR)
@@ -93,11 +85,6 @@ def _lane(microphone: MicrophoneState, label: str, day: Day, today: Today, known
 
 def bars(events: Iterable[Event], day: Day) -> str:
     """Return how much of each two minutes of a day events fill: a digit each, 9 for all of it.
-
-    Parameters
-    ----------
-    events : iterable of Event
-    day : Day
 
     Returns
     -------

@@ -26,7 +26,6 @@ def last_events(news: News, said_of: Callable[[Event], str]) -> LastEvents:
 
     Parameters
     ----------
-    news : News
     said_of : callable
         Returns what people said that an event was, in words; empty for nothing.
     """

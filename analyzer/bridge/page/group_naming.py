@@ -23,16 +23,6 @@ class GroupNaming:
     """Names groups of sounds, one at a time.
 
     All logs are read for that: too much for the bridge, which lives on a small box.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the logs, with the file of the groups.
-
-    Attributes
-    ----------
-    said : dict of str to str
-        What has become of what people said, in words, by the keys of groups.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,10 +37,6 @@ class GroupNaming:
 
         Parameters
         ----------
-        key : str
-            Of the group, which no group of another file has.
-        number : int
-            Of the group in its file.
         label : str
             The class that they are; empty to take the marks back.
 

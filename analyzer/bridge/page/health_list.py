@@ -24,13 +24,8 @@ def health_list(news: News, node: str, started: int, recurring: str = "") -> lis
 
     Parameters
     ----------
-    news : News
-    node : str
-        Name of the recorder.
     started : int
         When the bridge was started, in nanoseconds of UTC.
-    recurring : str, optional
-        Why the sounds that recur are not shown.
     """
     lines = [*_lines(news, node, started)]
     if recurring:

@@ -35,19 +35,7 @@ _EVERY_SECONDS = 1.0
 class HomePage:
     """Shows a home to browsers, and takes what people say that its sounds were.
 
-    Parameters
-    ----------
-    settings : PageSettings
-    home : Home
-    state : Path
-        Folder in which a token is kept that is made.
-    say : callable
-        Told the address of the page, and what is wrong, in a line.
-
-    Raises
-    ------
-    BridgeError
-        If the token cannot be read or made, or nothing can listen there.
+    Raise `BridgeError` if the token cannot be read or made, or nothing can listen there.
     """
 
     def __init__(

@@ -22,8 +22,6 @@ def page_token(file: Path | None, state: Path) -> str:
     file : Path or None
         That has it in one line, as `secret_path` finds it; by default one is made in the folder of
         the state, and kept.
-    state : Path
-        That folder.
 
     Raises
     ------
@@ -36,15 +34,7 @@ def page_token(file: Path | None, state: Path) -> str:
 def cookie_key(state: Path) -> bytes:
     """Return what the cookies of the page are made with; without its file there will be another.
 
-    Parameters
-    ----------
-    state : Path
-        Folder in which it is made once, and kept.
-
-    Raises
-    ------
-    BridgeError
-        If it cannot be read or made.
+    Raise `BridgeError` if it cannot be read or made.
     """
     return _kept(state / _COOKIES).encode()
 
@@ -57,10 +47,7 @@ def page_secrets(state: Path) -> list[Path]:
 def keep_address(address: str, state: Path) -> Path:
     """Write the whole address of the page into a file that only its owner may read.
 
-    Raises
-    ------
-    BridgeError
-        If it cannot be written.
+    Raise `BridgeError` if it cannot be written.
     """
     path = state / _ADDRESS
     _write(path, address)
@@ -70,10 +57,7 @@ def keep_address(address: str, state: Path) -> Path:
 def read_token(file: Path) -> str:
     """Read a file of a token, as `secret_path` finds it.
 
-    Raises
-    ------
-    BridgeError
-        If it cannot be used.
+    Raise `BridgeError` if it cannot be used.
     """
     file = secret_path(file)
     data = read_whole(file, "file of a token", 1 << 12, BridgeError)
@@ -88,10 +72,8 @@ def read_token(file: Path) -> str:
 def figures_token(port: int, file: Path | None) -> str:
     """Return the token of the port for Prometheus.
 
-    Raises
-    ------
-    BridgeError
-        If there is none: every account of the machine can reach a port of loopback.
+    Raise `BridgeError` if there is none: every account of the machine can reach a port of
+    loopback.
     """
     if file is None:
         raise BridgeError(

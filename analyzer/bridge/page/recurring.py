@@ -19,11 +19,6 @@ _NOTHING: dict[str, Any] = {"looked": "", "more": "", "groups": []}
 class Recurring:
     """The groups that `hearthlog discover` has found, if it has.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the logs.
-
     Attributes
     ----------
     problem : str
@@ -57,8 +52,6 @@ class Recurring:
 
         Parameters
         ----------
-        key : str
-            Of a group that is shown, as of `shown_groups`.
         text : str
             A class, by its name or in words; empty to take the name back.
 

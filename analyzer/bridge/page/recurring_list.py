@@ -23,17 +23,7 @@ class Moment(NamedTuple):
 
 
 def shown_groups(summary: HomeSummary) -> dict[str, GroupSummary]:
-    """Choose the groups that are shown, by keys that no group of another file has.
-
-    Parameters
-    ----------
-    summary : HomeSummary
-
-    Returns
-    -------
-    dict of str to GroupSummary
-        The largest: ten without a name, and fifty that have one.
-    """
+    """Choose the groups that are shown, by keys that no group of another file has."""
     unnamed = [each for each in summary.groups if not each.name][:_MOST_UNNAMED]
     named = [each for each in summary.groups if each.name][:_MOST_NAMED]
     return {f"{each.number} of {summary.id}": each for each in [*unnamed, *named]}
@@ -46,12 +36,8 @@ def recurring_list(
 
     Parameters
     ----------
-    summary : HomeSummary
     looked : int
         When the summary was written, in nanoseconds of UTC.
-    said : mapping of str to str
-        What has become of what people said, by the keys of groups.
-    moment : Moment
     """
     shown = shown_groups(summary)
     left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED

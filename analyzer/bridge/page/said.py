@@ -26,15 +26,7 @@ _BY_WORDS = {spelt(row.words): row.name for row in CLASSES}
 
 
 class Said:
-    """What people said of the events of a recorder.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the logs.
-    node : str
-        Name of the recorder.
-    """
+    """What people said of the events of a recorder."""
 
     def __init__(self, folder: Path, node: str) -> None:
         self._folder = folder
@@ -46,10 +38,7 @@ class Said:
     def read_back(self) -> None:
         """Read what the layers of the newest logs say.
 
-        Raises
-        ------
-        HearthlogError
-            If one of them is damaged.
+        Raise `HearthlogError` if one of them is damaged.
         """
         logs = [log for log in find_logs(self._folder) if self._is_of_node(log)]
         marked = [log for log in logs[-_MOST_LOGS:] if review_path(log).exists()]
@@ -70,16 +59,7 @@ class Said:
     def say(self, event: Event, text: str) -> str:
         """Mark what an event was, and return that in words.
 
-        Parameters
-        ----------
-        event : Event
-        text : str
-            A class, by its name or in words.
-
-        Raises
-        ------
-        BridgeError
-            If the text cannot be a class, or the event cannot be marked.
+        Raise `BridgeError` if the text cannot be a class, or the event cannot be marked.
         """
         label = class_of(text)
         with self._lock:
@@ -100,15 +80,7 @@ class Said:
 def class_of(text: str) -> str:
     """Return the name of the class that somebody means: `Water tap` is `tap_water`.
 
-    Parameters
-    ----------
-    text : str
-        A name of a class, its words, or a name for a class of one's own.
-
-    Raises
-    ------
-    BridgeError
-        If no class can have this name.
+    Raise `BridgeError` if no class can have this name.
     """
     spelling = spelt(text.strip()).strip("_")
     label = class_name(_BY_WORDS.get(spelling, spelling))

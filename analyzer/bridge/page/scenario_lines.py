@@ -11,17 +11,7 @@ from hearthlog.schemas.text import listed
 
 
 def scenario_lines(news: News) -> list[Any]:
-    """Describe each scenario of each microphone for JSON, in a line.
-
-    Parameters
-    ----------
-    news : News
-
-    Returns
-    -------
-    list of dict
-        Without those that label no more, and heard nothing today.
-    """
+    """Describe each scenario of each microphone for JSON, in a line."""
     state, midnight = news.state, news.today.midnight
     lines = []
     for name in sorted(state.scenarios):

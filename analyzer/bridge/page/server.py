@@ -57,12 +57,6 @@ class PageServer(HttpServer):
 
     Parameters
     ----------
-    admission : PageAdmission
-    board : Board
-        What the page shows.
-    actions : mapping of str to callable
-        Of `/mark` and `/group`: told the id of an event, or of a group of sounds, and what somebody
-        says that it was; returns what was marked, in words, and raises HearthlogError.
     frames : sequence of str, optional
         Pages, by their origins, that may show this one in a frame.
 

@@ -22,10 +22,6 @@ def when(time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
 
     Parameters
     ----------
-    time, now : int
-        In nanoseconds of UTC.
-    zone : tzinfo
-        Of the home.
     seconds : bool
         Whether the seconds are said, too.
     """

@@ -14,15 +14,7 @@ _READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and h
 class ByteSource:
     """The bytes of a file, as many as it had when it was opened.
 
-    Parameters
-    ----------
-    path : Path
-        Of a regular file on this machine.
-
-    Raises
-    ------
-    OSError
-        If it cannot be opened, or is no regular file.
+    Raise `OSError` if it cannot be opened, or is no regular file.
     """
 
     def __init__(self, path: Path) -> None:

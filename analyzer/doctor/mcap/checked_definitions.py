@@ -28,14 +28,8 @@ def parse_strictly(
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    opcode : int
-        Kind of the record.
     offset : int
         Byte of the file at which the record begins, or the chunk that it is in.
-    content : bytes
-        The record without opcode and length.
 
     Returns
     -------
@@ -60,13 +54,7 @@ def parse_strictly(
 
 
 def name_of(opcode: int) -> str:
-    """Name a kind of record, such as `Chunk index`.
-
-    Parameters
-    ----------
-    opcode : int
-        Any number; an unknown one is named as such.
-    """
+    """Name a kind of record, such as `Chunk index`."""
     try:
         return Opcode(opcode).name.capitalize().replace("_", " ")
     except ValueError:
@@ -78,8 +66,6 @@ class CheckedDefinitions(Definitions):
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
     ours : bool
         Whether hearthlog made this file: then breaches of its profile are errors, not warnings.
     """
@@ -97,17 +83,8 @@ class CheckedDefinitions(Definitions):
 
         Parameters
         ----------
-        opcode : int
-            Of a schema or a channel.
         offset : int
             Byte of the file at which the record begins, or the chunk that it is in.
-        content : bytes
-            The record without opcode and length.
-
-        Returns
-        -------
-        int or None
-            Number of the channel, if the record defines a new one.
         """
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):

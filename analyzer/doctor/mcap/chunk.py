@@ -29,19 +29,7 @@ from hearthlog.schemas.mcap.records import (
 
 
 class Chunk:
-    """A chunk, checked when the message indexes behind it are known.
-
-    Parameters
-    ----------
-    record : Record
-        The chunk.
-    findings : Findings
-        Is added to.
-    definitions : CheckedDefinitions
-        Of the file so far; those in the chunk are added.
-    budget : RecordBudget
-        Of the file.
-    """
+    """A chunk, checked when the message indexes behind it are known."""
 
     def __init__(
         self,
@@ -81,13 +69,7 @@ class Chunk:
         self.whole = True
 
     def add_index(self, record: Record) -> None:
-        """Add a message index that stands behind the chunk.
-
-        Parameters
-        ----------
-        record : Record
-            Of this kind.
-        """
+        """Add a message index that stands behind the chunk."""
         self._index_length += record.length
         try:
             channel, size = formats.MESSAGE_INDEX.unpack_from(record.content)
@@ -295,12 +277,6 @@ def check_channels(
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
-    definitions : CheckedDefinitions
-        Of the file, up to the end of these records.
-    content : ChunkContent
-        The messages.
     new : dict of int to int
         By number of a channel that these records define: where in their bytes they do.
     offset : int

@@ -47,14 +47,10 @@ class DataSection:
 
     Parameters
     ----------
-    findings : Findings
-        Is added to.
     names : collection of str
         Of metadata records and attachments, the first two of each are kept if they are not large.
     size : int
         Bytes of the file.
-    ours : bool
-        Whether hearthlog made this file.
     """
 
     def __init__(
@@ -88,11 +84,6 @@ class DataSection:
     def add(self, record: Record) -> Iterator[MessageBatch | None]:
         """Check the next record.
 
-        Parameters
-        ----------
-        record : Record
-            Behind those before it.
-
         Yields
         ------
         MessageBatch or None
@@ -116,18 +107,7 @@ class DataSection:
             yield from self._batches()
 
     def finish(self, *, cut: bool) -> Iterator[MessageBatch | None]:
-        """Check what is still open, and hand out the last messages.
-
-        Parameters
-        ----------
-        cut : bool
-            Whether something is missing behind the last record.
-
-        Yields
-        ------
-        MessageBatch or None
-            As of `add`.
-        """
+        """Check what is still open, and hand out the last messages."""
         self._end_run()
         yield from self._end_chunk(cut=cut)
         yield from self._batches()

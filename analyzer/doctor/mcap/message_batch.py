@@ -19,8 +19,6 @@ class ChunkContent(NamedTuple):
 
     Attributes
     ----------
-    records : bytes
-        Decompressed.
     starts : np.ndarray [shape=(n,)], int64
         Bytes in `records` at which its messages begin, ascending.
     heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
@@ -42,18 +40,7 @@ class MessageBatch(NamedTuple):
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
     ) -> Iterator[RawMessages]:
-        """Group the messages by channel, without those of channels that are not defined.
-
-        Parameters
-        ----------
-        channels, schemas : mapping of int to Channel, of int to Schema
-            By their numbers in the file.
-
-        Yields
-        ------
-        RawMessages
-            Those of one channel in the order of the file; channels by number.
-        """
+        """Group the messages by channel, without those of channels that are not defined."""
         for identity in np.flatnonzero(np.bincount(self.heads["channel"])).tolist():
             if identity in channels:
                 channel = channels[identity]

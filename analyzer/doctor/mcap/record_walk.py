@@ -31,12 +31,6 @@ class RecordWalk:
 
     Parameters
     ----------
-    source : ByteSource
-        Behind the magic.
-    findings : Findings
-        Is added to.
-    finished : bool
-        Whether the file has an end.
     offsets : sequence of int
         Bytes at which records begin, ascending, as the index of the file has them: here the walk
         goes on when it has lost its way.

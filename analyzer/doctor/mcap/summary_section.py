@@ -42,10 +42,6 @@ class SummarySection:
 
     Parameters
     ----------
-    data : DataSection
-        The whole data section before it.
-    findings : Findings
-        Is added to.
     whole : bool
         Whether all of that could be read: if not, what the index says is not compared with it.
     """
@@ -65,13 +61,7 @@ class SummarySection:
         self._crc = 0
 
     def add(self, record: Record) -> None:
-        """Check the next record behind the Data End.
-
-        Parameters
-        ----------
-        record : Record
-            Any but the footer.
-        """
+        """Check the next record behind the Data End."""
         opcode = record.opcode
         if opcode not in _ALLOWED:
             if opcode < _RESERVED:
@@ -87,13 +77,7 @@ class SummarySection:
         self._crc = zlib.crc32(record.content, self._crc)
 
     def finish(self, record: Record) -> None:
-        """Check the footer, and whether the summary is complete.
-
-        Parameters
-        ----------
-        record : Record
-            The footer.
-        """
+        """Check the footer, and whether the summary is complete."""
         footer = parse_strictly(self._findings, record.opcode, record.offset, record.content)
         if not isinstance(footer, Footer):
             return

@@ -59,16 +59,7 @@ class CatalogRow:
 
 
 class Catalog:
-    """The catalogue of a folder.
-
-    Parameters
-    ----------
-    folder : Path
-    table : pa.Table
-        Of `SCHEMA`.
-    unusable : sequence of str, optional
-        Parts of it that could not be read, and why.
-    """
+    """The catalogue of a folder."""
 
     def __init__(self, folder: Path, table: pa.Table, unusable: Sequence[str] = ()) -> None:
         self.folder = folder
@@ -94,24 +85,13 @@ class Catalog:
             Number of the first row, from 0.
         count : int, optional
             How many rows at most; by default all that follow.
-
-        Yields
-        ------
-        CatalogRow
-            In the order of the table.
         """
         for batch in self._plain.slice(first, count).to_batches(_BATCH):
             for values in batch.to_pylist():
                 yield CatalogRow(**values)
 
     def of_state(self, state: str) -> list[CatalogRow]:
-        """Return the rows of the files in one state.
-
-        Parameters
-        ----------
-        state : str
-            `FINISHED`, `UNFINISHED` or `DAMAGED`.
-        """
+        """Return the rows of the files in one state."""
         chosen = self._plain.filter(pc.equal(self._plain["state"], state))
         return [CatalogRow(**values) for values in chosen.to_pylist()]
 

@@ -63,7 +63,6 @@ def read_contents(path: Path, labelling: str) -> Contents:
 
     Parameters
     ----------
-    path : Path
     labelling : str
         `live`, `relabel` or `review`; only segments of this labelling, and of its scenarios, are
         counted.

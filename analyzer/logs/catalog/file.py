@@ -59,22 +59,12 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
     ----------
     rows : sequence of mapping of str to object
         Values by column of `SCHEMA`; times are int, in nanoseconds of UTC.
-
-    Returns
-    -------
-    pa.Table
-        Of `SCHEMA`.
     """
     return pa.Table.from_pylist(rows, SCHEMA)
 
 
 def without_times(table: pa.Table) -> pa.Table:
     """Replace timestamps by numbers, because Python has no times with nanoseconds.
-
-    Parameters
-    ----------
-    table : pa.Table
-        Of `SCHEMA`.
 
     Returns
     -------
@@ -88,15 +78,7 @@ def without_times(table: pa.Table) -> pa.Table:
 
 
 def write_table(table: pa.Table, stream: BinaryIO) -> None:
-    """Write the table of a catalogue as Parquet, with a digest.
-
-    Parameters
-    ----------
-    table : pa.Table
-        Of `SCHEMA`.
-    stream : binary file
-        Is written to, from where it is.
-    """
+    """Write the table of a catalogue as Parquet, with a digest."""
     buffer = pa.BufferOutputStream()
     pq.write_table(table, buffer, compression="none")
     stream.writelines(sealed(memoryview(buffer.getvalue())))
@@ -111,11 +93,6 @@ def sealed(data: memoryview) -> tuple[memoryview, bytes, memoryview]:
     ----------
     data : memoryview
         All bytes of a Parquet file.
-
-    Returns
-    -------
-    body, digest, footer : memoryview, bytes, memoryview
-        To be written in this order; the digest is the SHA-256 of the other two.
     """
     footer = _footer(data)
     return data[:footer], _digest(data[:footer], data[footer:]), data[footer:]
@@ -128,11 +105,6 @@ def read_table(stream: BinaryIO) -> pa.Table:
     ----------
     stream : binary file
         Is read from where it is, up to 1 GiB.
-
-    Returns
-    -------
-    pa.Table
-        Of `SCHEMA`.
 
     Raises
     ------

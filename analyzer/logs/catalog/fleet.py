@@ -51,13 +51,7 @@ class LabelAmount:
 
 
 def homes(catalog: Catalog) -> list[HomeSummary]:
-    """Sum up the files of each home.
-
-    Returns
-    -------
-    list of HomeSummary
-        In the order of the names of the homes.
-    """
+    """Sum up the files of each home."""
     table = catalog.table
     logs = pc.equal(table["kind"], LOG)
     counted = pa.table(

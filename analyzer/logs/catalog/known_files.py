@@ -12,13 +12,7 @@ from hearthlog.schemas.errors import LogError
 
 
 class KnownFiles:
-    """Files by name, with sizes and times of change.
-
-    Parameters
-    ----------
-    table : pa.Table
-        Of a catalogue.
-    """
+    """Files by name, with sizes and times of change."""
 
     def __init__(self, table: pa.Table) -> None:
         plain = without_times(table.select(["path", "size", "mtime"]))

@@ -33,19 +33,11 @@ def write_catalog(
 
     Parameters
     ----------
-    folder : Path
     before : Catalog, optional
         What there is: files that are as it says are not read again, damaged ones excepted. By
         default all files are read.
     progress : callable, optional
         Is told the share of the files that is done, 0 to 1.
-    workers : Workers, optional
-        Who reads files; this process by default.
-
-    Returns
-    -------
-    Catalog
-        What was written.
 
     Raises
     ------

@@ -39,14 +39,7 @@ def read_parts(folder: Path) -> Parts | None:
 
     An older catalogue, which is one file, is one part.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Raises
-    ------
-    LogError
-        If the folder cannot be looked into.
+    Raise `LogError` if the folder cannot be looked into.
     """
     catalog = folder / CATALOG
     with store_errors(catalog):
@@ -76,18 +69,7 @@ def write_parts(
 ) -> None:
     """Write the parts of the catalogue of a folder that are not there yet, each in one step.
 
-    Parameters
-    ----------
-    folder : Path
-    parts : mapping of str to pa.Table
-        Of `SCHEMA`, by the name of the part; others are deleted.
-    before : mapping of str to pa.Table
-        What the parts that are there hold.
-
-    Raises
-    ------
-    LogError
-        If the catalogue cannot be written, or is a link.
+    Raise `LogError` if the catalogue cannot be written, or is a link.
     """
     catalog = folder / CATALOG
     if is_local(catalog) and catalog.is_symlink():
@@ -114,20 +96,7 @@ def _names(catalog: Path) -> list[str]:
 
 
 def divided(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
-    """Divide rows by their homes.
-
-    Parameters
-    ----------
-    table : pa.Table
-        Of `SCHEMA`.
-
-    Yields
-    ------
-    part : str
-        Name of the part.
-    rows : pa.Table
-        Of one home, by path.
-    """
+    """Divide rows by their homes."""
     ordered = table.sort_by([("home", "ascending"), ("path", "ascending")])
     first = 0
     runs = pc.run_end_encode(ordered["home"].combine_chunks())

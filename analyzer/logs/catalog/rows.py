@@ -23,19 +23,7 @@ _HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
 
 
 def read_rows(folder: Path, names: Sequence[str]) -> pa.Table:
-    """Make the rows of some files: the task of a worker.
-
-    Parameters
-    ----------
-    folder : Path
-    names : sequence of str
-        Paths of the files within the folder, with `/`.
-
-    Returns
-    -------
-    pa.Table
-        Of `SCHEMA`; without files that have gone.
-    """
+    """Make the rows of some files: the task of a worker."""
     paths = [folder.joinpath(*name.split("/")) for name in names]
     rows = [row for read in map_logs(partial(_read_row, folder), paths) for row in read]
     return table_of([vars(row) for row in rows])

@@ -18,19 +18,7 @@ from hearthlog.schemas.times import seconds_text
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the labels of a track, whose times may have decimal commas.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for messages.
-    text : str
-        All of it.
-    choice : Choice
-        Not used.
-
-    Raises
-    ------
-    DataError
-        If the text has too many lines.
+    Raise `DataError` if the text has too many lines.
     """
     for number, line in numbered_lines(path, text):
         if line.startswith("\\"):  # the pitch of a spectral selection
@@ -48,17 +36,10 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
     Parameters
     ----------
-    path : Path
-        Of the file, for the message.
     marks : sequence of Mark
         At least one; all of one microphone.
     coverage : mapping of str to Coverage
         By microphone; times are written as seconds since its first frame.
-
-    Returns
-    -------
-    str
-        The text of the file.
 
     Raises
     ------

@@ -16,15 +16,7 @@ _SEPARATORS = re.compile(r"[\s_-]+")
 
 
 class ClassNames(NamedTuple):
-    """What labels mean.
-
-    Attributes
-    ----------
-    certain : mapping of str to str
-        Class of each label that is the name of a class, or that a map names.
-    folded : mapping of str to str
-        Class of each label that is one but for capitals, blanks, hyphens and accents.
-    """
+    """What labels mean."""
 
     certain: Mapping[str, str]
     folded: Mapping[str, str]
@@ -33,21 +25,8 @@ class ClassNames(NamedTuple):
 def read_class_map(path: Path) -> dict[str, str]:
     """Read a table of labels and their classes.
 
-    Parameters
-    ----------
-    path : Path
-        TOML, such as `"Tap Water" = "tap_water"`.
-
-    Returns
-    -------
-    dict of str to str
-        Class of each label, in the spelling of labels in a map.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, has something else than names of classes, or names two for one
-        label.
+    Raise `DataError` if the file cannot be read, has something else than names of classes, or
+    names two for one label.
     """
     classes: dict[str, str] = {}
     for label, name in read_toml(path, "map", DataError).items():
@@ -67,15 +46,9 @@ def find_class_names(labels: Iterable[str], class_map: Mapping[str, str] | None)
 
     Parameters
     ----------
-    labels : iterable of str
     class_map : mapping of str to str or None
         As `read_class_map` returns it. With a map, only classes that it or hearthlog knows are
         found for labels that are no names.
-
-    Returns
-    -------
-    ClassNames
-        Without the labels that mean no class.
     """
     given = class_map or {}
     classes = set(given.values())

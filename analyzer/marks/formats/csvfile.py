@@ -21,9 +21,6 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
     Parameters
     ----------
-    path : Path
-        Not used.
-    marks : sequence of Mark
     coverage : mapping of str to Coverage
         Not used: times are written in UTC.
 

@@ -126,25 +126,8 @@ class _Document(ContentHandler):
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
     """Yield the annotations that have a time of their own, of some tiers or of the top ones.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for messages.
-    text : str
-        All of it.
-    choice : Choice
-        Its tiers.
-
-    Yields
-    ------
-    FileLabel or LineError
-        In the order of the file.
-
-    Raises
-    ------
-    DataError
-        If the text is not XML, declares a DTD, is no document of ELAN, has times in another unit
-        or a recording with an offset, or has no such tier.
+    Raise `DataError` if the text is not XML, declares a DTD, is no document of ELAN, has times
+    in another unit or a recording with an offset, or has no such tier.
     """
     document = _Document(choice.tiers)
     endless = _ENDLESS.search(text)
@@ -203,12 +186,8 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
     Parameters
     ----------
-    path : Path
-        Not used.
     marks : sequence of Mark
         At least one.
-    coverage : mapping of str to Coverage
-        By microphone; has all those of the marks.
 
     Returns
     -------

@@ -65,13 +65,6 @@ class LabelCodec(Protocol):
 def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
     """Yield the labels of a file as they are there.
 
-    Parameters
-    ----------
-    path : Path
-        Of one of the formats in `formats.FORMATS`, by its suffix; a `*.txt` is a table or a label
-        track of Audacity by its first line.
-    choice : Choice
-
     Yields
     ------
     FileLabel or LineError
@@ -96,21 +89,9 @@ def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
 def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> None:
     """Write marks as a label file that `read_rows` reads again.
 
-    Parameters
-    ----------
-    path : Path
-        With a suffix of `formats.FORMATS`. Must not exist.
-    marks : sequence of Mark
-    coverage : mapping of str to Coverage
-        By microphone; has all those of the marks.
-
-    Raises
-    ------
-    DataError
-        If there are no marks, if the file would be too large, or if the marks are of several
-        microphones and the format has no place for them.
-    LogError
-        If the file exists, or cannot be written.
+    Raise `DataError` if there are no marks, if the file would be too large, or if the marks are
+    of several microphones and the format has no place for them. Raise `LogError` if the file
+    exists, or cannot be written.
     """
     if not marks:
         raise DataError("no marks to export: nothing was imported or marked in these logs yet")

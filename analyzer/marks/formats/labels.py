@@ -30,15 +30,10 @@ class FileLabel(NamedTuple):
 
     Attributes
     ----------
-    place : int or str
-        The line, or the place in a file without lines.
     start, end : str
         Seconds since `zero`, or ISO 8601.
-    label, microphone, reviewer : str
     made : str
         When the label was made, ISO 8601.
-    corrects : str
-        The labelling that it corrects.
     zero : str
         ISO 8601; by default the first frame of the microphone.
     length : str
@@ -64,8 +59,6 @@ class Choice(NamedTuple):
     ----------
     tiers : sequence of str
         Of ELAN; empty for all.
-    columns : mapping of str to str
-        Names of the columns of a table, by the field that each has.
     """
 
     tiers: Sequence[str] = ()
@@ -86,11 +79,6 @@ def make_mark(
 
     Parameters
     ----------
-    path : Path
-        Of the file, for errors.
-    label : FileLabel
-    coverage : mapping of str to Coverage
-        By microphone.
     microphone : str or None
         The microphone of a label that names none; not needed if there is only one.
 
@@ -141,8 +129,6 @@ def add_seconds(where: str, start: str, duration: str) -> str:
 
     Parameters
     ----------
-    where : str
-        File and place, for the message.
     start, duration : str
         Decimal numbers of seconds, with or without an exponent.
 

@@ -20,15 +20,6 @@ _NO_TASK = "unreadable task"
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the items of a file that Label Studio exports as JSON, or that it would import.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for messages.
-    text : str
-        All of it.
-    choice : Choice
-        Not used.
-
     Yields
     ------
     FileLabel or LineError
@@ -58,16 +49,8 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
     Parameters
     ----------
-    path : Path
-        Not used.
-    marks : sequence of Mark
     coverage : mapping of str to Coverage
         By microphone; times are written as seconds since its first frame.
-
-    Returns
-    -------
-    str
-        The text of the file.
     """
     tasks = [
         _task(name, [mark for mark in marks if mark.microphone == name], coverage[name])

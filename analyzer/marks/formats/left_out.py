@@ -12,15 +12,7 @@ OTHER = "label"
 
 
 def place_text(path: Path, place: int | str) -> str:
-    """Write the place of a label for an error: `file:line`, or `file: place`.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    place : int or str
-        The line, or the place in a file without lines.
-    """
+    """Write the place of a label for an error: `file:line`, or `file: place`."""
     return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
 
 
@@ -29,12 +21,6 @@ class LineError(DataError):
 
     Parameters
     ----------
-    where : str
-        File and place.
-    kind : str
-        What such a label is, as a noun.
-    reason : str
-        What is wrong, and what to do.
     alike : str, optional
         What labels of the kind must have in common to be counted together.
     """
@@ -62,10 +48,7 @@ class LeftOut:
     def add(self, error: LineError) -> None:
         """Leave out a label.
 
-        Raises
-        ------
-        LineError
-            If none may be left out.
+        Raise `LineError` if none may be left out.
         """
         if self._strict:
             raise error

@@ -32,16 +32,8 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
     Parameters
     ----------
-    path : Path
-        Not used.
-    marks : sequence of Mark
     coverage : mapping of str to Coverage
         By microphone; times are written as seconds since its first frame.
-
-    Returns
-    -------
-    str
-        The text of the file.
     """
     channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
     lines = ["\t".join(_COLUMNS)]

@@ -17,19 +17,7 @@ _FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the labels; lines of other types, and comments, are left out.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for messages.
-    text : str
-        All of it.
-    choice : Choice
-        Not used.
-
-    Raises
-    ------
-    DataError
-        If the text has too many lines.
+    Raise `DataError` if the text has too many lines.
     """
     for number, line in numbered_lines(path, text):
         fields, where = line.split(), place_text(path, number)
@@ -52,16 +40,8 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
     Parameters
     ----------
-    path : Path
-        Not used.
-    marks : sequence of Mark
     coverage : mapping of str to Coverage
         By microphone; times are written as seconds since its first frame.
-
-    Returns
-    -------
-    str
-        The text of the file, which has no place for reviewers.
     """
     lines = []
     for mark in marks:

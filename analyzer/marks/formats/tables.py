@@ -35,13 +35,7 @@ _UNIT = re.compile(r"(\((s|sec)\)|\[(s|sec)\])$")
 
 
 def is_table(text: str) -> bool:
-    """Tell whether the first line of a text names the columns of a table.
-
-    Parameters
-    ----------
-    text : str
-        All of the file.
-    """
+    """Tell whether the first line of a text names the columns of a table."""
     names = {_plain(name) for name in _first_line(text).split("\t")}
     start, end, duration = (names.intersection(_NAMES[field]) for field in _NUMBERS)
     return bool(start and (end or duration))
@@ -55,17 +49,8 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
 
     Parameters
     ----------
-    path : Path
-        Of the file, for messages.
-    text : str
-        All of it.
     choice : Choice
         Its columns, by their names, or by their numbers from 1 if the first line has no names.
-
-    Yields
-    ------
-    FileLabel or LineError
-        In the order of the file.
 
     Raises
     ------

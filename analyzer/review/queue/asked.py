@@ -33,22 +33,12 @@ _FULL_SCALE = 32767.0
 
 
 def asked_path(labels: Path) -> Path:
-    """Return the path of the list beside a label file: `ten.queue.csv` beside `ten.txt`.
-
-    Parameters
-    ----------
-    labels : Path
-    """
+    """Return the path of the list beside a label file: `ten.queue.csv` beside `ten.txt`."""
     return labels.with_name(_stem(labels) + _SUFFIX)
 
 
 def sounds_folder(labels: Path) -> Path:
-    """Return the path of the folder of sounds beside a label file: `ten` beside `ten.txt`.
-
-    Parameters
-    ----------
-    labels : Path
-    """
+    """Return the path of the folder of sounds beside a label file: `ten` beside `ten.txt`."""
     return labels.with_name(_stem(labels))
 
 
@@ -58,15 +48,7 @@ def _stem(labels: Path) -> str:
 
 
 class KeptSound(NamedTuple):
-    """The kept sound of a microphone.
-
-    Attributes
-    ----------
-    layers : dict of Path to Spans
-        That hold it, and of which time.
-    topic : str
-    time : Spans
-    """
+    """The kept sound of a microphone."""
 
     layers: dict[Path, Spans]
     topic: str
@@ -80,8 +62,6 @@ class SoundFile(NamedTuple):
     ----------
     first, last : int
         Numbers of the lines, from 1.
-    start, end : int
-        In nanoseconds of UTC.
     """
 
     first: int
@@ -90,13 +70,7 @@ class SoundFile(NamedTuple):
     end: int
 
     def name(self, lines: int) -> str:
-        """Name the file: `07.wav`, or `12-31.wav` for a minute.
-
-        Parameters
-        ----------
-        lines : int
-            That there are in all.
-        """
+        """Name the file: `07.wav`, or `12-31.wav` for a minute."""
         width = max(len(str(lines)), 2)
         last = f"-{self.last:0{width}}" if self.last > self.first else ""
         return f"{self.first:0{width}}{last}.wav"
@@ -109,13 +83,8 @@ def find_kept_sound(
 
     Parameters
     ----------
-    logs : Path
-        A log, or a folder of logs.
-    microphone : str
     limits : (int or None, int or None)
         Start and end in nanoseconds of UTC; None for all that there is.
-    losses : list of str
-        What cannot be read is appended.
 
     Raises
     ------
@@ -141,15 +110,7 @@ def find_kept_sound(
 def sound_files(
     marks: Sequence[Mark], asked: Iterable[ReviewSpan], kept: KeptSound
 ) -> list[SoundFile]:
-    """List the lines of a label file of which sound was kept, and the minutes.
-
-    Parameters
-    ----------
-    marks : sequence of Mark
-        The lines, in their order.
-    asked : iterable of ReviewSpan
-    kept : KeptSound
-    """
+    """List the lines of a label file of which sound was kept, and the minutes."""
     lines = [SoundFile(n, n, mark.start, mark.end) for n, mark in enumerate(marks, 1)]
     files = [*lines, *(one for one in drawn_minutes(asked, marks) if one.last > one.first)]
     return [one for one in files if cut(kept.time, one.start, one.end).length >= _SHORTEST]
@@ -158,18 +119,7 @@ def sound_files(
 def write_sounds(folder: Path, files: Sequence[SoundFile], lines: int, kept: KeptSound) -> None:
     """Write sounds as WAV files into a new folder, for the user alone; where there is none silence.
 
-    Parameters
-    ----------
-    folder : Path
-    files : sequence of SoundFile
-    lines : int
-        Of the label file.
-    kept : KeptSound
-
-    Raises
-    ------
-    LogError
-        If the folder exists or cannot be written, or the sound cannot be read.
+    Raise `LogError` if the folder exists or cannot be written, or the sound cannot be read.
     """
     with new_folder(folder) as temporary:
         temporary.chmod(0o700)
@@ -197,17 +147,6 @@ def label_lines(
     """Write labels for people with an editor: times of the clock, and which file to listen to.
 
     An import reads the first three columns.
-
-    Parameters
-    ----------
-    marks : sequence of Mark
-        In the order of time.
-    asked : iterable of ReviewSpan
-    files : iterable of SoundFile
-    folder : str
-        Name of theirs.
-    zone : tzinfo
-        Of the home.
     """
     notes: dict[int, list[str]] = {}
     for minute in drawn_minutes(asked, marks):
@@ -242,23 +181,12 @@ def drawn_minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterato
 
 
 def chosen_as(span: ReviewSpan) -> str:
-    """Return how a span was chosen, as `ReviewedSpan` says it.
-
-    Parameters
-    ----------
-    span : ReviewSpan
-    """
+    """Return how a span was chosen, as `ReviewedSpan` says it."""
     return RANDOM if span.reason == RANDOM else QUEUE
 
 
 def corrected_name(labelling: str) -> str:
-    """Return the name of a labelling, as marks say it: that of a model without `relabel/`.
-
-    Parameters
-    ----------
-    labelling : str
-        `live`, or `scenario/` and a name, or `relabel/` and a model.
-    """
+    """Return the name of a labelling, as marks say it: that of a model without `relabel/`."""
     return labelling.removeprefix(f"{RELABEL}/")
 
 
@@ -267,13 +195,8 @@ def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, optio
 
     Parameters
     ----------
-    path : Path
-        Of the list, for errors.
-    spans : iterable of ReviewSpan
     scenario : str
         Its name; empty for the sounds of the home.
-    option : str
-        By which a user names it, for errors.
 
     Raises
     ------
@@ -289,14 +212,7 @@ def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, optio
 
 
 def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
-    """Return the labels of a span for a label file: one, or of a whole minute all.
-
-    Parameters
-    ----------
-    span : ReviewSpan
-    labelling : Labelling
-        The one that is reviewed.
-    """
+    """Return the labels of a span for a label file: one, or of a whole minute all."""
     if span.reason != RANDOM:
         return [Mark(span.microphone, span.start, span.end, span.proposed_label)]
     parts, rows, _ = pieces(labelling, one(span.start, span.end))
@@ -314,24 +230,7 @@ def looked_at(
     reviewer: str,
     made: int,
 ) -> dict[Path, list[ReviewedSpan]]:
-    """Return which of the spans that were asked a person has looked at: those with a label.
-
-    Parameters
-    ----------
-    asked : iterable of ReviewSpan
-    marks : sequence of Mark
-        All that the label file has.
-    coverage : mapping of str to Coverage
-        By microphone; spans of others are left out.
-    reviewer : str
-    made : int
-        In nanoseconds of UTC.
-
-    Returns
-    -------
-    dict of Path to list of ReviewedSpan
-        By log.
-    """
+    """Return which of the spans that were asked a person has looked at: those with a label."""
     reviewed: dict[Path, list[ReviewedSpan]] = {}
     for span in asked:
         if span.microphone in coverage and any(_answers(mark, span) for mark in marks):
@@ -343,13 +242,7 @@ def looked_at(
 
 
 def unasked(asked: Sequence[ReviewSpan], marks: Iterable[Mark]) -> list[Mark]:
-    """Return the marks that lie in no span that was asked.
-
-    Parameters
-    ----------
-    asked : sequence of ReviewSpan
-    marks : iterable of Mark
-    """
+    """Return the marks that lie in no span that was asked."""
     return [mark for mark in marks if not any(_answers(mark, span) for span in asked)]
 
 

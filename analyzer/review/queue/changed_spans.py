@@ -36,14 +36,9 @@ def changed_by(  # noqa: PLR0913, PLR0917
 
     Parameters
     ----------
-    model : (Path, Model)
-        With its folder of models.
     side : NamedLabelling
         The labelling to be reviewed. Where it says something else than the model that labels now,
         as of older logs it may, nothing is asked.
-    sources : Labellings
-        Of the home; what cannot be read is added to its losses.
-    microphone : str
     count : int
         How many, at most.
     progress : callable, optional

@@ -20,8 +20,6 @@ def sample(weights: Float64, most: int = MOST_CANDIDATES) -> tuple[Indices, Floa
     ----------
     weights : np.ndarray [shape=(n,)], float64
         Not negative.
-    most : int
-        How many.
 
     Returns
     -------
@@ -50,7 +48,6 @@ def cover(points: Float64, gamma: float, weights: Float64, eligible: Bool, count
     ----------
     points : np.ndarray [shape=(n, width)], float64
         A row that is not finite is similar to none.
-    gamma : float
     weights : np.ndarray [shape=(n,)], float64
         Not negative.
     eligible : np.ndarray [shape=(n,)], bool

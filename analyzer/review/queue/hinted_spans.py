@@ -41,13 +41,6 @@ def hinted_spans(
 
     Parameters
     ----------
-    side : NamedLabelling
-        The labelling to be reviewed.
-    sources : Labellings
-        Logs that cannot be read are added to its losses.
-    microphone : str
-    reviewed : Spans
-        Time of which nothing is asked.
     count : int
         How many, at most.
 

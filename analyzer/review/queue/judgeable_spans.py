@@ -96,7 +96,6 @@ def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[n
 
     Parameters
     ----------
-    spans : JudgeableSpans
     silent : np.ndarray [shape=(classes,)], bool
         Which labels are silence.
 
@@ -113,26 +112,13 @@ def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[n
 
 
 def without(segments: Events, reviewed: Spans) -> Events:
-    """Return the parts of segments outside of some time.
-
-    Parameters
-    ----------
-    segments : Events
-        In the order of time, one label at a time.
-    reviewed : Spans
-    """
+    """Return the parts of segments outside of some time."""
     spans, rows = remains(segments, reviewed)
     return Events(*spans, segments.labels[rows])
 
 
 def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
     """Compare spans with another labelling.
-
-    Parameters
-    ----------
-    spans : JudgeableSpans
-    others : Events
-        In the order of time, one label at a time; labels are indices of the same classes.
 
     Returns
     -------

@@ -33,13 +33,7 @@ class Minutes(NamedTuple):
 
 
 def whole_minutes(labelling: Labelling) -> Minutes:
-    """Find the minutes of a labelling, and tell those with a sound from those without.
-
-    Parameters
-    ----------
-    labelling : Labelling
-        In the order of time, one label at a time.
-    """
+    """Find the minutes of a labelling, and tell those with a sound from those without."""
     if not len(labelling):
         return Minutes(np.empty(0, np.int64), np.empty(0, bool))
     stretches = joined(labelling.starts, labelling.ends, _UNLABELLED)
@@ -63,7 +57,6 @@ def draw_minutes(
 
     Parameters
     ----------
-    minutes : Minutes
     count : int
         How many, at most.
     drawn : collection of int

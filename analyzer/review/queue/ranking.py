@@ -46,17 +46,12 @@ class ReviewQueue:
 
     Attributes
     ----------
-    spans : JudgeableSpans
     labels, others : list of str
         The label of most of each span by the labelling, and by the other one; empty without one.
     uncertainty, disagreement, novelty : np.ndarray [shape=(n,)], float64
         0 to 1.
-    candidates : int
-        The number of spans that these were chosen from.
     has_uncertainty : bool
         False if the logs have no probabilities.
-    ranking : str or None
-        As of `make_queue`: the order of the spans, and the reason of each.
     """
 
     spans: JudgeableSpans
@@ -104,15 +99,8 @@ def make_queue(  # noqa: PLR0913
 
     Parameters
     ----------
-    sources : Labellings
-        Logs that cannot be read are added to its losses.
-    microphone : str
-    side : NamedLabelling
-        The labelling to be reviewed.
     other : NamedLabelling or None
         Another one, to find disagreements; another name for a class is none.
-    reviewed : Spans
-        Time that is left out.
     count : int
         Number of spans, at most.
     ranking : str, optional
@@ -121,8 +109,6 @@ def make_queue(  # noqa: PLR0913
         nothing to judge. The most
         `useful` spans are those that sound like most of what the model is uncertain of, those of
         rare classes before others.
-    models : Path, optional
-        Folder of models, in which the one of the labels is looked for.
     audible : Spans, optional
         Time of which sound was kept: `useful` spans that lie in it go first.
     progress : callable, optional
@@ -224,7 +210,6 @@ def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:
 
     Parameters
     ----------
-    spans : JudgeableSpans
     uncertain : np.ndarray [shape=(n,)], float64
         0 to 1; where all are 0, all spans are as uncertain.
 

@@ -35,11 +35,6 @@ class ReviewSpan(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
-    start, end : int
-        In nanoseconds of UTC.
-    a, label_a : str
-        A labelling (`live`, `review`, `relabel/<model>`), and its label of most of the span.
     b, label_b : str
         Another one; both are empty if there is none, the label where it has none.
     score : float or None
@@ -72,12 +67,6 @@ class ReviewSpan(NamedTuple):
 def disagreements(difference: Difference, microphone: str) -> list[ReviewSpan]:
     """List where two labellings differ.
 
-    Parameters
-    ----------
-    difference : Difference
-    microphone : str
-        That both labellings are of.
-
     Returns
     -------
     list of ReviewSpan
@@ -96,11 +85,6 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
 
     Parameters
     ----------
-    queue : ReviewQueue
-    microphone : str
-        That it is of.
-    a : str
-        The labelling to be reviewed: `live`, or `relabel/<model>`.
     b : str, optional
         The labelling that it was compared with; empty without one.
 
@@ -125,16 +109,7 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
 
 
 def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> list[ReviewSpan]:
-    """List minutes that were drawn at random, in their order.
-
-    Parameters
-    ----------
-    minutes : Spans
-        In any order.
-    side : NamedLabelling
-        The labelling to be reviewed.
-    microphone : str
-    """
+    """List minutes that were drawn at random, in their order."""
     spans = []
     for start, end in zip(minutes.starts.tolist(), minutes.ends.tolist(), strict=True):
         parts, rows, _ = pieces(side.labelling, one(start, end))
@@ -149,8 +124,6 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
 
     Parameters
     ----------
-    path : Path
-        Must not exist.
     spans : sequence of ReviewSpan
         At most `MOST_SPANS`.
 
@@ -170,10 +143,6 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
 
 def read_list(path: Path) -> list[ReviewSpan]:
     """Read a list of spans.
-
-    Parameters
-    ----------
-    path : Path
 
     Returns
     -------

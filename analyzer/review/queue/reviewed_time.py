@@ -16,7 +16,6 @@ class ReviewedTime(NamedTuple):
 
     Attributes
     ----------
-    spans : Spans
     random : frozenset of int
         Starts of the spans that were drawn at random, in nanoseconds of UTC.
     """
@@ -30,9 +29,6 @@ def reviewed_time(sources: Labellings, microphone: str, scenario: str = "") -> R
 
     Parameters
     ----------
-    sources : Labellings
-        Layers that cannot be read are added to its losses.
-    microphone : str
     scenario : str, optional
         Its name; empty for the sounds of the home.
     """

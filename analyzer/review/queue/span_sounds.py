@@ -59,11 +59,6 @@ def labelling_model(
 
     Parameters
     ----------
-    logs : list of LogContents
-        In the order of time.
-    microphone : str
-    models : Path
-        Folder of model files; the starter models are known without.
     scenario : str, optional
         For which it labelled; empty for the sounds of the home.
 
@@ -91,9 +86,6 @@ def span_sounds(
     ----------
     spans : JudgeableSpans
         At least one.
-    sources : Labellings
-        Logs that cannot be read are added to its losses.
-    microphone : str
     model : Model or None
         The one that labelled them. Without one, or if its features are not those of the logs, the
         points are means and standard deviations of the features, scaled by their own spread.

@@ -19,8 +19,6 @@ class ModelUncertainty:
     ----------
     spans : JudgeableSpans
         At least one.
-    classes : sequence of str
-        The names behind their labels.
 
     Attributes
     ----------
@@ -84,13 +82,7 @@ def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64
 
 
 class SpanMeans:
-    """Means of the finite values in each span.
-
-    Parameters
-    ----------
-    count : int
-        Number of spans.
-    """
+    """Means of the finite values in each span."""
 
     def __init__(self, count: int) -> None:
         self._sums, self._counts = np.zeros(count), np.zeros(count)

@@ -34,21 +34,7 @@ class _Change:
 
 @dataclass
 class Marking:
-    """The review layers of some logs, as one reviewer changes them.
-
-    Parameters
-    ----------
-    microphone : str
-    coverage : Coverage
-        Of the microphone.
-    reviewer : str
-    corrects : str
-        The labelling that is reviewed: `live`, `scenario/<name>`, or the name of a model.
-    labelled : LabelledSpans
-        The segments of that labelling.
-    scenario : str, optional
-        The name of the scenario whose labelling it is.
-    """
+    """The review layers of some logs, as one reviewer changes them."""
 
     microphone: str
     coverage: Coverage
@@ -67,15 +53,8 @@ class Marking:
         ----------
         start, end : int
             In nanoseconds of UTC; what lies before or after all logs is cut off.
-        label : str
-            A name of a class.
         chosen : str, optional
             As of `ReviewedSpan`, if the span counts as reviewed; else empty.
-
-        Returns
-        -------
-        list of Mark
-            The new marks: one for each log of the span.
 
         Raises
         ------
@@ -93,8 +72,6 @@ class Marking:
         ----------
         start, end : int
             In nanoseconds of UTC; what lies before or after all logs is cut off.
-        chosen : str
-            How the span was chosen, as of `ReviewedSpan`.
 
         Raises
         ------
@@ -117,11 +94,6 @@ class Marking:
         ----------
         start, end : int
             In nanoseconds of UTC; what lies before or after all logs is cut off.
-
-        Returns
-        -------
-        list of Mark
-            The new marks: one for each label and log of the span.
 
         Raises
         ------
@@ -190,15 +162,7 @@ class Marking:
     def marks(self) -> LabelledSpans:
         """Return all marks of the microphone in these logs.
 
-        Returns
-        -------
-        LabelledSpans
-            In the order of time.
-
-        Raises
-        ------
-        LogError
-            If a layer is damaged.
+        Raise `LogError` if a layer is damaged.
         """
         self._read()
         marks = (mark for same in self._marks.values() for mark in same)
@@ -208,15 +172,7 @@ class Marking:
     def reviewed(self) -> LabelledSpans:
         """Return what was looked at of the microphone in these logs, with how it was chosen.
 
-        Returns
-        -------
-        LabelledSpans
-            In the order of time; they may overlap.
-
-        Raises
-        ------
-        LogError
-            If a layer is damaged.
+        Raise `LogError` if a layer is damaged.
         """
         self._read()
         spans = (span for same in self._reviewed.values() for span in same)

@@ -41,12 +41,7 @@ Limits = tuple[int | None, int | None]
 
 
 def review_items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
-    """Return the items of a review, in the order of the spans.
-
-    Parameters
-    ----------
-    spans : iterable of ReviewSpan
-    """
+    """Return the items of a review, in the order of the spans."""
     return [
         ReviewItem(span.start, span.end, span.proposed_label, _text(span), chosen_as(span))
         for span in spans
@@ -71,26 +66,12 @@ def queue_spans(  # noqa: PLR0913, PLR0917
         One of `QUEUES`, or the name of a list (`*.csv`) that `hearthlog diff` made, or a model
         whose changes are asked for: its name in the folder of models, or its file. Every fifth item
         of a `useful` queue is a minute drawn at random, and every one of a `random` one.
-    sources : Labellings
-    labelled : (str, str)
-        The microphone, and the labelling: `live`, or `scenario/` and a name, or `relabel/` and a
-        model.
     limits : (int or None, int or None)
         Start and end in nanoseconds of UTC; None for all that there is.
     count : int or None
         How many, at most; None for ten, all of a list.
-    models : Path, optional
-        Folder of models, in which the one of the labels is looked for, and whose champion others
-        are compared with.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
-    audible : Spans, optional
-        As of `make_queue`.
-
-    Returns
-    -------
-    list of ReviewSpan
-        The most useful first, or in the order of the list.
 
     Raises
     ------

@@ -26,19 +26,7 @@ _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time
 
 
 class ReviewItem(NamedTuple):
-    """A span to be reviewed.
-
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    label : str
-        The label of most of it, which the key `a` accepts.
-    text : str
-        A line for the reviewer.
-    chosen : str
-        As of `ReviewedSpan`; one that was drawn at random is gone through until all of it is right.
-    """
+    """A span to be reviewed."""
 
     start: int
     end: int
@@ -110,14 +98,6 @@ class Session:
 
     Parameters
     ----------
-    screen : Screen
-    marking : Marking
-    classes : sequence of str
-        Each gets a key, as far as there are keys.
-    zone : tzinfo
-        Of the home, for times in texts.
-    say : callable
-        Shows a line to the reviewer.
     look_closely : callable
         Draws a span (start, end in nanoseconds of UTC) at the resolution of its frames.
     listen : callable
@@ -154,20 +134,7 @@ class Session:
     def run(self, keys: "SimpleQueue[str]") -> int:
         """Obey keys until the reviewer quits or closes the viewer, or the last item is done.
 
-        Parameters
-        ----------
-        keys : queue.SimpleQueue of str
-            The keys that are pressed, one character each, from any thread.
-
-        Returns
-        -------
-        int
-            The number of marked spans.
-
-        Raises
-        ------
-        LogError
-            If a review layer is damaged when the session begins.
+        Raise `LogError` if a review layer is damaged when the session begins.
         """
         self._began = time.monotonic()
         self._redraw()

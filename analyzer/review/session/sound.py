@@ -14,13 +14,6 @@ _FULL_SCALE = np.float32(32768.0)
 def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
     """Start to play the kept sound of a span of time.
 
-    Parameters
-    ----------
-    clips : sequence of SoundClip
-        In the order of time.
-    start, end : int
-        In nanoseconds of UTC.
-
     Returns
     -------
     str
@@ -42,13 +35,6 @@ def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Flo
     """Return the kept sound of a span of time, without the holes.
 
     Clips of another rate than the first are left out.
-
-    Parameters
-    ----------
-    clips : sequence of SoundClip
-        In the order of time.
-    start, end : int
-        In nanoseconds of UTC.
 
     Returns
     -------

@@ -20,7 +20,6 @@ def checked_classes(timeline: Timeline, logs: HomeLogs) -> Checked:
 
     Parameters
     ----------
-    timeline : Timeline
     logs : HomeLogs
         Of its home; minutes up to four weeks before and after the timeline count.
 

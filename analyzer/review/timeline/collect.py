@@ -91,16 +91,7 @@ class _Microphone:
 
 
 class Collector:
-    """Collects the rows of logs, one after the other in the order of time.
-
-    Parameters
-    ----------
-    grid : Grid
-    sampled : bool
-        Whether only a part of the rows comes.
-    frames : bool
-        Whether single frames are kept.
-    """
+    """Collects the rows of logs, one after the other in the order of time."""
 
     def __init__(self, grid: Grid, *, sampled: bool, frames: bool) -> None:
         self._grid = grid
@@ -143,13 +134,7 @@ class Collector:
         self._microphone(microphone).logs.add(log)
 
     def add_review(self, review: Mapping[str, Reviewed]) -> None:
-        """Add the marks that are in the span of the grid, and what a person has looked at.
-
-        Parameters
-        ----------
-        review : mapping of str to Reviewed
-            By scenario, as `read_review` returns it.
-        """
+        """Add the marks that are in the span of the grid, and what a person has looked at."""
         for scenario, (marks, reviewed) in review.items():
             for mark in marks:
                 if mark.start < self._grid.end and mark.end > self._grid.start:
@@ -169,13 +154,7 @@ class Collector:
         self._microphone(microphone).clips.append(clip)
 
     def microphones(self) -> dict[str, MicrophoneTimeline]:
-        """Return the timelines of the microphones that have something to show.
-
-        Returns
-        -------
-        dict of str to MicrophoneTimeline
-            By microphone, in the order of their names.
-        """
+        """Return the timelines of the microphones that have something to show."""
         return {
             name: self._timeline(name, rows)
             for name, rows in sorted(self._microphones.items())
@@ -183,13 +162,7 @@ class Collector:
         }
 
     def logs(self, microphone: str) -> set[Path]:
-        """Return the logs and layers that have topics of a microphone.
-
-        Parameters
-        ----------
-        microphone : str
-            One of `microphones`.
-        """
+        """Return the logs and layers that have topics of a microphone."""
         return self._microphones[microphone].logs
 
     def lines(self) -> LogLines:

@@ -36,9 +36,6 @@ class FeatureRows(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
-    names : tuple of str
-        Of the k columns.
     times : np.ndarray [shape=(n,)], int64
         Starts of the frames, in nanoseconds of UTC.
     values : np.ndarray [shape=(n, k)], float32
@@ -55,9 +52,6 @@ class LabelRows(NamedTuple):
 
     Attributes
     ----------
-    microphone, labelling : str
-    names : tuple of str
-        Of the classes.
     times : np.ndarray [shape=(n,)], int64
         Starts of the frames, in nanoseconds of UTC.
     probabilities : np.ndarray [shape=(n, k)], float32
@@ -93,7 +87,6 @@ class DirectionRows(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
     times : np.ndarray [shape=(n,)], int64
         Starts of the blocks, in nanoseconds of UTC.
     directions : np.ndarray [shape=(n, 2)], float64
@@ -119,8 +112,6 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
 
     Parameters
     ----------
-    path : Path
-        The log, for errors.
     columns : Columns
         At least one message, with the `FIELDS` of its type.
 
@@ -169,11 +160,6 @@ def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:
 
 def shown_topic(name: str) -> TopicName | None:
     """Return the parts of a topic that a timeline shows.
-
-    Parameters
-    ----------
-    name : str
-        Of the topic, as `/<microphone>/relabel/<model>/label`.
 
     Returns
     -------

@@ -12,11 +12,6 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
 
     Two names of one class (see `hearthlog.models.classes`) are no difference.
 
-    Parameters
-    ----------
-    one, other : LabelledSpans
-        In the order of time, one label at a time.
-
     Returns
     -------
     LabelledSpans

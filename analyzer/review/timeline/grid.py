@@ -10,15 +10,7 @@ from hearthlog.schemas.arrays import Float64, Int64
 
 @dataclass(frozen=True)
 class Grid:
-    """A span of time, divided into equal shares.
-
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    count : int
-        Number of shares.
-    """
+    """A span of time, divided into equal shares."""
 
     start: int
     end: int
@@ -59,14 +51,7 @@ class Grid:
 
 
 class GridMeans:
-    """Means of rows of values in each share of a grid.
-
-    Parameters
-    ----------
-    grid : Grid
-    width : int
-        Values in a row.
-    """
+    """Means of rows of values in each share of a grid."""
 
     def __init__(self, grid: Grid, width: int) -> None:
         self._grid = grid

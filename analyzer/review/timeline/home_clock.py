@@ -37,13 +37,6 @@ def home_clock(zone: tzinfo, start: int, end: int) -> HomeClock:
 
     Where clocks are changed in between, it goes on with the time that holds in the middle, and its
     name says so: an axis of time has no hour twice.
-
-    Parameters
-    ----------
-    zone : tzinfo
-        Of the home.
-    start, end : int
-        In nanoseconds of UTC.
     """
     ahead = _ahead((start + end) // 2, zone)
     is_one = _ahead(start, zone) == ahead == _ahead(max(start, end - 1), zone)

@@ -40,15 +40,8 @@ class Lane(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
     labelling : str
         The one whose labels it shows; empty if it stands beside all of them.
-    name : str
-        In words.
-    spans : LabelledSpans
-        Their texts are words, too.
-    colours : mapping of str to Colour
-        Of each text.
     """
 
     microphone: str
@@ -60,10 +53,6 @@ class Lane(NamedTuple):
 
 def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
     """Make the lanes of a timeline, microphone by microphone, from above.
-
-    Parameters
-    ----------
-    timeline : Timeline
 
     Yields
     ------
@@ -90,13 +79,7 @@ def labellings_of(microphone: MicrophoneTimeline) -> list[LabellingTimeline]:
 
 
 def labelling_in_words(name: str) -> str:
-    """Name a labelling: `the recorder`, the scenario, or the model.
-
-    Parameters
-    ----------
-    name : str
-        As `live`, `candidate`, `scenario/<name>` or `relabel/<model>`.
-    """
+    """Name a labelling: `the recorder`, the scenario, or the model."""
     if is_scenario(name):
         return name.replace("/", " ")
     return "the recorder" if name == LIVE else name.removeprefix(f"{RELABEL}/")
@@ -115,13 +98,8 @@ def reviewed_lane(
 
     Parameters
     ----------
-    microphone : str
     scenario : str
         Its name; empty for the sounds of the home.
-    marks : LabelledSpans
-        With the label of each mark.
-    reviewed : LabelledSpans
-        That were looked at, also those without a mark.
     """
     names = {text: in_words(text) for text in dict.fromkeys(marks.texts)}
     shades = {name: colour(text) for text, name in names.items()}

@@ -66,11 +66,6 @@ Update = Plot | StateLane | LogLines
 def last_time(folder: Path) -> int | None:
     """Return the last log time of the log in a folder that was written to last.
 
-    Parameters
-    ----------
-    folder : Path
-        That the recorder writes to.
-
     Returns
     -------
     int or None
@@ -111,23 +106,8 @@ class LiveTimeline:
     def take(self, path: Path, batch: Sequence[RawMessages]) -> Iterator[Update]:
         """Yield the updates that new messages of a log make.
 
-        Parameters
-        ----------
-        path : Path
-            The log, for errors.
-        batch : sequence of RawMessages
-            What was written to the log since the last call.
-
-        Yields
-        ------
-        Plot, StateLane or LogLines
-            What is new in it.
-
-        Raises
-        ------
-        LogError
-            If the messages are not of the types of their channels, or a channel does not name its
-            values.
+        Raise `LogError` if the messages are not of the types of their channels, or a channel
+        does not name its values.
         """
         for columns in decode_types(path, batch, FIELDS):
             rows = read_rows(path, columns) if len(columns) else None

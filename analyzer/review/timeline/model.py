@@ -44,8 +44,6 @@ class GridSeries(NamedTuple):
 
     Attributes
     ----------
-    names : tuple of str
-        Of the columns.
     values : np.ndarray [shape=(count, k)], float64
         NaN where nothing was recorded.
     """
@@ -59,8 +57,6 @@ class FrameValues(NamedTuple):
 
     Attributes
     ----------
-    names : tuple of str
-        Of the columns.
     times : np.ndarray [shape=(n,)], int64
         Starts of the frames, in nanoseconds of UTC.
     values : np.ndarray [shape=(n, k)], float32
@@ -93,8 +89,6 @@ class SoundClip(NamedTuple):
 
     Attributes
     ----------
-    start : int
-        In nanoseconds of UTC.
     rate : int
         Samples a second.
     samples : np.ndarray [shape=(n,)], int16
@@ -116,11 +110,6 @@ class LabellingTimeline:
 
     Attributes
     ----------
-    name : str
-    spans : LabelledSpans
-        The segments or marks.
-    probabilities : GridSeries or None
-        A column for each class.
     novelty : np.ndarray [shape=(count,)], float64, or None
     frames : list of FrameValues
         The probabilities, frame by frame; none of more than three hours, see `read_frames`.
@@ -139,31 +128,14 @@ class MicrophoneTimeline:
 
     Attributes
     ----------
-    name : str
-    labellings : list of LabellingTimeline
-        The recorder's first, the reviewer's last.
-    features : GridSeries or None
     level : np.ndarray [shape=(count,)], float64, or None
         Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
     level_frames : list of FrameValues
         The level, frame by frame; none of more than three hours.
     floor : np.ndarray [shape=(count,)], float64, or None
         Level of the floor of the room, in the same unit; NaN where it is not known.
-    reviewed : LabelledSpans
-        What a person has looked at, with how it was chosen.
-    gaps : LabelledSpans
-        When nothing was heard, with the reasons.
-    troubles : LabelledSpans
-        Warnings and errors of the diagnostics.
-    clips : list of SoundClip
-    recurring : LabelledSpans
-        Sounds that recur, with what they are called.
-    spoken : LabelledSpans
-        Turns of voices, with whose they are.
     direction : np.ndarray [shape=(count,)], float64, or None
         Whence the sound of an array came, in degrees; NaN where nothing was located.
-    reviewed_scenarios : dict of str to LabelledSpans
-        As `reviewed`, of scenarios of which something is marked or looked at, by their names.
     """
 
     name: str
@@ -208,16 +180,6 @@ class Timeline:
     ----------
     grid : Grid
         The whole span, in shares that are a pixel or two wide.
-    microphones : dict of str to MicrophoneTimeline
-    lines : LogLines
-    zone : str
-        IANA name of the home's time zone.
-    coverage : dict of str to Coverage
-        When each microphone was recording, and in which log.
-    every : int
-        One in so many parts of the logs was read.
-    losses : list of str
-        What could not be shown, and why.
     """
 
     grid: Grid
@@ -232,9 +194,6 @@ class Timeline:
     def clock(self) -> HomeClock:
         """The clock of the home.
 
-        Raises
-        ------
-        DataError
-            If there is no such time zone.
+        Raise `DataError` if there is no such time zone.
         """
         return home_clock(home_zone(self.zone), self.grid.start, self.grid.end)

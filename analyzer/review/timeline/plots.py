@@ -78,12 +78,8 @@ class Plot(NamedTuple):
 
     Attributes
     ----------
-    kind : PlotKind
-    microphone : str
     labelling : str
         Empty if the plot is of none.
-    names : tuple of str
-        Of the k columns.
     times : np.ndarray [shape=(n,)], int64
         Middles of the spans, in nanoseconds of UTC.
     values : np.ndarray [shape=(n, k)], float64

@@ -66,19 +66,10 @@ def read_timeline(
 
     Parameters
     ----------
-    paths : iterable of Path
-        Logs, whose layers come with them, or folders of logs.
     start, end : int, optional
         In nanoseconds of UTC; by default from the first message to the last.
-    zone : str, optional
-        IANA name of the home's time zone; by default the one in the logs.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
-
-    Returns
-    -------
-    Timeline
-        What could not be read is in its `losses`.
 
     Raises
     ------
@@ -132,14 +123,8 @@ def read_frames(
 
     Parameters
     ----------
-    timeline : Timeline
     start, end : int, optional
         In nanoseconds of UTC; by default from its start to its end.
-
-    Yields
-    ------
-    Timeline
-        With frames: the timeline itself if it has them. What cannot be read is left out.
     """
     start = timeline.grid.start if start is None else max(start, timeline.grid.start)
     end = timeline.grid.end if end is None else min(end, timeline.grid.end)

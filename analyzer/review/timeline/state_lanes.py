@@ -39,13 +39,7 @@ TROUBLE = LaneKind("Trouble", _trouble_colours, TROUBLES)
 
 
 def scenario_kind(labelling: str) -> LaneKind:
-    """Return the kind of lane of a scenario, which shows its segments once they are closed.
-
-    Parameters
-    ----------
-    labelling : str
-        `scenario/<name>`.
-    """
+    """Return the kind of lane of a scenario, which shows its segments once they are closed."""
     return LaneKind(labelling.replace("/", "_").capitalize(), _class_colours)
 
 
@@ -74,11 +68,6 @@ class StateLane(NamedTuple):
 
 def changes(spans: LabelledSpans) -> Changes:
     """Turn spans into changes of a lane.
-
-    Parameters
-    ----------
-    spans : LabelledSpans
-        In the order of time; they do not overlap.
 
     Returns
     -------

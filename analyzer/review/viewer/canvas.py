@@ -31,13 +31,6 @@ class Canvas:
     """Draws arrays into a recording. Times are nanoseconds of UTC, shape (n,).
 
     Rerun has axes of UTC only; so it is told, as if it were UTC, what the clock of the home shows.
-
-    Parameters
-    ----------
-    recording : rr.RecordingStream
-        Goes to a file, or to a viewer.
-    clock : HomeClock
-        Names the axis of time.
     """
 
     def __init__(self, recording: rr.RecordingStream, clock: HomeClock) -> None:
@@ -51,15 +44,8 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Path of the strips in the recording.
-        places : (float, float)
-            Where they lie, in the unit of the view, and how thick they are, in points of the screen
-            at any zoom.
         spans : Spans
             At least one, in the order of time.
-        name : str
-            Is shown at the mouse.
         colour : Colour
             Red, green and blue, 0 to 255.
         """
@@ -92,8 +78,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Path of the lane in the recording.
         colours : mapping of str to Colour
             By state: red, green and blue, 0 to 255.
         """
@@ -107,8 +91,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Configured by `configure_states`.
         times : np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         states : sequence of (str or None)
@@ -122,10 +104,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Path of the bands in the recording.
-        names : sequence of str
-            Of the k bands, the lowest first.
         colours : sequence of Colour
             Of each: red, green and blue, 0 to 255.
         """
@@ -142,8 +120,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Configured by `configure_bands`.
         times : np.ndarray [shape=(n,)], int64
             Middles of spans, in nanoseconds of UTC.
         shares : np.ndarray [shape=(n, k)], float64
@@ -166,10 +142,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Path of the lines in the recording.
-        names : sequence of str
-            Of the k lines.
         colours : sequence of Colour
             Of each: red, green and blue, 0 to 255.
         """
@@ -181,9 +153,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Path of the points in the recording.
-        name : str
         colour : Colour
             Red, green and blue, 0 to 255.
         """
@@ -197,8 +166,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Configured by `configure_lines` or `configure_points`.
         times : np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         values : np.ndarray [shape=(n, k)], float
@@ -220,14 +187,8 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Configured by `configure_lines`.
-        names : sequence of str
-            Of its lines; every part has some of them.
         parts : iterable of FrameValues
             Each of at least one frame.
-        step : float
-            To whose multiples values are rounded.
         """
         for part in parts:
             times, values = _with_holes(part, names)
@@ -237,15 +198,7 @@ class Canvas:
             self.draw_lines(entity, times[kept], rounded[kept])
 
     def configure_heat_map(self, entity: str, names: Sequence[str]) -> None:
-        """Set the names of the rows of a heat map.
-
-        Parameters
-        ----------
-        entity : str
-            Path of the heat map in the recording.
-        names : sequence of str
-            Of the k rows, the lowest first.
-        """
+        """Set the names of the rows of a heat map."""
         count = len(names)
         style = rr.SeriesPoints(
             names=names, markers=["square"] * count, marker_sizes=[_HEAT_SQUARE] * count
@@ -257,8 +210,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Configured by `configure_heat_map`.
         times : np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         shade : np.ndarray [shape=(n, k)], float64
@@ -277,14 +228,7 @@ class Canvas:
         self.recording.send_columns(entity, [self._time_column(times)], columns)
 
     def write_lines(self, entity: str, lines: LogLines) -> None:
-        """Add lines of text, each at its time and with its level.
-
-        Parameters
-        ----------
-        entity : str
-            Path of the text in the recording.
-        lines : LogLines
-        """
+        """Add lines of text, each at its time and with its level."""
         if len(lines.times):
             levels = [_LEVELS.get(level, "INFO") for level in lines.levels.tolist()]
             column = rr.TextLog.columns(text=lines.texts.tolist(), level=levels)
@@ -297,8 +241,6 @@ class Canvas:
 
         Parameters
         ----------
-        entity : str
-            Path of the clips in the recording.
         clips : sequence of SoundClip
             At least one, in the order of time.
         start : int

@@ -34,10 +34,6 @@ class DrawnLane:
 
     Parameters
     ----------
-    root : str
-        Entity of all of it.
-    height : float
-        Where it lies, in the unit of the view.
     long : int
         Nanoseconds: what is shorter is drawn thinner, or many short sounds look like a long one.
     """
@@ -48,15 +44,7 @@ class DrawnLane:
         self._count = 0
 
     def show(self, lane: Lane, canvas: Canvas) -> None:
-        """Draw what is new, and hide what is gone; long sounds lie under short ones.
-
-        Parameters
-        ----------
-        lane : Lane
-            All that it has now.
-        canvas : Canvas
-            Is drawn on.
-        """
+        """Draw what is new, and hide what is gone; long sounds lie under short ones."""
         starts, ends, texts = lane.spans
         wanted = set(zip(starts.tolist(), ends.tolist(), texts, strict=True))
         for entity, part in list(self._parts.items()):
@@ -91,13 +79,7 @@ class LanePlace(NamedTuple):
 
 
 def lane_places(lanes: Sequence[Lane]) -> list[LanePlace]:
-    """Find a place for each lane: those of the labellings of a microphone are in the same ones.
-
-    Parameters
-    ----------
-    lanes : sequence of Lane
-        As `timeline_lanes` yields them.
-    """
+    """Find a place for each lane: those of the labellings of a microphone are in the same ones."""
     names: dict[str, dict[str, None]] = {}
     for lane in lanes:
         names.setdefault(lane.microphone, {})[lane.name] = None
@@ -118,12 +100,6 @@ def lanes_entity(microphone: str, labelling: str) -> str:
 
 def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]:
     """Draw all of a timeline but the single frames.
-
-    Parameters
-    ----------
-    timeline : Timeline
-    canvas : Canvas
-        Is drawn on.
 
     Returns
     -------
@@ -155,17 +131,7 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]
 
 
 def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
-    """Write beside the classes of the recorder how many of its sounds were right in this home.
-
-    Parameters
-    ----------
-    timeline : Timeline
-        That is drawn.
-    checked : mapping
-        As `checked_classes` returns it.
-    canvas : Canvas
-        Is drawn on.
-    """
+    """Write beside the classes of the recorder how many of its sounds were right in this home."""
     lanes = list(timeline_lanes(timeline))
     for lane, place in zip(lanes, lane_places(lanes), strict=True):
         known = checked.get((lane.microphone, lane.name))
@@ -174,17 +140,7 @@ def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
 
 
 def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
-    """Draw what close-ups show of a short timeline beside the longer timeline around it.
-
-    Parameters
-    ----------
-    timeline : Timeline
-        The short one.
-    before : Spans
-        What is drawn close up already, and is not drawn again.
-    canvas : Canvas
-        Is drawn on.
-    """
+    """Draw what close-ups show of a short timeline beside the longer timeline around it."""
     strokes = -(-_CLOSE_STROKES // timeline.grid.count)
     for plot in timeline_plots(timeline):
         if plot.kind in _CLOSE_KINDS:
@@ -201,14 +157,8 @@ def draw_asked(number: int, start: int, end: int, text: str, canvas: Canvas) -> 
 
     Parameters
     ----------
-    number : int
-        How many were asked before.
     start, end : int
         Of the span, in nanoseconds of UTC.
-    text : str
-        What is asked.
-    canvas : Canvas
-        Is drawn on.
     """
     if number:
         canvas.hide(f"{ASKED}/{number - 1}")
@@ -225,9 +175,6 @@ def draw_frames(
 
     Parameters
     ----------
-    timeline : Timeline
-    canvas : Canvas
-        Is drawn on.
     start, end : int, optional
         In nanoseconds of UTC: frames that begin from `start` on, before `end`; by default all.
     """
@@ -248,17 +195,7 @@ def draw_frames(
 
 
 def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
-    """Set names and colours of what a plot shows.
-
-    Parameters
-    ----------
-    plot : Plot
-        Its kind and names count.
-    entity : str
-        From `plot_entity`, or a child of it.
-    canvas : Canvas
-        Is drawn on.
-    """
+    """Set names and colours of what a plot shows."""
     if plot.kind.style is Style.BANDS:
         words = [in_words(name) for name in plot.names]
         canvas.configure_bands(entity, words, [colour(name) for name in plot.names])
@@ -271,19 +208,7 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
 
 
 def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> None:
-    """Draw values into a plot that is configured.
-
-    Parameters
-    ----------
-    plot : Plot
-        Of the same kind and names.
-    entity : str
-        Configured by `configure_plot`.
-    canvas : Canvas
-        Is drawn on.
-    strokes : int, optional
-        As of `Canvas.add_bands`.
-    """
+    """Draw values into a plot that is configured."""
     if plot.kind.style is Style.BANDS:
         canvas.add_bands(entity, plot.times, plot.values, plot.length, strokes)
     elif plot.kind.style is Style.HEAT_MAP:
@@ -293,19 +218,7 @@ def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> No
 
 
 def plot_entity(plot: Plot, close_up: str = "") -> str:
-    """Name the entity of a plot.
-
-    Parameters
-    ----------
-    plot : Plot
-    close_up : str, optional
-        `CLOSE_UP` for a plot of a short span.
-
-    Returns
-    -------
-    str
-        As `<microphone>/live/shares`, or `<microphone>/level` for a plot of no labelling.
-    """
+    """Name the entity of a plot."""
     labelling = f"/{_word(plot.labelling)}" if plot.labelling else ""
     return f"{plot.microphone}{close_up}{labelling}/{plot.kind.name}"
 
@@ -317,14 +230,7 @@ def text_entity(plot: Plot) -> str:
 
 
 def frames_entity(microphone: str, name: str) -> str:
-    """Name the entity of the frames of a labelling, or of the level.
-
-    Parameters
-    ----------
-    microphone : str
-    name : str
-        Of the labelling (`live`, `relabel/<model>`), or `level`.
-    """
+    """Name the entity of the frames of a labelling, or of the level."""
     return f"{microphone}/frames/{_word(name)}"
 
 

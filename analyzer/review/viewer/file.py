@@ -25,11 +25,8 @@ SUFFIX = ".rrd"
 def check_output(output: Path) -> None:
     """Raise DataError unless a recording can be saved under this name.
 
-    Raises
-    ------
-    DataError
-        If the name does not end in `.rrd`, the file exists, or its folder does not exist
-        or cannot be written.
+    Raise `DataError` if the name does not end in `.rrd`, the file exists, or its folder does
+    not exist or cannot be written.
     """
     if output.suffix != SUFFIX:
         raise DataError(f"{output}: the name of a Rerun recording must end in {SUFFIX}")
@@ -44,18 +41,7 @@ def save_timeline(timeline: Timeline, output: Path, checked: Checked | None = No
 
     Only Rerun's viewer sends usage statistics and opens a port; this does neither.
 
-    Parameters
-    ----------
-    timeline : Timeline
-    output : Path
-        Must not exist, and must end in `.rrd`.
-    checked : mapping, optional
-        As `checked_classes` returns it.
-
-    Raises
-    ------
-    DataError
-        If the name has another suffix, the file exists, or it cannot be written.
+    Raise `DataError` if the name has another suffix, the file exists, or it cannot be written.
     """
     check_output(output)
     try:
@@ -99,15 +85,7 @@ def _copy(pipe: Path, output: Path) -> None:
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
-    """Set the start of a recording, and name it after its span.
-
-    Parameters
-    ----------
-    recording : rr.RecordingStream
-        Is told both.
-    timeline : Timeline
-        What it shows.
-    """
+    """Set the start of a recording, and name it after its span."""
     start, end = (timeline.clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
     recording.send_recording_start_time_nanos(start)
     recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")

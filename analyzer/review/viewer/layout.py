@@ -50,9 +50,6 @@ class TimelineBlueprint(rrb.Blueprint):
 
     Parameters
     ----------
-    rows : sequence of (int, View or Container)
-        From above, with their heights in relation to each other.
-    panel : rrb.TimePanel
     start, end : Boundary
         The range: times, or seconds from the cursor.
     """
@@ -69,40 +66,19 @@ class TimelineBlueprint(rrb.Blueprint):
 
 
 def stack(rows: Sequence[Row], name: str | None = None) -> rrb.Vertical:
-    """Put views one below the other.
-
-    Parameters
-    ----------
-    rows : sequence of (int, View or Container)
-        From above, with their heights in relation to each other.
-    name : str, optional
-        Of the tab that they are in.
-    """
+    """Put views one below the other."""
     heights = [height for height, _ in rows]
     return rrb.Vertical(*(view for _, view in rows), row_shares=heights, name=name)
 
 
 def tabs(views: Iterable[rrb.View | rrb.Container]) -> rrb.View | rrb.Container:
-    """Put views one behind the other; a single one needs no tab.
-
-    Parameters
-    ----------
-    views : iterable of (View or Container)
-        The one in front first.
-    """
+    """Put views one behind the other; a single one needs no tab."""
     views = list(views)
     return views[0] if len(views) == 1 else rrb.Tabs(*views)
 
 
 def states_view(root: str, name: str) -> rrb.View:
-    """Make a view of all lanes of states below an entity.
-
-    Parameters
-    ----------
-    root : str
-    name : str
-        Its title.
-    """
+    """Make a view of all lanes of states below an entity."""
     return rrb.StateTimelineView(origin=root, name=name, time_view=_axis())
 
 
@@ -120,8 +96,6 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
         At least one; the names of the last with the most of them count.
     entities : sequence of str
         Of the plots, at least one.
-    live : bool, optional
-        Whether new values come from the right, and the view has a title and a legend.
     """
     plot = max(reversed(plots), key=lambda one: len(one.names))
     kind = plots[0].kind
@@ -161,19 +135,7 @@ def review_layout(
 ) -> TimelineBlueprint:
     """Lay out the views of a review.
 
-    Parameters
-    ----------
-    timeline : Timeline
-        The time axes begin with the whole of it.
-    marking : bool, optional
-        Whether the time panel is open, on whose ruler spans are marked with the mouse.
-    close_up : bool, optional
-        Whether short spans are looked at: what is drawn of them comes first.
-
-    Raises
-    ------
-    DataError
-        If there is no such time zone as the timeline's.
+    Raise `DataError` if there is no such time zone as the timeline's.
     """
     clock = timeline.clock
     plots: dict[str, list[Plot]] = {name: [] for name in timeline.microphones}

@@ -53,19 +53,8 @@ class LiveServer:
 
     Parameters
     ----------
-    port : int
-        To listen on.
-    bind : str
-        Address to listen on; nothing is sent anywhere but to viewers that connect.
-    minutes : float
-        Length of the time axes, which end with the newest data.
     memory : str, optional
         How much is kept for viewers that come later, as `20MB`; then the oldest is dropped.
-
-    Attributes
-    ----------
-    url : str
-        Where viewers connect to.
 
     Raises
     ------
@@ -99,13 +88,6 @@ class LiveServer:
         """Draw updates, and lay out the views anew where there is a new plot.
 
         Where the clock of the home is changed, an axis of the new time begins.
-
-        Parameters
-        ----------
-        updates : iterable of (Plot, StateLane or LogLines)
-            From `LiveTimeline.take`, in the order of time.
-        zone : tzinfo, optional
-            Of the home.
         """
         for update in updates:
             times = update.changes.times if isinstance(update, StateLane) else update.times

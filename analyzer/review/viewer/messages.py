@@ -26,27 +26,12 @@ def get_blueprint() -> bytes:
 
 
 def set_blueprint(blueprint: str) -> bytes:
-    """Make the request to replace the blueprint by another one.
-
-    Parameters
-    ----------
-    blueprint : str
-        In JSON.
-    """
+    """Make the request to replace the blueprint by another one."""
     return _field(_SET_BLUEPRINT, _field(2, blueprint.encode()) + _field(_ON_RECORDING, b""))
 
 
 def set_time(axis: str, nanoseconds: int, *, play: bool) -> bytes:
-    """Make the request to put the cursor on a time.
-
-    Parameters
-    ----------
-    axis : str
-        Name of the axis of time.
-    nanoseconds : int
-    play : bool
-        Whether the cursor runs from there on.
-    """
+    """Make the request to put the cursor on a time."""
     timeline = _field(2, _field(1, axis.encode()))
     time = _field(3, _field(1, nanoseconds))
     return _field(_SET_TIME, timeline + time + _field(5, _PLAYING if play else _PAUSED))
@@ -54,11 +39,6 @@ def set_time(axis: str, nanoseconds: int, *, play: bool) -> bytes:
 
 def read_blueprint(answer: bytes) -> str:
     """Read the JSON of a blueprint.
-
-    Parameters
-    ----------
-    answer : bytes
-        To `get_blueprint`.
 
     Returns
     -------
@@ -76,17 +56,10 @@ def read_blueprint(answer: bytes) -> str:
 def read_state(answer: bytes) -> tuple[str, list[list[str]], int | None]:
     """Read what a viewer says of its state.
 
-    Parameters
-    ----------
-    answer : bytes
-        To `get_state`.
-
     Returns
     -------
     version : str
         Of the viewer; empty if the answer has none.
-    reports : list of list of str
-        The errors of each view.
     cursor : int or None
         In nanoseconds of the axis of time; None if there is no cursor.
 
@@ -124,10 +97,7 @@ def _varint(value: int) -> bytes:
 def _fields(content: bytes) -> Iterator[tuple[int, Value]]:
     """Yield number and value of each field.
 
-    Raises
-    ------
-    ValueError
-        If it is no message.
+    Raise `ValueError` if it is no message.
     """
     place = 0
     while place < len(content):

@@ -30,10 +30,7 @@ _BACKTRACE = re.compile(r"\s*\d+: ")
 def program() -> Path:
     """Return the path of the viewer's program, as the installed `rerun` package has it.
 
-    Raises
-    ------
-    DataError
-        If it is not installed.
+    Raise `DataError` if it is not installed.
     """
     spec = find_spec("rerun_cli")
     path = Path(spec.origin).with_name("rerun") if spec and spec.origin else None
@@ -46,11 +43,6 @@ def hidden_options() -> str:
     """Return options of `rerun` with which no web page finds the viewer that a user starts.
 
     By itself it listens to the whole network, and tells every web page that finds it what it shows.
-
-    Returns
-    -------
-    str
-        Of a command line: a `hidden_address`, and a port.
     """
     address = hidden_address()
     return f"--bind {address} --port {free_port(bind=address)}"
@@ -65,15 +57,7 @@ def has_display() -> bool:
 def check_display(instead: str) -> None:
     """Raise DataError where no window can be opened.
 
-    Parameters
-    ----------
-    instead : str
-        What the message advises beside `--web`: an option, and what it is for.
-
-    Raises
-    ------
-    DataError
-        If this is Linux without a display of X11 or Wayland.
+    Raise `DataError` if this is Linux without a display of X11 or Wayland.
     """
     if not has_display():
         raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
@@ -82,17 +66,7 @@ def check_display(instead: str) -> None:
 class ViewerProcess:
     """A running viewer.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        Of its command line, beside the address and the port.
-    port : int, optional
-        Where it listens, at a `hidden_address`; by default any.
-
-    Raises
-    ------
-    DataError
-        If the viewer is not installed.
+    Raise `DataError` if the viewer is not installed.
     """
 
     def __init__(self, arguments: Sequence[str], port: int | None = None) -> None:
@@ -129,10 +103,7 @@ class ViewerProcess:
     def wait_until_it_listens(self) -> None:
         """Wait until the viewer takes data.
 
-        Raises
-        ------
-        DataError
-            If it ends instead, or takes longer than a minute.
+        Raise `DataError` if it ends instead, or takes longer than a minute.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while time.monotonic() < deadline:
@@ -147,10 +118,7 @@ class ViewerProcess:
     def check(self) -> None:
         """Raise DataError if the viewer failed.
 
-        Raises
-        ------
-        DataError
-            If it ended with an error; the message has the last one of its log.
+        Raise `DataError` if it ended with an error; the message has the last one of its log.
         """
         if (self._process.poll() or 0) > 0:
             raise self.failed()

@@ -38,11 +38,6 @@ class ViewerState(NamedTuple):
 
     Attributes
     ----------
-    version : str
-    views : int
-        How many there are.
-    errors : list of str
-        Those that views report.
     cursor : int or None
         The time cursor, in nanoseconds of the clock of the home.
     """
@@ -114,7 +109,6 @@ class Viewer:
 
     Parameters
     ----------
-    control : ViewerControl
     address : str
         URL of its page; empty if it opens itself.
     """
@@ -144,27 +138,15 @@ class Viewer:
     def check(self) -> None:
         """Raise DataError if the viewer failed.
 
-        Raises
-        ------
-        DataError
-            If it ended with an error.
+        Raise `DataError` if it ended with an error.
         """
         self._control.process.check()
 
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
         """Show a timeline.
 
-        Parameters
-        ----------
-        timeline : Timeline
-        close_up : bool
-            Whether short spans of it are looked at one after the other.
-
-        Raises
-        ------
-        DataError
-            If the viewer has ended, or does not take data within a minute, or there is no such time
-            zone as the timeline's.
+        Raise `DataError` if the viewer has ended, or does not take data within a minute, or
+        there is no such time zone as the timeline's.
         """
         process = self._control.process
         process.wait_until_it_listens()
@@ -178,14 +160,7 @@ class Viewer:
         self._flush()
 
     def write_checked(self, timeline: Timeline, checked: Checked) -> None:
-        """Write beside the classes of a timeline that is drawn how many of its sounds were right.
-
-        Parameters
-        ----------
-        timeline : Timeline
-        checked : mapping
-            As `checked_classes` returns it.
-        """
+        """Draw the precision of each class of a timeline next to its name."""
         write_checked(timeline, checked, self._canvas)
         self._flush()
 
@@ -194,7 +169,6 @@ class Viewer:
 
         Parameters
         ----------
-        timeline : Timeline
         start, end : int
             In nanoseconds of UTC: frames that begin from `start` on, before `end`.
         """
@@ -213,15 +187,7 @@ class Viewer:
         self._flush()
 
     def ask(self, start: int, end: int, text: str) -> None:
-        """Draw which span is asked, in place of the one before.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC.
-        text : str
-            What is asked.
-        """
+        """Draw which span is asked, in place of the one before."""
         draw_asked(self._asked, start, end, text, self._canvas)
         self._asked += 1
         self._flush()
@@ -244,11 +210,6 @@ class Viewer:
 
     def wait_until_drawn(self, is_over: Callable[[], bool] = bool) -> ViewerState | None:
         """Wait until the viewer shows what was sent to it; for a page, until somebody opens it.
-
-        Parameters
-        ----------
-        is_over : callable, optional
-            Returns whether nobody will open the page any more.
 
         Returns
         -------
@@ -281,10 +242,7 @@ class Viewer:
     def state(self) -> ViewerState:
         """Return the state of the viewer.
 
-        Raises
-        ------
-        ConnectionError, TimeoutError
-            If the viewer does not answer.
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         return self._control.state()
 
@@ -308,10 +266,7 @@ class Viewer:
     def cursor(self) -> int | None:
         """Return the time of the cursor, in nanoseconds of UTC; None if there is no cursor.
 
-        Raises
-        ------
-        ConnectionError, TimeoutError
-            If the viewer does not answer.
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         cursor = self.state().cursor
         return None if cursor is None else self._clock.utc(cursor)
@@ -321,8 +276,6 @@ class Viewer:
 
         Parameters
         ----------
-        start, end : int
-            In nanoseconds of UTC.
         margin : int
             On either side, in nanoseconds.
 
@@ -344,37 +297,16 @@ class Viewer:
     def play(self, start: int) -> None:
         """Let the cursor run from a time on.
 
-        Parameters
-        ----------
-        start : int
-            In nanoseconds of UTC.
-
-        Raises
-        ------
-        ConnectionError, TimeoutError
-            If the viewer does not answer.
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         self._control.set_time(self._clock.name, self._clock.shown(start), play=True)
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons in the page of the viewer, if it has one.
-
-        Parameters
-        ----------
-        keys : sequence of (str, str)
-            Of each button the key, and its text.
-        press : callable
-            Told the key of the button that is pressed, from another thread.
-        """
+        """Offer buttons in the page of the viewer, if it has one."""
         self._control.offer(keys, press)
 
     def say(self, text: str) -> None:
-        """Show a line in the page of the viewer, if it has one.
-
-        Parameters
-        ----------
-        text : str
-        """
+        """Show a line in the page of the viewer, if it has one."""
         self._control.say(text)
 
     @property

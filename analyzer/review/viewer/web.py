@@ -28,21 +28,7 @@ _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 @dataclass
 class Relay:
-    """Requests to a page, and its answers.
-
-    Attributes
-    ----------
-    keys : list of (str, str)
-        Buttons of the page: the key, and what it does.
-    press : callable
-        Told the key that was pressed in the page.
-    texts : queue.SimpleQueue of str
-        Lines that the page is to show.
-    requests : queue.SimpleQueue of (int, bytes)
-        Number and content of requests that the page has not fetched.
-    answers : dict of int to Future
-        By the number of the request, while somebody waits for the answer.
-    """
+    """Requests to a page, and its answers."""
 
     keys: Sequence[tuple[str, str]] = ()
     press: Callable[[str], None] = lambda _: None
@@ -54,22 +40,8 @@ class Relay:
     def ask(self, request: bytes) -> bytes:
         """Ask the page, and wait for its answer.
 
-        Parameters
-        ----------
-        request : bytes
-            A message of `messages`.
-
-        Returns
-        -------
-        bytes
-            For `read_state` or `read_blueprint`.
-
-        Raises
-        ------
-        TimeoutError
-            If there is no answer within 15 seconds.
-        ConnectionError
-            If the viewer in the page refused.
+        Raise `TimeoutError` if there is no answer within 15 seconds. Raise `ConnectionError` if
+        the viewer in the page refused.
         """
         self._last += 1
         number, answer = self._last, Future[bytes]()
@@ -87,7 +59,6 @@ class Relay:
         -------
         number : int
             Of the request; 0 if there is none.
-        content : bytes
         """
         with suppress(queue.Empty):
             while True:
@@ -101,8 +72,6 @@ class Relay:
 
         Parameters
         ----------
-        number : int
-            Of the request; one that nobody waits for any more is ignored.
         content : bytes or None
             None if the viewer refused.
         """
@@ -276,17 +245,7 @@ class _WebControl:
 def open_page(port: int | None = None, data: str | None = None) -> Viewer:
     """Serve the viewer as a page of this machine.
 
-    Parameters
-    ----------
-    port : int, optional
-        Of the page; by default any.
-    data : str, optional
-        URL of a server whose data it shows; by default it shows what is sent to it.
-
-    Raises
-    ------
-    DataError
-        If the viewer is not installed, or the port is in use.
+    Raise `DataError` if the viewer is not installed, or the port is in use.
     """
     page, viewer_files = free_port(port), free_port()
     process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)])

@@ -61,13 +61,7 @@ class _WindowControl:
 
 
 class WindowViewer(Viewer):
-    """A viewer in a window of its own.
-
-    Parameters
-    ----------
-    process : ViewerProcess
-        The viewer, which is stopped at the end.
-    """
+    """A viewer in a window of its own."""
 
     def __init__(self, process: ViewerProcess) -> None:
         self._window = _WindowControl(process)
@@ -76,10 +70,7 @@ class WindowViewer(Viewer):
     def picture(self) -> bytes:
         """Return a picture of the window as PNG.
 
-        Raises
-        ------
-        ConnectionError, TimeoutError
-            If the viewer does not answer.
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         return self._window.client.take_screenshot()
 
@@ -87,17 +78,8 @@ class WindowViewer(Viewer):
 def open_window(port: int | None = None, data: str | None = None) -> WindowViewer:
     """Open Rerun's viewer in a window.
 
-    Parameters
-    ----------
-    port : int, optional
-        Where it takes data; by default any.
-    data : str, optional
-        URL of a server whose data it shows; by default it shows what is sent to it.
-
-    Raises
-    ------
-    DataError
-        If there is no display, the viewer is not installed, or the port is in use.
+    Raise `DataError` if there is no display, the viewer is not installed, or the port is in
+    use.
     """
     check_display(
         "--save FILE.rrd to make a file that Rerun opens elsewhere, with --queue FILE.txt to "
@@ -113,15 +95,7 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
 def open_hidden(port: int | None = None) -> WindowViewer:
     """Run the viewer without a window, for pictures.
 
-    Parameters
-    ----------
-    port : int, optional
-        Where it takes data; by default any.
-
-    Raises
-    ------
-    DataError
-        If the viewer is not installed, or the port is in use.
+    Raise `DataError` if the viewer is not installed, or the port is in use.
     """
     return _opened(port, "--expect-data-soon", "--headless")
 

@@ -28,7 +28,6 @@ def augmented(windows: Float32, rng: np.random.Generator) -> Float32:
     ----------
     windows : np.ndarray [shape=(n, 20, 21)], float32
         Features of the set `auros21`.
-    rng : np.random.Generator
 
     Returns
     -------

@@ -26,20 +26,7 @@ __all__ = ["INPUTS", "card_names", "has_card", "network_features", "network_fold
 def network_features(name: str) -> FeatureSet:
     """Return the feature set of a network.
 
-    Parameters
-    ----------
-    name : str
-        That of a card that there is, without `.toml`.
-
-    Returns
-    -------
-    FeatureSet
-        The network itself is read when an extractor is made.
-
-    Raises
-    ------
-    ModelError
-        If the card cannot be read, or says what cannot be.
+    Raise `ModelError` if the card cannot be read, or says what cannot be.
     """
     return _features(read_card(find_card(name)))
 

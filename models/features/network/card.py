@@ -49,16 +49,8 @@ class NetworkCard:
 
     Attributes
     ----------
-    path : Path
-        Of the network.
-    sha256 : str
-        Of the network, in hexadecimal.
-    sample_rate : int
-        Of the samples that it takes, in hertz.
     window, hop : int
         Samples at 16 kHz that it is given at once, and from one time to the next.
-    names : tuple of str
-        Names of its values.
     input, output : str
         Names in the network; empty for its only one.
     """
@@ -106,23 +98,12 @@ def card_names() -> list[str]:
 
 
 def has_card(name: str) -> bool:
-    """Tell whether there is a card of a name.
-
-    Parameters
-    ----------
-    name : str
-        Without `.toml`.
-    """
+    """Tell whether there is a card of a name."""
     return bool(_NAME.fullmatch(name)) and os.path.lexists(find_card(name))
 
 
 def find_card(name: str) -> Path:
     """Return the card of a name.
-
-    Parameters
-    ----------
-    name : str
-        Without `.toml`.
 
     Returns
     -------
@@ -174,14 +155,7 @@ def read_card(path: Path) -> NetworkCard:
 def read_network(path: Path) -> bytes:
     """Read the file of a network, of 512 MB at most.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    ModelError
-        If there is none, it is larger, or cannot be read.
+    Raise `ModelError` if there is none, it is larger, or cannot be read.
     """
     return read_whole(path, "network", _SIZE_LIMIT, ModelError)
 

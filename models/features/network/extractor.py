@@ -17,14 +17,7 @@ class NetworkExtractor:
     is silence to it. They are given to it one by one, so that blocks of any size give the same
     bits.
 
-    Parameters
-    ----------
-    card : NetworkCard
-
-    Raises
-    ------
-    ModelError
-        If the network is not that of the card, or not what the card says.
+    Raise `ModelError` if the network is not that of the card, or not what the card says.
     """
 
     def __init__(self, card: NetworkCard) -> None:

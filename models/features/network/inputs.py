@@ -15,7 +15,6 @@ class LastEmbedding:
     ----------
     window_frames : int
         So many that the sound behind that embedding lies in the window as a whole.
-    width : int
     """
 
     window_frames: int
@@ -44,12 +43,7 @@ class LastEmbedding:
 
 
 class EmbeddingStream:
-    """The embeddings at the frames of one stream, as `InputStream`.
-
-    Parameters
-    ----------
-    inputs : LastEmbedding
-    """
+    """The embeddings at the frames of one stream, as `InputStream`."""
 
     def __init__(self, inputs: LastEmbedding) -> None:
         self._inputs = inputs

@@ -22,10 +22,6 @@ _SOUND_SEED = 20_261_125
 class Network:
     """A network in memory.
 
-    Parameters
-    ----------
-    card : NetworkCard
-
     Attributes
     ----------
     of_silence : np.ndarray [shape=(width,)], float32
@@ -111,14 +107,7 @@ class Network:
 def load_network(card: NetworkCard) -> Network:
     """Load a network once, however many extractors are made.
 
-    Parameters
-    ----------
-    card : NetworkCard
-
-    Raises
-    ------
-    ModelError
-        As `Network`.
+    Raise `ModelError` as `Network`.
     """
     return Network(card)
 

@@ -38,15 +38,7 @@ class RunningNode(Protocol):
 def message_class(name: str) -> Any:
     """Return the class of messages of a type.
 
-    Parameters
-    ----------
-    name : str
-        Such as "hearthlog_msgs/msg/AudioLabel".
-
-    Raises
-    ------
-    NodeError
-        If no such messages are built here.
+    Raise `NodeError` if no such messages are built here.
     """
     package, kind, message = name.split("/")
     try:
@@ -57,13 +49,7 @@ def message_class(name: str) -> Any:
 
 
 def offered_profile(offered: Mapping[str, Any]) -> QoSProfile:
-    """Return the quality of service that a log says a topic was offered with.
-
-    Parameters
-    ----------
-    offered : mapping
-        The first of the channel's `offered_qos_profiles`.
-    """
+    """Return the quality of service that a log says a topic was offered with."""
     lifespan = offered["lifespan"]
     latched = offered["durability"] == "transient_local"
     return QoSProfile(
@@ -76,13 +62,7 @@ def offered_profile(offered: Mapping[str, Any]) -> QoSProfile:
 
 
 class TypeChecks:
-    """Compares, every two seconds, the types of all who use topics with those of hearthlog.
-
-    Parameters
-    ----------
-    node : Node
-        Says on its log, once, whose type differs.
-    """
+    """Compares, every two seconds, the types of all who use topics with those of hearthlog."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -95,7 +75,6 @@ class TypeChecks:
 
         Parameters
         ----------
-        topic : str
         type_hash : str
             Of the type that it has here, as REP-2016 writes it.
         """
@@ -131,12 +110,7 @@ def own_hash(node: Node, topic: str) -> str:
 
 
 def wait_for_subscribers(publishers: Iterable[Any]) -> None:
-    """Wait, half a second at most, until subscribers have all that was published.
-
-    Parameters
-    ----------
-    publishers : iterable of Publisher or None
-    """
+    """Wait, half a second at most, until subscribers have all that was published."""
     until = time.monotonic() + _ARRIVAL_SECONDS
     for publisher in publishers:
         left = until - time.monotonic()
@@ -148,11 +122,6 @@ def run(make_node: Callable[[], Any]) -> None:
     """Run a node until it is enough, Ctrl-C comes, or it is asked to end.
 
     The handlers of rclpy are not used: they end the context while others publish.
-
-    Parameters
-    ----------
-    make_node : callable
-        Returns a node that is a `RunningNode` too; may raise NodeError.
     """
     stopped = False
 

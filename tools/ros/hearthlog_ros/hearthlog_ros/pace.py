@@ -23,8 +23,6 @@ class Pace:
         ----------
         first : int
             Log time of its first frame, in nanoseconds of UTC.
-        now : int
-            The same clock, now.
         """
         late = now - first - self._delay
         if self._least and 0 < late < _MOST_LATE:
@@ -39,8 +37,6 @@ class Pace:
         ----------
         log_time : int
             Of the message, in nanoseconds of UTC.
-        now : int
-            The same clock, now.
         """
         wait = log_time + self._delay - now
         return wait if 0 < wait <= self._delay else 0
