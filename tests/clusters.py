@@ -5,21 +5,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
 from distributed import Client
+from waiting import wait_for
 
 DASK = str(Path(sys.executable).with_name("dask"))
 LONG = 60.0
-
-
-def until(true):
-    deadline = time.monotonic() + LONG
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @contextmanager
@@ -58,7 +51,9 @@ def scheduler_in(folder):
     about = folder / "scheduler.json"
     command = [DASK, "scheduler", "--port", "0", "--scheduler-file", str(about)]
     with running([*command, *PRIVATE]) as process:
-        until(lambda: about.exists() and about.read_text().endswith("}"))  # it is written in place
+        wait_for(
+            lambda: about.exists() and about.read_text().endswith("}")
+        )  # it is written in place
         yield json.loads(about.read_text())["address"], process
 
 
@@ -87,4 +82,4 @@ def _await_nanny(address, pid):
         return os.getpid(), dask_worker.status.name
 
     with Client(address, set_as_default=False) as client:
-        until(lambda: (pid, "running") in client.run(state, nanny=True).values())
+        wait_for(lambda: (pid, "running") in client.run(state, nanny=True).values())

@@ -21,6 +21,7 @@ import pytest
 import soundfile
 from conftest import HEARTHLOG
 from microphones import DIES_WITH_PARENT
+from waiting import wait_for
 
 _ROOT = Path(__file__).parents[1]
 _VERSIONS = _ROOT / "build" / "home-assistant"
@@ -70,15 +71,6 @@ def free_port():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return free.getsockname()[1]
-
-
-def wait_for(condition, seconds, *, pause=0.2):
-    """Return what a condition gives as soon as it is true."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"not within {seconds} s"
-        time.sleep(pause)
-    return value
 
 
 def end(process, number=signal.SIGTERM, seconds=120):

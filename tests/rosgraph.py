@@ -5,7 +5,6 @@ import os
 import shlex
 import signal
 import subprocess
-import time
 from collections import Counter
 from contextlib import contextmanager
 from itertools import count
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from logreader import LogReader
+from waiting import wait_for
 
 from hearthlog.schemas.logs.files import find_logs
 
@@ -66,15 +66,6 @@ class Ros:
             *remap,
             env=env or {},
         )
-
-
-def wait_for(reached, seconds=120):
-    """Poll until a condition holds; a busy machine may take its time."""
-    deadline = time.monotonic() + seconds
-    while not (result := reached()):
-        assert time.monotonic() < deadline, "waited for nothing"
-        time.sleep(0.1)
-    return result
 
 
 def wait_until_handled(process, number=signal.SIGTERM):

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from waiting import wait_for
 
 from hearthlog.analyzer.bridge.alerts import output
 from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
@@ -36,13 +37,6 @@ WAIT = 30  # seconds, for what comes at once
 
 def ring(number, due=0):
     return Ring("coughs", number * SECOND, f"alert {number}", is_known=True, due=due)
-
-
-def wait_for(condition):
-    until = time.monotonic() + WAIT
-    while not condition():
-        assert time.monotonic() < until, "waited for nothing"
-        time.sleep(0.02)
 
 
 @contextmanager

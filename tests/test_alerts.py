@@ -18,6 +18,7 @@ from livehome import LiveHome as WrittenHome
 from livehome import following
 from pydantic import TypeAdapter
 from spliced import run
+from waiting import wait_for
 
 from hearthlog.analyzer.bridge.alerts.evaluate import rings
 from hearthlog.analyzer.bridge.alerts.gathering import Gathered
@@ -344,13 +345,6 @@ def bridge(root, rules, told, said):
     own = AlertsOutput(rules, DeliverySettings(), home, root / "state", said.append, tell)
     with following(home, {"alerts": own}, said):
         yield
-
-
-def wait_for(condition):
-    until = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < until, "waited for nothing"
-        time.sleep(0.05)
 
 
 def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tmp_path):

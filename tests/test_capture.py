@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import HEARTHLOG
 from logs import features, read
+from waiting import wait_for
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
@@ -180,10 +181,7 @@ def test_a_recorder_that_is_killed_loses_a_second_and_the_next_start_says_so(lab
     _, stamps, _ = features(left)
     assert killed - (int(stamps[-1]) + FRAME) < SECONDS
     with recording(labmic, logs):
-        deadline = time.monotonic() + 120
-        while left.exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        wait_for(lambda: not left.exists())
         wait_for_frames(logs, len(stamps) + 40)
     assert not list(logs.rglob("*.active"))
     first, second = sorted(logs.rglob("*.mcap"))

@@ -21,6 +21,7 @@ from logreader import LogReader
 from logs import read
 from lossy import LossySource
 from spliced import raw_messages, small_disk
+from waiting import wait_for
 
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
@@ -583,10 +584,7 @@ def test_a_killed_recorder_leaves_clips_that_the_next_one_completes(noise, tmp_p
     process = subprocess.Popen(
         [*command, "--start", "2026-03-01T07:00:00"], env={**os.environ, **environment}
     )
-    deadline = time.monotonic() + 120
-    while not _heard(logs, 60):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_for(lambda: _heard(logs, 60))
     process.kill()
     process.wait()
     (active,) = logs.rglob("*.audio.mcap.active")

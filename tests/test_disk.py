@@ -15,6 +15,7 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features, read
 from test_capture import recording, sound, wait_for_frames
+from waiting import wait_for
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.recorder.config import Settings
@@ -153,7 +154,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def wait_for(process, text, seconds=120):
+def wait_for_text(process, text, seconds=120):
     """Wait for a line on standard error."""
     deadline = time.monotonic() + seconds
     said = ""
@@ -172,10 +173,10 @@ def test_a_disk_that_was_full_is_written_again_when_there_is_room(labmic, small_
         wait_for_frames(logs, 60)
         with suppress(OSError):
             filler.write_bytes(b"\0" * 5_000_000)
-        wait_for(process, "No space left on device")
+        wait_for_text(process, "No space left on device")
         time.sleep(5)
         filler.unlink()
-        wait_for(process, "can be written again")
+        wait_for_text(process, "can be written again")
         wait_for_frames(logs, 200)
     frames, _, _ = features(logs)
     assert frames.tolist() == list(range(len(frames)))
@@ -188,9 +189,9 @@ def test_a_recorder_starts_on_a_full_disk_and_writes_when_there_is_room(labmic, 
     with suppress(OSError):
         filler.write_bytes(b"\0" * 5_000_000)
     with recording(labmic, logs) as process:
-        wait_for(process, "No space left on device")
+        wait_for_text(process, "No space left on device")
         filler.unlink()
-        wait_for(process, "can be written again")
+        wait_for_text(process, "can be written again")
         wait_for_frames(logs, 60)
     frames, _, _ = features(logs)
     assert frames.tolist() == list(range(len(frames)))
@@ -206,8 +207,7 @@ def test_a_second_recorder_of_a_folder_is_refused_with_the_number_of_the_first(
         second = hearthlog("record", "--device", labmic.device, "-o", logs, env=labmic.env)
         other = [*HEARTHLOG, "record", "--device", labmic.device, "--node", "other", "-o", logs]
         with subprocess.Popen(other, env=labmic.env) as third:
-            while not list(logs.rglob("other_*")):
-                time.sleep(0.2)
+            wait_for(lambda: list(logs.rglob("other_*")))
             third.send_signal(signal.SIGTERM)
     assert second.returncode == 1
     assert f"is recorded by 'home' already (process {process.pid})" in second.stderr
@@ -220,7 +220,7 @@ def test_a_folder_that_was_moved_away_and_made_again_is_locked_again(labmic, hea
     with recording(labmic, logs) as process:
         wait_for_frames(logs, 20)
         logs.rename(tmp_path / "away")
-        wait_for(process, "can be written again")
+        wait_for_text(process, "can be written again")
         second = hearthlog("record", "--device", labmic.device, "-o", logs, env=labmic.env)
     assert second.returncode == 1
     assert f"is recorded by 'home' already (process {process.pid})" in second.stderr

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from logreader import LogReader
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
+from waiting import wait_for
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
@@ -220,9 +221,6 @@ def test_a_rewriting_that_has_ended_leaves_no_process(live_hour, tmp_path):
     finisher = LogFinisher()
     finisher.add([shutil.copy(live_hour[0], tmp_path / live_hour[0].name)])
     process = Path(f"/proc/{finisher._processes[0].pid}")
-    deadline = time.monotonic() + 120
-    while process.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for(lambda: not process.exists())
     assert [path.suffix for path in find_logs(tmp_path)] == [".mcap"]
     finisher.close()

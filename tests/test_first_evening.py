@@ -2,13 +2,13 @@
 
 import signal
 import subprocess
-import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 from conftest import HEARTHLOG
 from logs import read
+from waiting import wait_for
 
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.sources.decoding import read_audio
@@ -43,13 +43,6 @@ def recording(env):
             process.output, process.errors = process.communicate(timeout=20)
         finally:
             process.kill()
-
-
-def wait_for(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
 
 
 def latest(kind):

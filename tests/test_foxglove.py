@@ -23,6 +23,7 @@ from growing import GROWN, grown_definitions, write_as_later
 from logreader import LogReader
 from test_interoperability import plain
 from test_typescript import FOLDER, like, need_node
+from waiting import wait_for
 
 from hearthlog.analyzer.foxglove.admission import Admission, RefusedError
 from hearthlog.analyzer.foxglove.recording import Recording
@@ -147,11 +148,7 @@ class Viewer:
         return found if topic is None else [event for event in found if event["topic"] == topic]
 
     def wait(self, condition):
-        until = time.monotonic() + 60
-        while not (found := condition()):
-            assert time.monotonic() < until, self.events[-3:]
-            time.sleep(0.05)
-        return found
+        return wait_for(condition, 60, lambda: self.events[-3:])
 
     def wait_for(self, kind, topic=None, count=1):
         return self.wait(lambda: len(self.of(kind, topic)) >= count and self.of(kind, topic))
@@ -278,8 +275,7 @@ def test_one_who_comes_late_is_told_of_the_stream(day, model_file, tmp_path):
 
 def test_one_who_serves_late_tells_of_the_stream_too(day, model_file, tmp_path):
     with recording(day, model_file, tmp_path):
-        while not list(tmp_path.rglob("*.active")):
-            time.sleep(0.1)
+        wait_for(lambda: list(tmp_path.rglob("*.active")))
         time.sleep(3)
         with serving(tmp_path) as (_, url), Viewer(url) as viewer:
             viewer.wait_for("message", "/mic/info")

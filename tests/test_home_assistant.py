@@ -12,7 +12,8 @@ from zoneinfo import ZoneInfo
 import pytest
 import yaml
 from brokers import Broker, Listener
-from homeassistant import HomeAssistant, Household, end, hass_of, versions, wait_for
+from homeassistant import HomeAssistant, Household, end, hass_of, versions
+from waiting import wait_for
 
 pytestmark = pytest.mark.timeout(600)
 

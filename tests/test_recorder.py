@@ -13,6 +13,7 @@ import soundfile
 from conftest import HEARTHLOG
 from logreader import LogReader
 from logs import features, read
+from waiting import wait_for
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
@@ -309,10 +310,7 @@ def start_realtime(file, logs):
 
 def wait_for_log(logs, seconds):
     """Wait until the log is open, and so many seconds more; return when it was opened."""
-    deadline = time.monotonic() + 120
-    while not list(logs.rglob("*.active")):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: list(logs.rglob("*.active")))
     began = time.time()
     time.sleep(seconds)
     return began

@@ -6,7 +6,6 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event as Flag
@@ -25,6 +24,7 @@ from rewriting import Log
 from spliced import run, small_disk
 from stores import put
 from together import record_together
+from waiting import wait_for
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.errors import WorkerError
@@ -263,13 +263,6 @@ def opened(process):
         return [str(fd.readlink()) for fd in (process / "fd").iterdir()]
     except OSError:
         return []
-
-
-def wait_for(condition, seconds=60):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def test_two_runs_at_once_do_not_hinder_each_other(model, logs, layers):

@@ -23,6 +23,7 @@ from lossy import LossySource
 from mcap.records import Metadata
 from rewriting import Log
 from together import record_together
+from waiting import wait_for
 
 from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import ReplayOptions
@@ -484,8 +485,8 @@ def test_at_a_rate_it_takes_the_time_of_the_sound(folder, model_file, tmp_path):
 def test_a_signal_ends_it_and_completes_the_log(folder, model_file, tmp_path, number):
     options = ["--model", model_file, "-o", tmp_path / "again", "--rate", "1"]
     process = start("replay", folder, *options)
-    active = wait_until(lambda: next(tmp_path.rglob("*.active"), None))
-    wait_until(lambda: read(active, "features"))
+    active = wait_for(lambda: next(tmp_path.rglob("*.active"), None))
+    wait_for(lambda: read(active, "features"))
     process.send_signal(number)
     _, errors = process.communicate(timeout=20)
     assert process.returncode == 3
@@ -515,14 +516,6 @@ def test_a_loop_goes_on_until_it_is_stopped(folder, model_file):
 def start(*arguments):
     command = [*HEARTHLOG, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + 120
-    while not (found := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return found
 
 
 def write_clips(path, clips, rate=16_000, kind="pcm-s16"):

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import soundfile
+import waiting
 from conftest import HEARTHLOG
 from kept import keep_models, put_by_hand
 from logreader import LogReader
@@ -67,13 +68,11 @@ def recording(folder, logs, *arguments, env=None):
 
 
 def wait_for(condition, seconds=120):
-    deadline = time.monotonic() + seconds
-    while True:
+    def holds():
         with suppress(LogError):  # a log is completed, and gets its name, at any time
-            if condition():
-                return
-        assert time.monotonic() < deadline, f"not in {seconds} s"
-        time.sleep(0.1)
+            return condition()
+
+    waiting.wait_for(holds, seconds)
 
 
 def count(logs, kind):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from logs import features, read
 from test_capture import FRAME, SECONDS, wait_for_frames
+from waiting import wait_for
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.recorder.config import load_settings
@@ -72,10 +73,7 @@ def test_a_clock_that_is_set_while_the_microphone_is_silent_is_told_of_in_the_ga
     wait_for_frames(logs, 20)
     labmic.freeze()
     clock[0] = step * SECONDS
-    until = time.monotonic() + 120
-    while "waiting for it" not in told(logs) and "went silent" not in told(logs):
-        assert time.monotonic() < until
-        time.sleep(0.1)
+    wait_for(lambda: not ("waiting for it" not in told(logs) and "went silent" not in told(logs)))
     labmic.restore()
     wait_for_frames(logs, len(features(logs)[0]) + 40)
     recorder.finish()

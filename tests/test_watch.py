@@ -18,6 +18,7 @@ from conftest import HEARTHLOG
 from PIL import Image
 from rerun.experimental import ViewerClient
 from viewers import Window, address_of, display
+from waiting import wait_for
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
@@ -125,14 +126,6 @@ def answer(operation):
         return operation()
     except (TimeoutError, ConnectionError):
         return None
-
-
-def wait_for(operation):
-    until = time.monotonic() + 90
-    while not (found := operation()):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    return found
 
 
 def is_there(picture, tint, column):

@@ -14,9 +14,10 @@ import numpy as np
 import psutil
 import pytest
 import tasks
-from clusters import DASK, LONG, PRIVATE, running, scheduler_in, until, worker_of
+from clusters import DASK, LONG, PRIVATE, running, scheduler_in, worker_of
 from dask.utils import key_split
 from distributed import Client
+from waiting import wait_for
 
 import hearthlog.analyzer.workers.cluster
 import hearthlog.analyzer.workers.members
@@ -96,7 +97,7 @@ def test_without_processes_a_task_is_done_when_it_was_submitted():
 def test_two_processes_run_two_tasks_at_once():
     with open_workers(2) as workers:
         first, second = (workers.submit(tasks.nap, 0.5) for _ in range(2))
-        until(lambda: len(_children()) == 2)
+        wait_for(lambda: len(_children()) == 2)
         assert wait([first, second], LONG).not_done == set()
         assert workers.parallel == 2
 
@@ -121,7 +122,7 @@ def test_a_task_that_kills_its_process_is_given_up_after_three():
 def test_leaving_the_block_ends_the_processes_and_lets_their_tasks_tidy_up(tmp_path):
     with open_workers(2) as workers:
         futures = [workers.submit(tasks.write_slowly, tmp_path) for _ in range(5)]
-        until(lambda: len(list(tmp_path.iterdir())) == 2)
+        wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
     assert all(future.done() for future in futures)
     assert not _children()
     assert not list(tmp_path.iterdir())
@@ -130,7 +131,7 @@ def test_leaving_the_block_ends_the_processes_and_lets_their_tasks_tidy_up(tmp_p
 _PARENT = """
 import sys
 import tasks
-from clusters import DASK, LONG, PRIVATE, running, scheduler_in, until, worker_of
+from clusters import DASK, LONG, PRIVATE, running, scheduler_in, worker_of
 from hearthlog.analyzer.workers import open_workers
 with open_workers(2) as workers:
     [workers.submit(tasks.write_slowly, sys.argv[1]) for _ in range(3)][0].result()
@@ -141,7 +142,7 @@ with open_workers(2) as workers:
 def test_processes_end_with_their_parent(tmp_path, end):
     command = [sys.executable, "-c", _PARENT, str(tmp_path)]
     with running(command, stderr=subprocess.PIPE) as parent:
-        until(lambda: len(list(tmp_path.iterdir())) == 2)
+        wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
         children = psutil.Process(parent.pid).children()
         os.killpg(parent.pid, end)
         assert parent.wait(LONG) == -end
@@ -228,7 +229,7 @@ def test_a_scheduler_that_goes_away_leaves_nothing_but_the_error_on_the_terminal
     with scheduler_in(tmp_path) as (address, scheduler), worker_of(address, "--no-nanny"):
         command = [sys.executable, "-c", _CLIENT, address, str(begun)]
         with running(command, stderr=subprocess.PIPE) as client:
-            until(begun.exists)
+            wait_for(begun.exists)
             scheduler.kill()
             assert client.wait(LONG) == 0
             said = client.stderr.read().decode()
@@ -265,7 +266,7 @@ def test_a_worker_with_another_hearthlog_that_joins_later_gets_nothing(cluster, 
         open_workers(scheduler=cluster) as workers,
         running([*start, cluster, *options], paths=paths, cwd=tmp_path),
     ):
-        until(lambda: workers.refused)
+        wait_for(lambda: workers.refused)
         assert workers.parallel == 1
         futures = [workers.submit(tasks.own_id) for _ in range(20)]
         assert len({future.result(LONG) for future in futures}) == 1
@@ -277,10 +278,10 @@ def test_a_worker_with_another_hearthlog_is_refused_before_a_run(cluster, tmp_pa
     options = ["--nthreads", "1", "--no-nanny", *PRIVATE]
     said = rf"the Dask worker at tcp://127\.0\.0\.1:\d+ has {has}, this is "
     with running([*start, cluster, *options], paths=paths, cwd=tmp_path):
-        until(lambda: _threads(cluster) == 2)
+        wait_for(lambda: _threads(cluster) == 2)
         with pytest.raises(WorkerError, match=said), open_workers(scheduler=cluster):
             pass
-    until(lambda: _threads(cluster) == 1)
+    wait_for(lambda: _threads(cluster) == 1)
 
 
 def test_tasks_go_on_when_all_workers_leave_and_others_come(tmp_path):
@@ -301,7 +302,7 @@ def test_a_task_that_fails_once_is_tried_again(cluster, tmp_path):
 def test_dask_names_tasks_after_their_functions(cluster, tmp_path):
     with open_workers(scheduler=cluster) as workers, Client(cluster, set_as_default=False) as other:
         futures = [workers.submit(tasks.touch_and_nap, str(tmp_path / "n"), 5) for _ in range(2)]
-        until((tmp_path / "n").exists)
+        wait_for((tmp_path / "n").exists)
         keys = [key for running in other.processing().values() for key in running]
         assert len(set(keys)) == 2
         assert {key_split(key) for key in keys} == {"touch_and_nap"}
