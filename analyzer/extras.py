@@ -9,8 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import HearthlogError, listed
 
 _CLUSTER = ("dask", "distributed", "fsspec", "s3fs", "upath")
 _EXTRAS = {

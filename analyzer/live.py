@@ -14,10 +14,10 @@ from hearthlog.models.modelfile.card import DESCRIPTION, attachment_of
 from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
 from hearthlog.recorder.rest import paused_until
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import check_allowed, find_logs, is_active, log_name
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
-from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
 Level = Literal["ok", "warning", "error"]
 _LEVELS: tuple[Level, ...] = ("ok", "warning", "error")  # by the levels of diagnostics

@@ -8,7 +8,7 @@ from threading import Thread
 from urllib.parse import urlsplit
 
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
 
 _SECONDS = 15.0
 _LONGEST = 1 << 12  # bytes of a file

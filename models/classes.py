@@ -4,15 +4,15 @@ import re
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
-from hearthlog.schemas.messages import labels
-from hearthlog.schemas.messages.labels import spelt
+from hearthlog.schemas.messages import topics
+from hearthlog.schemas.messages.topics import spelt
 
-SILENCE, SPEECH, MUSIC, PHONE_RING = labels.SILENCE, "speech", "music", "phone_ring"
+SILENCE, SPEECH, MUSIC, PHONE_RING = topics.SILENCE, "speech", "music", "phone_ring"
 COUGHING, CRYING, YELLING, LAUGHING = "coughing", "crying", "yelling", "laughing"
 FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
 OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
 OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no scenario that is built in
-OTHER, UNKNOWN = "other", labels.UNKNOWN  # for models and people; never learned
+OTHER, UNKNOWN = "other", topics.UNKNOWN  # for models and people; never learned
 OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # what it has no name for
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 

@@ -28,10 +28,9 @@ from hearthlog.recorder.rest import Rest, check_quiet_hours, quiet_hours
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.recorder.timezone import check_time_zone, machine_zone, time_zone
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.files import exposed_secret, read_toml
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name, check_scenario_name
-from hearthlog.schemas.storage.regular_file import exposed_secret
-from hearthlog.schemas.storage.small_file import read_toml
 
 ReadableBy = Literal["owner", "group", "all"]
 Keep = Literal["off", "events", "unsure", "always"]

@@ -27,8 +27,8 @@ from hearthlog.models.embedding.networks import (
 from hearthlog.models.embedding.runtimes import missing_modules
 from hearthlog.models.errors import ModelError
 from hearthlog.recorder.modules import module_command
+from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.text import printable
 
 NO_NETWORK = "none"  # in place of a name
 DEFAULT_NETWORK = YAMNET.name

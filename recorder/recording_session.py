@@ -39,7 +39,7 @@ from hearthlog.recorder.microphone_stream import MicrophoneStream
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.messages import EncodedMessage
-from hearthlog.schemas.messages.gaps import ON_PURPOSE
+from hearthlog.schemas.messages.message_types import ON_PURPOSE
 from hearthlog.schemas.messages.topics import LIVE
 
 NOT_RUNNING = "the recorder was not running"

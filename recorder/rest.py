@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.logs.files import log_readers
-from hearthlog.schemas.messages.gaps import PAUSED, QUIET_HOURS
-from hearthlog.schemas.storage.new_files import replaced_file
-from hearthlog.schemas.text import shortened
+from hearthlog.schemas.messages.message_types import PAUSED, QUIET_HOURS
+from hearthlog.schemas.new_files import replaced_file
 
 _FORM = re.compile(r"([01]\d|2[0-3]):([0-5]\d)-([01]\d|2[0-3]):([0-5]\d)")
 _DAY = 24 * 60

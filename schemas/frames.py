@@ -1,10 +1,97 @@
-"""The frame: the step in which sound becomes features and labels, in every log.
+"""The frame, the step in which every log counts time, and times as text.
 
-What is computed from a frame is a feature set's own concern; how long it is, and of how many
-samples, is not, for everything that reads logs counts time in frames.
+What is computed from a frame is a feature set's own concern; its length is the same for all logs.
 """
 
-from hearthlog.schemas.times import NANOSECONDS
+import re
+from datetime import UTC, datetime, timedelta
+
+NANOSECONDS = 1_000_000_000  # of a second
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
+
+
+def read_time(text: str) -> int:
+    """Read a time in ISO 8601.
+
+    Parameters
+    ----------
+    text : str
+        A date such as `2026-03-01`, or date and time such as `2026-03-01T07:00:00.123456789+01:00`;
+        UTC without an offset, at most nine decimals.
+
+    Returns
+    -------
+    int
+        Nanoseconds of UTC since 1970.
+
+    Raises
+    ------
+    ValueError
+        If the text is no time.
+    """
+    rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for them
+    moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    nanoseconds = (moment - _EPOCH) // timedelta(microseconds=1) * 1_000
+    return nanoseconds + (int(rest.group().ljust(3, "0")) if rest else 0)
+
+
+def millisecond_text(nanoseconds: int) -> str:
+    """Write a time in UTC, down to the millisecond.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Nanoseconds of UTC since 1970.
+
+    Returns
+    -------
+    str
+        Such as `2026-03-01T07:00:00.123Z`, or `<nanoseconds> ns` if no calendar has the time.
+    """
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    try:
+        moment = datetime.fromtimestamp(seconds, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{nanoseconds} ns"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03}Z"
+
+
+def time_text(nanoseconds: int) -> str:
+    """Write a time in UTC, with all nine decimals of its seconds.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Nanoseconds of UTC since 1970, within the years 1 to 9999.
+
+    Returns
+    -------
+    str
+        Such as `2026-03-01T07:00:00.123456789Z`.
+    """
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09}Z"
+
+
+def seconds_text(nanoseconds: int) -> str:
+    """Write a duration or a time in seconds, with all nine decimals.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        May be negative.
+
+    Returns
+    -------
+    str
+        Such as `-1.500000000`.
+    """
+    seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
+    return f"{'-' * (nanoseconds < 0)}{seconds}.{rest:09}"
+
 
 SAMPLE_RATE = 16_000  # Hz, one channel
 FRAME_SAMPLES = 800

@@ -7,9 +7,9 @@ import numpy as np
 
 from hearthlog.analyzer.accuracy.events import events_of
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.times import NANOSECONDS
 
 
 def expected_values(folder: Path, zone, root: str) -> dict[str, str]:

@@ -14,12 +14,11 @@ from logreader import LogMessage
 from mcap.records import Channel, Message, Metadata, Schema
 from rewriting import Log
 
-from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import SUFFIX, is_layer
-from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.logs.metadata import HEARTHLOG_METADATA, log_digest
 from hearthlog.schemas.messages import fields as schema_fields
 from hearthlog.schemas.messages import message_types, type_definitions
-from hearthlog.schemas.messages.versions import APPENDED, SCHEMA_VERSION, Appended
+from hearthlog.schemas.messages.message_types import APPENDED, SCHEMA_VERSION, Appended
 
 NEXT = SCHEMA_VERSION + 1
 
@@ -131,7 +130,7 @@ def _write(path: Path, target: Path) -> None:
         elif isinstance(record, Channel):
             name = old[record.schema_id].name
             record.metadata["topic_type_hash"] = message_types.type_hash(name)
-        elif isinstance(record, Metadata) and record.name == METADATA:
+        elif isinstance(record, Metadata) and record.name == HEARTHLOG_METADATA:
             record.metadata["schema_version"] = str(NEXT)
             if "input_sha256" in record.metadata:
                 of = target.with_name(record.metadata["log"])

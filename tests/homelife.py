@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, topics_of
-from hearthlog.schemas.times import NANOSECONDS
 
 GENERAL = [
     "silence",

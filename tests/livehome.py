@@ -10,13 +10,12 @@ from homelife import GENERAL
 
 from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, header, message
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, scenario_labelling, topics_of
-from hearthlog.schemas.times import NANOSECONDS
 
 FRAME = NANOSECONDS // 20
 MINUTE = 60 * NANOSECONDS

@@ -31,9 +31,9 @@ from mcap.records import (
 )
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.logs.contents_record import METADATA as CONTENTS
-from hearthlog.schemas.mcap.formats import MAGIC
+from hearthlog.schemas.logs.contents import CONTENTS_METADATA as CONTENTS
+from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA, TopicCount, rosbag2_metadata
+from hearthlog.schemas.mcap.records import MAGIC
 from hearthlog.schemas.messages.message_types import decode, encode
 
 HEAD = struct.Struct("<BQ")
@@ -146,13 +146,13 @@ class Log:
         schemas = {r.id: r.name for r in self.records() if isinstance(r, Schema)}
         counts, span = self._count()
         topics = {
-            c.topic: rosbag2.TopicCount(schemas.get(c.schema_id, ""), c.metadata, counts[i])
+            c.topic: TopicCount(schemas.get(c.schema_id, ""), c.metadata, counts[i])
             for i, c in channels.items()
             if {"offered_qos_profiles", "topic_type_hash"} <= c.metadata.keys()
         }
         for record in self.records():
-            if isinstance(record, Metadata) and record.name == rosbag2.METADATA:
-                record.metadata = rosbag2.file_metadata(name, topics, span)
+            if isinstance(record, Metadata) and record.name == ROSBAG2_METADATA:
+                record.metadata = rosbag2_metadata(name, topics, span)
 
 
 class _Layout:

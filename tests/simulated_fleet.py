@@ -5,8 +5,8 @@ import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
-from hearthlog.schemas.times import NANOSECONDS
 
 _FIRST_DAY = datetime(2026, 3, 1, 7, tzinfo=UTC)
 

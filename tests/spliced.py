@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.metadata import rosbag2_channel
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages.message_types import definition, encode, type_hash
 from hearthlog.schemas.messages.topics import Quality
@@ -88,7 +88,7 @@ def write_log(path: Path, topics: dict[str, Sequence[tuple[int, Any]]]) -> Path:
         for topic, messages in topics.items():
             name = messages[0][1].__msgtype__
             schema = writer.register_schema(name, "ros2msg", definition(name).encode())
-            about = rosbag2.channel_metadata(type_hash(name), Quality())
+            about = rosbag2_channel(type_hash(name), Quality())
             channel = writer.register_channel(topic, "cdr", schema, about)
             rows += [(time, channel, encode(message)) for time, message in messages]
         for number, (time, channel, data) in enumerate(sorted(rows, key=lambda row: row[0])):

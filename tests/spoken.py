@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hearthlog.models.starter import GENERAL, starter_file
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools import home
 from hearthlog.tools.lab.conversations import clips_of_voices, converse, record_samples
 

@@ -28,8 +28,8 @@ from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.accuracy_text import Accuracy
 
 DAY = date(2026, 3, 1)

@@ -46,10 +46,9 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, ignore_progress
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.home.clips import SHIPPED
 
 

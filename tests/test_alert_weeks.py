@@ -15,11 +15,10 @@ from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.topics import topics_of
-from hearthlog.schemas.times import NANOSECONDS
 
 HOUR = 60 * MINUTE
 NIGHTS, SOUNDS = 10, 5

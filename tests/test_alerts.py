@@ -40,8 +40,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, log_path
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.topics import topics_of
 
 

@@ -34,10 +34,10 @@ from hearthlog.analyzer.marks.marks import (
     write_marks,
 )
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, review_path
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.message_types import SEGMENT, duration_message, header, message
-from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 NAMES = [f"again{form.suffix}" for form in FORMATS]

@@ -34,7 +34,7 @@ from hearthlog.recorder.sources.file_times import (
     file_time,
 )
 from hearthlog.recorder.sources.open_audio import _mp3_frame, audio_seconds, is_audio
-from hearthlog.schemas.times import NANOSECONDS, read_time
+from hearthlog.schemas.frames import NANOSECONDS, read_time
 
 pytestmark = pytest.mark.fast
 

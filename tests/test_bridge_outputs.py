@@ -17,7 +17,7 @@ from hearthlog.analyzer.bridge.outputs import open_outputs, output_problems
 from hearthlog.analyzer.bridge.saying import Saying
 from hearthlog.analyzer.bridge.settings import BridgeSettings
 from hearthlog.analyzer.ports import free_port, listen
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

@@ -40,10 +40,10 @@ from hearthlog.analyzer.bridge.page.words import length, when
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.times import NANOSECONDS
 
 LIVED = [name for name in GENERAL if name not in {"silence", "crying"}]
 HOSTILE = '<img src=x onerror="document.title=1">'

@@ -34,8 +34,8 @@ from hearthlog.analyzer.discover.summary_file import (
     summary_path,
 )
 from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 
 NOW = int(datetime(2026, 3, 3, 12, tzinfo=UTC).timestamp()) * NANOSECONDS
 MOMENT = Moment(NOW, UTC)

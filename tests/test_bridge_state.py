@@ -21,9 +21,9 @@ from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.totals import Total, Totals
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

@@ -30,9 +30,9 @@ from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording_session import RecordingSession
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.times import NANOSECONDS
 
 MICROPHONE = SimpleNamespace(device="test")
 OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"

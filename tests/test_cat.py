@@ -24,10 +24,10 @@ from spliced import run, write_log
 from hearthlog.analyzer.export.text import _moments, in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.logs.typed_columns import decode_all
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.schemas.frames import NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages.message_types import (
     FEATURES,
@@ -40,7 +40,6 @@ from hearthlog.schemas.messages.message_types import (
     time_message,
 )
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 from hearthlog.tools.cli.options import parse_time
 
 

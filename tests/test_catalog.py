@@ -38,18 +38,15 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE
+from hearthlog.schemas.errors import HearthlogWarning, LogError, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs, time_span
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.mcap.records import FOOTER_SIZE
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.messages.topics import RELABEL, REVIEW, Topic
-from hearthlog.schemas.progress import ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 START = 1_772_352_000_000_000_000  # a full hour

@@ -20,11 +20,9 @@ import hearthlog.analyzer.logs.selection
 from hearthlog.analyzer.logs.catalog.catalog import FINISHED, read_catalog
 from hearthlog.analyzer.logs.catalog.making import write_catalog
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import CATALOG_INDEX, find_logs
+from hearthlog.schemas.errors import LogError, ignore_progress
+from hearthlog.schemas.logs.files import CATALOG_INDEX, find_logs, time_span
 from hearthlog.schemas.logs.writer import LogWriter
-from hearthlog.schemas.mcap.statistics import time_span
-from hearthlog.schemas.progress import ignore_progress
 
 __all__ = ["fleet", "recording"]
 _TICK = 0.05  # s; clocks of disks are finer

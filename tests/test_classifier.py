@@ -23,7 +23,7 @@ from hearthlog.models.classifiers.rbf_distances import (
     in_steps,
 )
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 
 pytestmark = pytest.mark.fast
 

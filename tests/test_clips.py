@@ -47,7 +47,7 @@ from hearthlog.recorder.stream.private_frames import PRIVATE_LIMIT
 from hearthlog.recorder.stream.private_frames import PRIVATE_LIMIT_ELSEWHERE as ELSEWHERE
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import audio_path, find_logs, is_layer, log_path
-from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.metadata import provenance
 from hearthlog.schemas.messages.message_types import nanoseconds
 
 SECOND = 1_000_000_000

@@ -24,7 +24,7 @@ from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.main import make_app
 
 pytestmark = pytest.mark.fast

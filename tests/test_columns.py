@@ -28,26 +28,29 @@ from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs import merged_reading
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
-from hearthlog.schemas.logs.files import active_path
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.files import active_path, time_span
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap import chunks as chunk_reading
 from hearthlog.schemas.mcap import logfile
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD
+from hearthlog.schemas.mcap.compressed_chunk import StoredChunk
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import FOOTER_SIZE, HEAD, read_footer
 from hearthlog.schemas.mcap.records import encode as encode_record
-from hearthlog.schemas.mcap.records import read_footer
-from hearthlog.schemas.mcap.statistics import time_span
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.gaps import encode_gap
-from hearthlog.schemas.messages.message_types import definition, encode, header, message, typestore
+from hearthlog.schemas.messages.message_types import (
+    definition,
+    encode,
+    encode_gap,
+    header,
+    message,
+    typestore,
+)
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

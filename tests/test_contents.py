@@ -23,23 +23,21 @@ from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.logs.contents import Contents
-from hearthlog.schemas.logs.contents_record import (
-    METADATA,
+from hearthlog.schemas.logs.contents import (
+    CONTENTS_METADATA,
+    LogContents,
     as_metadata,
     from_metadata,
     stated_contents,
 )
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import LogStreamWriter
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogStreamWriter, LogWriter
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.gaps import encode_gap
+from hearthlog.schemas.messages.message_types import encode_gap
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.salvage.recover import recover_log
-from hearthlog.schemas.salvage.thin import thin_log
+from hearthlog.schemas.salvage.recover import recover_log, thin_log
 
 START = 1_772_323_200 * 10**9
 LOST = {2: 25, 3: 400}
@@ -63,7 +61,7 @@ def stated(path):
 
 
 def counted(path):
-    contents = Contents()
+    contents = LogContents()
     with LogFile(path) as file:
         for batch in read_in_batches(file, file.chunks):
             contents.add(batch)
@@ -78,7 +76,7 @@ def check(path):
 def with_record(log, path, record):
     """Copy a log with another record of its contents."""
     rewritten = Log(log)
-    rewritten.items.append(Metadata(METADATA, record))
+    rewritten.items.append(Metadata(CONTENTS_METADATA, record))
     return rewritten.write(path)
 
 
@@ -112,7 +110,7 @@ def test_what_is_made_of_logs_says_what_its_messages_say(logs, hearthlog, tmp_pa
         check(path)
         with LogFile(path) as file:
             records = [file.record(place) for place in file.record_locations]
-        assert sum(getattr(record, "name", "") == METADATA for record in records) == 1
+        assert sum(getattr(record, "name", "") == CONTENTS_METADATA for record in records) == 1
     assert len(stated(made[0]).gaps) == 2
     assert "/hall/features" not in stated(made[3]).topics
 
@@ -135,7 +133,7 @@ def test_a_summary_of_finished_logs_reads_no_messages(logs, monkeypatch, tmp_pat
     expected = summarise(plain)
     monkeypatch.setattr(summarising, "read_in_batches", None)
     summary = summarise(logs)
-    assert summary.metadata == expected.metadata | {METADATA}
+    assert summary.metadata == expected.metadata | {CONTENTS_METADATA}
     ours = {"metadata": set(), "chunk_bytes": 0, "chunks": 0, "raw_bytes": 0}
     assert same(replace(summary, **ours), replace(expected, **ours))
 
@@ -143,7 +141,7 @@ def test_a_summary_of_finished_logs_reads_no_messages(logs, monkeypatch, tmp_pat
 @pytest.mark.parametrize("name", [b"version", b"sha256", b"silence"])
 def test_a_damaged_record_is_not_believed(logs, tmp_path, name):
     path, data = tmp_path / logs[0].name, logs[0].read_bytes()
-    start = data.rindex(METADATA.encode(), 0, data.rindex(b"topics"))
+    start = data.rindex(CONTENTS_METADATA.encode(), 0, data.rindex(b"topics"))
     place = data.index(name, start)
     path.write_bytes(
         data[:place] + data[place : place + len(name)].upper() + data[place + len(name) :]
@@ -229,9 +227,9 @@ def test_what_is_no_record_is_none(text):
 
 
 def test_a_log_with_very_many_gaps_says_nothing_of_them(tmp_path):
-    assert METADATA in names(gaps_in_log(tmp_path / "few.mcap", 100))
+    assert CONTENTS_METADATA in names(gaps_in_log(tmp_path / "few.mcap", 100))
     path = gaps_in_log(tmp_path / "many.mcap", 5000)
-    assert METADATA not in names(path)
+    assert CONTENTS_METADATA not in names(path)
     assert len(summarise([path]).gaps) == 5000
 
 
@@ -262,7 +260,7 @@ def test_the_doctor_finds_a_record_that_says_otherwise(logs, tmp_path):
 
 def test_a_long_log_is_counted_without_being_kept(monkeypatch):
     batches = []
-    monkeypatch.setattr(Contents, "add", lambda _, batch: batches.append(len(batch[0].buffer)))
+    monkeypatch.setattr(LogContents, "add", lambda _, batch: batches.append(len(batch[0].buffer)))
     writer = LogStreamWriter(BytesIO(), [Topic("/mic/audio", message_types.RAW_AUDIO)])
     for number in range(1000):
         writer.write_messages([(START + number, "/mic/audio", bytes(20_000))])

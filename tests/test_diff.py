@@ -37,14 +37,12 @@ from hearthlog.analyzer.review.queue.review_list import (
 )
 from hearthlog.analyzer.review.queue.uncertainty import uncertainty
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, read_time, time_text
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
 
 CLASSES = ("silence", "speech", "coughing")
 MIDNIGHT = read_time("2026-03-02T00:00:00")

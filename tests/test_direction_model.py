@@ -54,10 +54,9 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_370_123_456_789  # half a minute before the hour
 CORNER, DOOR = 0.5, -2.0  # radians

@@ -37,10 +37,10 @@ from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.schemas.frames import NANOSECONDS, read_time
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.lab.recurring_scene import OTHER
 
 START = 1_772_352_000 * NANOSECONDS

@@ -25,10 +25,9 @@ from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.log import live_log
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.recording_session import RecordingSession
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 490_000 * 3600 * NANOSECONDS
 BLOCK = 12  # frames

@@ -250,7 +250,7 @@ def test_what_is_wrong_in_a_page_is_noticed(tmp_path):
     assert unknown_targets("    make tea\n\n`make check`") == {"tea"}
     text = "[a](page.md#a-title) [b](page.md#b-title) [c](gone.md) [d](https://example.org)"
     assert broken_links(page, text) == ["page.md#b-title", "gone.md"]
-    text = "`schemas/gone.py` `docs/log.md` `hearthlog.schemas.times` `hearthlog.schemas.gone.f`"
+    text = "`schemas/gone.py` `docs/log.md` `hearthlog.schemas.frames` `hearthlog.schemas.gone.f`"
     assert missing_paths(text) == ["schemas/gone.py", "hearthlog.schemas.gone.f"]
 
 

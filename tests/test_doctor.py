@@ -51,11 +51,10 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, review_path
-from hearthlog.schemas.mcap.formats import MAGIC
+from hearthlog.schemas.mcap.records import MAGIC
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
 NAME = "home_20260301T070000Z.mcap"

@@ -17,7 +17,7 @@ from hearthlog.recorder.log.finishing import LogFinisher, finish_log
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
@@ -25,8 +25,7 @@ from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import EmbeddingSource, Topic
-from hearthlog.schemas.salvage.thin import STEPS, thin_log
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.salvage.recover import STEPS, thin_log
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
 TOPIC = "/mic/embedding"

@@ -24,7 +24,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import GENERAL, starter_file
-from hearthlog.schemas.storage.sealed_file import read_sealed, write_sealed
+from hearthlog.schemas.arrays import read_sealed, write_sealed
 
 pytestmark = pytest.mark.fast
 

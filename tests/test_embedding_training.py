@@ -47,7 +47,7 @@ from hearthlog.models.embedding.networks import YAMNET, load_embedder
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 
 HEARING = head_inputs_of("yamnet")
 WIDTH = len(HEARING.names)

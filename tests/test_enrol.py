@@ -22,11 +22,10 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.schemas.frames import FRAME_SAMPLES
+from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.schemas.times import NANOSECONDS
 
 RATE = 16_000
 FEATURES = topic("mic", "features")

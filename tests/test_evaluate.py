@@ -40,7 +40,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.scores import print_scores
 from hearthlog.tools.home.simulate import write_training_set
 

@@ -22,8 +22,8 @@ from hearthlog.analyzer.marks.formats.labels import Choice
 from hearthlog.analyzer.marks.label_import import ImportOptions, import_labels
 from hearthlog.analyzer.marks.marks import LATEST, Mark, read_marks
 from hearthlog.analyzer.marks.merge_marks import new_marks
+from hearthlog.schemas.frames import NANOSECONDS, seconds_text
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS, seconds_text
 
 SECOND = NANOSECONDS
 MILLISECOND = SECOND // 1000

@@ -29,6 +29,7 @@ from spliced import raw_messages, run, small_disk, write_log
 from hearthlog import open_logs
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter
@@ -37,7 +38,6 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds, time_message
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 KINDS = ("features", "statistics", "label", "segment", "gap", "info")
 RATE = 16_000

@@ -29,14 +29,13 @@ from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 HOUR = 3600 * NANOSECONDS
 START = 490_000 * HOUR
@@ -66,7 +65,7 @@ def content(path):
         for item in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
             found += breakup_chunk(item, validate_crc=True) if isinstance(item, Chunk) else [item]
     parts = {kind: [r for r in found if isinstance(r, kind)] for kind in (Message, Attachment)}
-    parts[Metadata] = [r for r in found if isinstance(r, Metadata) and r.name != rosbag2.METADATA]
+    parts[Metadata] = [r for r in found if isinstance(r, Metadata) and r.name != ROSBAG2_METADATA]
     parts[Schema] = {r.id: r for r in found if isinstance(r, Schema)}
     parts[Channel] = {r.id: r for r in found if isinstance(r, Channel)}
     return parts

@@ -15,19 +15,17 @@ from logs import features
 
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.schemas import files
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import read_time
 from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.logs.files import find_logs, log_path
-from hearthlog.schemas.logs.follow import follow, follow_messages
-from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.follow import FolderChanges, follow, follow_messages
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.raw_messages import in_order_of_time
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.storage import byte_ranges
-from hearthlog.schemas.storage.folder_changes import FolderChanges
-from hearthlog.schemas.times import read_time
 
 pytestmark = pytest.mark.fast
 
@@ -393,14 +391,14 @@ def test_a_folder_that_may_not_be_read_is_told_once_and_tried_again(tmp_path, mo
 def test_a_log_that_cannot_be_opened_is_told_once_and_tried_again(
     tmp_path, monkeypatch, start, first
 ):
-    is_free, open_regular = Event(), byte_ranges.open_regular
+    is_free, open_regular = Event(), files.open_regular
 
     def refuse(path):
         if not is_free.is_set():
             raise OSError(24, "Too many open files", str(path))
         return open_regular(path)
 
-    monkeypatch.setattr(byte_ranges, "open_regular", refuse)
+    monkeypatch.setattr(files, "open_regular", refuse)
     writer = log(tmp_path, "home_0.mcap")
     write(writer, 0)
     with Told(tmp_path, start=start) as followed:
@@ -417,7 +415,7 @@ def test_a_log_that_vanishes_before_it_is_opened_is_passed_over(tmp_path, monkey
     def vanish(path):
         raise FileNotFoundError(2, "No such file or directory", str(path))
 
-    monkeypatch.setattr(byte_ranges, "open_regular", vanish)
+    monkeypatch.setattr(files, "open_regular", vanish)
     writer = log(tmp_path, "home_0.mcap")
     with Told(tmp_path, start=0) as followed:
         sleep(1)
@@ -437,9 +435,9 @@ def test_old_logs_are_not_opened_and_after_each_other_one_the_caller_has_a_turn(
     tmp_path, monkeypatch
 ):
     old, *others = [of_day(tmp_path, f"2026-03-{day:02}") for day in (1, 4, 5, 6)]
-    opened, open_regular = [], byte_ranges.open_regular
+    opened, open_regular = [], files.open_regular
     monkeypatch.setattr(
-        byte_ranges, "open_regular", lambda path: opened.append(path) or open_regular(path)
+        files, "open_regular", lambda path: opened.append(path) or open_regular(path)
     )
     stop, turns = Event(), []
     start = read_time("2026-03-05")

@@ -22,7 +22,7 @@ from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 TAKEN = [file for file in FILES if not file.refused]

@@ -17,8 +17,8 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import MAGIC
 from hearthlog.schemas.messages.type_definitions import message_type
 
 TYPE = "our_msgs/msg/C"

@@ -21,8 +21,8 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 NUMBERS = st.one_of(

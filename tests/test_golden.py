@@ -45,7 +45,7 @@ from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.versions import SCHEMA_VERSION
+from hearthlog.schemas.messages.message_types import SCHEMA_VERSION
 
 pytestmark = pytest.mark.fast
 

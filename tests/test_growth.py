@@ -22,14 +22,20 @@ from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, join, read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.logs.provenance import provenance, read_provenance
+from hearthlog.schemas.logs.metadata import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows, encode_rows
 from hearthlog.schemas.messages.fields import difference, fields_of, type_hash_of
-from hearthlog.schemas.messages.message_types import definition, encode, header, message
+from hearthlog.schemas.messages.message_types import (
+    APPENDED,
+    SCHEMA_VERSION,
+    definition,
+    encode,
+    header,
+    message,
+)
 from hearthlog.schemas.messages.type_definitions import message_type
-from hearthlog.schemas.messages.versions import APPENDED, SCHEMA_VERSION
 
 GOLDEN = Path(__file__).parent / "golden"
 OURS = message_types._DEFINED_HERE[:-1]  # the last one is of Foxglove
@@ -344,7 +350,7 @@ def test_the_doctor_misses_what_the_version_of_a_log_had(golden, capfd, tmp_path
     log.metadata("hearthlog").metadata["schema_version"] = str(NEXT)
     log.write(golden)
     with grown_definitions(tmp_path), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hearthlog.schemas.logs.provenance._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
+        patch.setattr("hearthlog.schemas.logs.metadata._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
         said = json.loads(run(capfd, "doctor", golden, "--json").stdout)
     wrong = [each["what"] for each in said["findings"] if each["level"] == "error"]
     absent = {  # in this log

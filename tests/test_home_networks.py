@@ -28,9 +28,9 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder import recording
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.topics import EmbeddingSource, EmbeddingSpace
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_352_000 * NANOSECONDS
 DAY = 86_400 * NANOSECONDS

@@ -17,8 +17,8 @@ from spliced import run
 import hearthlog as package
 from hearthlog.analyzer.export import merge
 from hearthlog.schemas.errors import HearthlogWarning
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import FOOTER_SIZE, HEAD, MAGIC
 from hearthlog.schemas.messages.type_definitions import MessageType
 
 END = struct.pack("<BQQQI", 2, 20, 0, 0, 0) + MAGIC

@@ -20,11 +20,10 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 STEERING = "\x1b]0;evil\x07\x9b31m\x00\r\n"

@@ -23,9 +23,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 40}

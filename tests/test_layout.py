@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows
 from hearthlog.schemas.messages.message_types import definition, typestore
 from hearthlog.schemas.messages.type_definitions import message_type
-from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

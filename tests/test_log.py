@@ -17,10 +17,9 @@ from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

@@ -22,16 +22,14 @@ from hearthlog.recorder.log.recovery import end_of_sound, recover_active
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.gaps import LOG_DAMAGED, encode_gap
-from hearthlog.schemas.messages.message_types import nanoseconds
+from hearthlog.schemas.messages.message_types import LOG_DAMAGED, encode_gap, nanoseconds
 from hearthlog.schemas.messages.topics import Topic, topics_of
 from hearthlog.schemas.salvage.recover import NothingWholeError, recover_in_place, recover_log
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
 NAME = "home_20260301T070000Z.mcap"

@@ -23,7 +23,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 
 pytestmark = pytest.mark.fast
 

@@ -25,8 +25,8 @@ from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.rest import paused_until
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 
 ROOT = "hearthlog/home"
 COUGHING = f"{ROOT}/mic/class/coughing"

@@ -26,12 +26,12 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning, LogError
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.feature_record import (
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.metadata import (
     feature_entries,
     features_of_microphone,
     other_features,
 )
-from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import make_app
 
 _CLIPS = Path(__file__).parent / "data" / "household"

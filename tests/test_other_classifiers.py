@@ -42,7 +42,7 @@ from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.svm_rbf import weakest_pairs
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "classifiers"
 sys.path.insert(0, str(EXAMPLE))

@@ -18,7 +18,7 @@ from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.ports import free_port, listen
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

@@ -37,9 +37,8 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.clips.clip_choice import KeptSound
 from hearthlog.recorder.clips.clip_layer import ClipWriter
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, read_time
 from hearthlog.schemas.logs.files import active_path, find_logs, is_layer
-from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.record import record_composition

@@ -24,7 +24,7 @@ from hearthlog.recorder.sources.audio_files import FileSource, LongBlocks
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.metadata import provenance
 from hearthlog.schemas.messages.message_types import DIAGNOSTICS, LABEL, decode, nanoseconds
 
 pytestmark = pytest.mark.fast

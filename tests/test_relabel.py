@@ -41,13 +41,12 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.frames import SAMPLE_RATE
+from hearthlog.schemas.frames import NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import find_logs, is_layer, relabel_path
+from hearthlog.schemas.logs.metadata import log_digest
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.salvage.recover import recover_log
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_370_123_456_789  # half a minute after the hour
 EPOCH = {"SOURCE_DATE_EPOCH": "1772348400"}

@@ -43,11 +43,10 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.errors import HearthlogError, LogError, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import Attachment
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import Attachment, LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import (
     encode,
@@ -57,7 +56,6 @@ from hearthlog.schemas.messages.message_types import (
     time_message,
 )
 from hearthlog.schemas.messages.topics import Topic, topics_of
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.replay import replay as verb
 
 SECOND = 1_000_000_000

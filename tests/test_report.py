@@ -31,10 +31,9 @@ from hearthlog.analyzer.report.home_metrics import whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.times import NANOSECONDS
 
 
 @pytest.fixture

@@ -27,9 +27,8 @@ from hearthlog.recorder.disk.recorded import RecordedDays, recorded_logs
 from hearthlog.recorder.disk.retention import Disk, plan_retention
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.recording import record
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.files import active_path, find_logs, log_path
-from hearthlog.schemas.times import NANOSECONDS
 
 DAY = 86_400 * NANOSECONDS
 HOUR = 3600 * NANOSECONDS

@@ -20,8 +20,8 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.labeller import Labeller
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 
 pytestmark = pytest.mark.fast

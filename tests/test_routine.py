@@ -33,7 +33,7 @@ from hearthlog.analyzer.routine.day_profile import (
     Profiles,
 )
 from hearthlog.analyzer.routine.usual import learn, regular_hours
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 MONDAY = date(2026, 2, 2)
 VIENNA = ZoneInfo("Europe/Vienna")

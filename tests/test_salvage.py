@@ -29,10 +29,10 @@ from spliced import run
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.salvage.recover import NothingWholeError, recover_log
-from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 
 @pytest.fixture

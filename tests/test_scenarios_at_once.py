@@ -56,6 +56,7 @@ from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -66,8 +67,7 @@ from hearthlog.schemas.messages.topics import (
     parse_topic,
     scenario_labelling,
 )
-from hearthlog.schemas.salvage.thin import STEPS, thin_log
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.salvage.recover import STEPS, thin_log
 from hearthlog.tools.cli.options import scenario_files
 
 START = 1_772_348_400 * 1_000_000_000

@@ -16,8 +16,8 @@ from hearthlog.analyzer.evaluation.scenes import background, compose, compose_si
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import scenario_of
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 
 SECONDS = 60

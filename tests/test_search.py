@@ -24,7 +24,7 @@ from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.workers.parallel import fits_on, in_parallel, single_thread
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli import progress
 from hearthlog.tools.home.simulate import write_training_set
 

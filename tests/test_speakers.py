@@ -20,9 +20,9 @@ from hearthlog.analyzer.training.speakers import others_of, speaker_recordings, 
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.lab.conversations import converse, record_samples
 

@@ -16,15 +16,14 @@ from spliced import LOST, raw_messages, run, small_disk, write_log
 
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import Attachment, TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.metadata import rosbag2_channel
+from hearthlog.schemas.logs.writer import Attachment, LogWriter, TopicBatch
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import message
 from hearthlog.schemas.messages.topics import Quality, Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 INFO = Topic("/mic/info", "std_msgs/msg/String", Quality(depth=1, transient_local=True))
 FEATURES = Topic("/mic/features", message_types.FEATURES, array_names={"values": ["a", "b"]})
@@ -361,7 +360,7 @@ def test_it_is_not_repeated_where_it_is_said_at_the_start_or_is_not_wanted(heart
 
 
 def profile(history, depth, durability="transient_local"):
-    quality = json.loads(rosbag2.channel_metadata("", Quality())["offered_qos_profiles"])[0]
+    quality = json.loads(rosbag2_channel("", Quality())["offered_qos_profiles"])[0]
     return quality | {"history": history, "depth": depth, "durability": durability}
 
 

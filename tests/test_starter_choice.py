@@ -22,9 +22,9 @@ from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
 from hearthlog.recorder.embedder_probe import Probe, likely_network
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.options import starter_of
 from hearthlog.tools.cli.record import _tell_of_network
 

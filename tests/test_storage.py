@@ -26,13 +26,13 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.files import find_logs, time_span, topic_counts
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import time_span, topic_counts
-from hearthlog.schemas.storage.new_files import (
+from hearthlog.schemas.new_files import (
     check_new,
     create_file,
     hand_over,
@@ -43,7 +43,6 @@ from hearthlog.schemas.storage.new_files import (
     private_folder,
     replaced_file,
 )
-from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_352_000 * NANOSECONDS
 
@@ -232,7 +231,7 @@ def test_the_name_of_a_file_is_a_plain_path(tmp_path):
 
 def test_a_path_of_a_store_goes_to_other_processes(bucket, logs):
     log = find_logs(put(logs, bucket / "home"))[0]
-    count = "import pickle, sys; from hearthlog.schemas.mcap.statistics import topic_counts; "
+    count = "import pickle, sys; from hearthlog.schemas.logs.files import topic_counts; "
     count += "print(topic_counts(pickle.load(sys.stdin.buffer))['/mic/label'])"
     command = [sys.executable, "-c", count]
     done = subprocess.run(command, input=pickle.dumps(log), capture_output=True, check=True)

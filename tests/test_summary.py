@@ -25,10 +25,10 @@ from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
-from hearthlog.schemas.logs.contents import Gap
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.contents import LoggedGap
 from hearthlog.schemas.logs.files import active_path, find_logs
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import (
     definition,
@@ -39,7 +39,6 @@ from hearthlog.schemas.messages.message_types import (
     typestore,
 )
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 START = 1_772_348_370_123_456_789
@@ -162,7 +161,7 @@ def test_labels_segments_and_gaps_are_those_of_the_messages(logs, model_file):
         sum(nanoseconds(m.duration) for m in doubtful) / SECOND
     )
     assert summary.gaps == [
-        Gap(
+        LoggedGap(
             "hall",
             nanoseconds(m.header.stamp),
             nanoseconds(m.duration) / SECOND,
@@ -386,7 +385,7 @@ def test_a_type_of_ours_with_another_field_is_understood(tmp_path):
         channel = writer.register_channel("/mic/gap", "cdr", schema)
         writer.add_message(channel, START, encode(gap) + bytes(4), START)
         writer.finish()
-    assert summarise([path]).gaps == [Gap("mic", START, 2.0, "overrun", 40)]
+    assert summarise([path]).gaps == [LoggedGap("mic", START, 2.0, "overrun", 40)]
 
 
 def test_a_message_that_is_not_of_its_type_is_damage_in_its_file(tmp_path):

@@ -21,12 +21,12 @@ from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.disk.keeping import keep_disk
 from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, log_path
-from hearthlog.schemas.logs.provenance import provenance_records
+from hearthlog.schemas.logs.metadata import provenance_records
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.salvage.thin import STEPS, thin_log, thinned_step
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.salvage.recover import STEPS, thin_log, thinned_step
 
 
 @pytest.fixture
@@ -267,7 +267,7 @@ def test_a_dry_run_says_what_would_be_thinned(logs, tmp_path, hearthlog):
 
 def test_what_a_newer_version_has_thinned_is_left_alone(recorded, tmp_path, monkeypatch):
     copy = tmp_path / recorded[0].name
-    monkeypatch.setattr("hearthlog.schemas.salvage.thin.STEPS", ("", "all that is silent"))
+    monkeypatch.setattr("hearthlog.schemas.salvage.recover.STEPS", ("", "all that is silent"))
     thin_log(recorded[0], copy, 1)
     monkeypatch.undo()
     with pytest.raises(LogError, match="in a way that this version does not know"):

@@ -56,15 +56,13 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import audio_path, find_logs
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.progress import ignore_progress
 
 __all__ = ["viewer"]  # a fixture
 

@@ -24,7 +24,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.train import print_figures, train
 from hearthlog.tools.home.simulate import write_training_set
 

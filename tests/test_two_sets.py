@@ -25,9 +25,9 @@ from hearthlog.models.features.installed import DEFAULT, FEATURE_SETS
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.options import METHOD
 
 START = 1_772_348_400 * NANOSECONDS

@@ -48,9 +48,9 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.frames import NANOSECONDS, read_time
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS, read_time
 from hearthlog.tools.lab.conversations import converse
 
 SPREAD = voice_space().spread

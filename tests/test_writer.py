@@ -11,19 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import LogWriter
-from hearthlog.schemas.mcap import stored_chunk
-from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.mcap import compressed_chunk
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, header, message
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
@@ -57,8 +55,8 @@ BATCHES = st.lists(
 @settings(deadline=None)
 @given(BATCHES, st.sampled_from([100, 1000, 5000, 1 << 20]), st.lists(st.booleans(), min_size=6))
 def test_blocks_make_the_same_file_as_single_messages(batches, chunk_size, flushed):
-    level_of_mcap = patch.object(stored_chunk, "_LEVEL", 3)
-    with level_of_mcap, patch.object(stored_chunk, "_LOCAL", stored_chunk._Local()):
+    level_of_mcap = patch.object(compressed_chunk, "_LEVEL", 3)
+    with level_of_mcap, patch.object(compressed_chunk, "_LOCAL", compressed_chunk._Local()):
         check_files(batches, chunk_size, flushed)
 
 

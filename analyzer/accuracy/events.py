@@ -6,7 +6,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, joined, lengths
 from hearthlog.models.classes import COUGHING, CRYING, LAUGHING, SILENCE, YELLING
 from hearthlog.schemas.arrays import Bool, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 MINUTE = 60 * NANOSECONDS
 SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which a television has, too

@@ -8,11 +8,10 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import find_logs, log_name
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.logs.files import find_logs, log_name, time_span
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _LATER = 60 * NANOSECONDS  # than its end a segment is written at most
 _FIELDS = "header.stamp", "duration", "label"

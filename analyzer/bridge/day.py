@@ -4,7 +4,7 @@ from datetime import timedelta, tzinfo
 from typing import NamedTuple
 
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, local_time, midnight
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 
 class Today(NamedTuple):

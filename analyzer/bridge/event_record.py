@@ -4,7 +4,7 @@ from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from typing import NamedTuple
 
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 PAUSE_SECONDS = 10  # between the segments of one event, at most: as in the report
 

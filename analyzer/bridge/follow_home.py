@@ -14,16 +14,16 @@ from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
 from hearthlog.analyzer.bridge.listeners import listener_of
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import is_layer, log_name
 from hearthlog.schemas.logs.follow import follow_messages
-from hearthlog.schemas.logs.provenance import provenance_records, unknown_version
+from hearthlog.schemas.logs.metadata import provenance_records, unknown_version
 from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, is_scenario, parse_topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _LATEST = 60 * NANOSECONDS  # of labels and diagnostics: of the older ones nothing is left
 _WAIT_SECONDS = 1.0

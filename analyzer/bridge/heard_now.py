@@ -6,7 +6,7 @@ import numpy as np
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 ANY_SOUND = ""  # in place of a class: whatever is not silence
 HOLD_SECONDS = 10  # after the last frame of a class, it is over; as events are

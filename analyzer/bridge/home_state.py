@@ -15,10 +15,10 @@ from hearthlog.analyzer.bridge.heard_now import HeardNow
 from hearthlog.analyzer.bridge.listeners import is_of_scenario, listener_of
 from hearthlog.analyzer.logs.spans import joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import TopicName, parse_topic
-from hearthlog.schemas.times import NANOSECONDS
 
 FIELDS = {
     message_types.LABEL: ("label", "confidence"),

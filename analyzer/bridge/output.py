@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from hearthlog.analyzer.bridge.day import Today
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 RECENT = 60 * NANOSECONDS  # after its end an event is no news
 

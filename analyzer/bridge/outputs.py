@@ -23,8 +23,8 @@ from hearthlog.analyzer.ping import has_password, read_ping_address
 from hearthlog.analyzer.ports import ip_of, listen
 from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.storage.regular_file import exposed_secret
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.files import exposed_secret
+from hearthlog.schemas.frames import NANOSECONDS
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher

@@ -30,8 +30,8 @@ from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
 from hearthlog.analyzer.ports import HOST, is_asked_in_digits
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import create_file, replaced_file
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.new_files import create_file, replaced_file
 
 _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
 _LATER = 12 * 3600 * NANOSECONDS  # than its beginning an event may be known

@@ -15,7 +15,7 @@ from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import RECENT, News, Output
 from hearthlog.recorder.memory import give_back, keep_one_heap
 from hearthlog.recorder.service_manager import notify
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _WATCHDOG_SECONDS = 10.0
 _MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of

@@ -30,7 +30,7 @@ from hearthlog.recorder.config import (
 from hearthlog.recorder.config_origins import Origins, key_lines
 from hearthlog.recorder.config_problems import configuration_error
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.schemas.storage.small_file import read_toml
+from hearthlog.schemas.files import read_toml
 
 _MOST_OF_TOPIC = 200  # characters
 _COLLECTED = ".prom"  # ends the names that the textfile collector of node_exporter reads

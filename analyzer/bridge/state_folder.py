@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.schemas.storage.new_files import private_folder
+from hearthlog.schemas.new_files import private_folder
 
 _OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between them
 

@@ -10,8 +10,8 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.storage.new_files import replaced_file
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.new_files import replaced_file
 
 TOTALS = "totals.json"  # in the folder of the state
 _LIMIT = 1 << 20  # bytes

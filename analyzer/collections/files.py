@@ -8,7 +8,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.recorder.sources.audio_files import files_below
 from hearthlog.recorder.sources.open_audio import is_audio
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
 
 _TABLE_LIMIT = 128 << 20  # the largest, of AudioSet, has 50 MB
 _JSON_LIMIT = 256 << 20

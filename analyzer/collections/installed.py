@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.collections.clip import CollectionClip
 from hearthlog.analyzer.errors import DataError
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 
 class Collection(NamedTuple):

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import OTHER, OTHER_NEGATIVE, UNKNOWN, find_class
 from hearthlog.models.classifiers.description import TEXT
-from hearthlog.schemas.storage.small_file import read_toml
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
+from hearthlog.schemas.files import read_toml
 
 _KEYS = {"labels", "broad", "skip", "keep"}
 BROAD = "only broad categories"

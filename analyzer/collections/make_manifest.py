@@ -18,8 +18,8 @@ from hearthlog.analyzer.logs.text_files import disarmed
 from hearthlog.analyzer.training.manifest import OPTIONAL, REQUIRED, SIZE_LIMIT
 from hearthlog.models.classes import OTHER_NEGATIVE
 from hearthlog.models.classifiers.description import TEXT
-from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.storage.new_files import new_file
+from hearthlog.schemas.errors import Progress
+from hearthlog.schemas.new_files import new_file
 
 _COLUMNS = (*REQUIRED, *OPTIONAL, "detail")
 _UNLABELLED = "nothing in it that the collection has a category for"

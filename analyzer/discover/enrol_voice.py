@@ -10,7 +10,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.enrol import Enrolled, cut_path, enrol_log
 from hearthlog.analyzer.training.speakers import APART
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _LEAST = 2 * NANOSECONDS  # of a turn
 _ENOUGH = 60 * NANOSECONDS

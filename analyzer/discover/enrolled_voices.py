@@ -12,7 +12,7 @@ from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.speakers import is_voice
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.times import time_text
+from hearthlog.schemas.frames import time_text
 
 _QUIET = 10 ** (-30 / 10)  # of the loud frames
 _MOST_FRAMES = 6_000  # of a voice

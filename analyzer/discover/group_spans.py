@@ -11,7 +11,7 @@ from hearthlog.analyzer.discover.read_sounds import read_sounds
 from hearthlog.analyzer.discover.sound_spans import ALL
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.errors import Progress, ignore_progress
 
 
 class GroupSpans(NamedTuple):

@@ -23,11 +23,11 @@ from hearthlog.analyzer.discover.groups import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.classifiers.description import MOST_VALUES
+from hearthlog.schemas.arrays import read_sealed, write_sealed
+from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.messages.topics import EmbeddingSpace
-from hearthlog.schemas.storage.new_files import open_lock, replaced_file
-from hearthlog.schemas.storage.sealed_file import read_sealed, write_sealed
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.new_files import open_lock, replaced_file
 
 GROUPS = "groups.safetensors"  # in a folder of logs
 _KEY = "hearthlog_groups"

@@ -16,9 +16,8 @@ from hearthlog.analyzer.marks.marks import (
     read_reviewed,
     write_marks,
 )
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 
 class Looked(NamedTuple):

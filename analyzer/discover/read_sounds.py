@@ -18,11 +18,10 @@ from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.embeddings import mean_embeddings
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 _FIELDS = {"header.stamp", "values", "label", "confidence"}
 

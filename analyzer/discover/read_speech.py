@@ -22,14 +22,12 @@ from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, microphone_of, parse_topic, topic
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = {"header.stamp", "values", "duration", "label", "probabilities"}
 _NEVER = 1 << 62

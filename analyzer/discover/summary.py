@@ -15,8 +15,8 @@ from hearthlog.analyzer.discover.summary_file import (
 )
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.text import printable, shortened
-from hearthlog.schemas.times import NANOSECONDS, time_text
+from hearthlog.schemas.errors import printable, shortened
+from hearthlog.schemas.frames import NANOSECONDS, time_text
 
 _HOURS = 24
 _SHOWN = 3

@@ -9,10 +9,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.frames import NANOSECONDS, read_time
 from hearthlog.schemas.logs.files import log_readers
-from hearthlog.schemas.storage.new_files import replaced_file
-from hearthlog.schemas.storage.small_file import read_whole
-from hearthlog.schemas.times import NANOSECONDS, read_time
+from hearthlog.schemas.new_files import replaced_file
 
 SUMMARY: Final = "groups.safetensors.json"  # in a folder of logs, beside the file of groups
 MOST_GROUPS = 1_000  # in a file

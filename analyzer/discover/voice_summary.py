@@ -12,7 +12,7 @@ from hearthlog.analyzer.discover.home_voices import Voices
 from hearthlog.analyzer.discover.read_speech import HomeSpeech
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _HOURS = 24
 _SHOWN = 3

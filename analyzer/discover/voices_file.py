@@ -13,10 +13,10 @@ from hearthlog.analyzer.discover.voice_space import voice_space
 from hearthlog.analyzer.discover.voices import Evidence
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
+from hearthlog.schemas.arrays import read_sealed, write_sealed
+from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.logs.files import log_readers
-from hearthlog.schemas.storage.new_files import replaced_file
-from hearthlog.schemas.storage.sealed_file import read_sealed, write_sealed
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.new_files import replaced_file
 
 VOICES = "voices.safetensors"  # in a folder of logs
 _KEY = "hearthlog_voices"

@@ -6,9 +6,8 @@ from pathlib import Path
 from hearthlog.analyzer.doctor.file_checks import ExaminedFile, examine_file
 from hearthlog.analyzer.doctor.findings import Finding, Findings
 from hearthlog.analyzer.doctor.folder_checks import check_leftovers, check_series
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.files import check_allowed, find_logs
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 __all__ = ["ExaminedFile", "Finding", "Findings", "examine", "examine_file"]
 

@@ -20,7 +20,7 @@ from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.messages.gaps import CLOCK_SET, LOG_DAMAGED, ON_PURPOSE
+from hearthlog.schemas.messages.message_types import CLOCK_SET, LOG_DAMAGED, ON_PURPOSE
 from hearthlog.schemas.messages.topics import ROSOUT, EmbeddingSource
 
 STAMP = "header.stamp"

@@ -22,25 +22,22 @@ from hearthlog.analyzer.doctor.mcap.summary_section import SummarySection
 from hearthlog.analyzer.doctor.message_checks import MessageChecks
 from hearthlog.analyzer.doctor.metadata_checks import ATTACHMENTS, MetadataChecks
 from hearthlog.analyzer.doctor.topic_types import ALWAYS, LOG_NAME, split_topic
-from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.columns import decode, faults, unreadable
-from hearthlog.schemas.logs.contents import Contents
-from hearthlog.schemas.logs.contents_record import METADATA as CONTENTS
-from hearthlog.schemas.logs.contents_record import stated_contents
-from hearthlog.schemas.logs.log_stream import ENCODING
-from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
-from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.logs.contents import CONTENTS_METADATA as CONTENTS
+from hearthlog.schemas.logs.contents import LogContents, stated_contents
+from hearthlog.schemas.logs.metadata import HEARTHLOG_METADATA, provenance_records, unknown_version
+from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA as ROSBAG2
+from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.chunks import read_in_batches
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC, not_mcap
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.records import read_footer
-from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.mcap.records import FOOTER_SIZE, HEAD, MAGIC, not_mcap, read_footer
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
 _MOST_WRONG = 20_000  # faults of a channel that are unlike, before the rest is passed over
-_KEPT = {METADATA, ROSBAG2, CONTENTS, *ATTACHMENTS}
+_KEPT = {HEARTHLOG_METADATA, ROSBAG2, CONTENTS, *ATTACHMENTS}
 
 
 @dataclass
@@ -101,14 +98,16 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
         findings.error("footer", "there is no Footer at the end", RECOVER)
     else:
         _report_unfinished(findings, active=active)
-    for text in {unknown_version(record) for record in data.metadata.get(METADATA, [])} - {""}:
+    for text in {
+        unknown_version(record) for record in data.metadata.get(HEARTHLOG_METADATA, [])
+    } - {""}:
         findings.warning("newer", text)
     if isinstance(checks, MessageChecks):
         checks.finish()
         whole = data.whole and not walk.damaged
         MetadataChecks(data, checks, findings, finished=complete, whole=whole).check()
         examined.ours, examined.frames = True, checks.frames
-        examined.node = data.metadata.get(METADATA, [{}])[0].get("node", "")
+        examined.node = data.metadata.get(HEARTHLOG_METADATA, [{}])[0].get("node", "")
     if CONTENTS in data.metadata and complete and data.whole and not walk.damaged:
         _check_contents(findings)
     examined.span = data.span
@@ -208,7 +207,7 @@ def _check_contents(findings: Findings) -> None:
     """Compare what the file says of its messages with what they say."""
     try:
         with LogFile(findings.path) as file:
-            stated, actual = stated_contents(file), Contents()
+            stated, actual = stated_contents(file), LogContents()
             for batch in read_in_batches(file, file.chunks):
                 actual.add(batch)
     except LogError:

@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.schemas.text import printable
-from hearthlog.schemas.times import millisecond_text
+from hearthlog.schemas.errors import printable
+from hearthlog.schemas.frames import millisecond_text
 
 Level = Literal["error", "warning"]
 _SHOWN = 5  # findings of one kind in one file

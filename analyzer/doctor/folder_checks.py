@@ -9,9 +9,8 @@ from hearthlog.analyzer.doctor.file_checks import ExaminedFile
 from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.message_checks import ALLOWED_DELAY
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, log_of_layer
-from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
 _DAY = re.compile(r"\d{4}/\d{2}/\d{2}")
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by

@@ -36,16 +36,15 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import DESCRIPTION, attachment_of
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.logs.provenance import METADATA, THINNED, describes_model
+from hearthlog.schemas.logs.metadata import HEARTHLOG_METADATA, THINNED, describes_model
 from hearthlog.schemas.mcap.chunk_writer import GATHERED_SPAN
 from hearthlog.schemas.messages.fields import difference
-from hearthlog.schemas.messages.gaps import LOG_DAMAGED
+from hearthlog.schemas.messages.message_types import LOG_DAMAGED
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.messages.type_definitions import message_type
-from hearthlog.schemas.salvage.thin import dropped_kinds
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.salvage.recover import dropped_kinds
 
 # In ns, by how much the messages of one microphone may come behind those of another.
 ALLOWED_DELAY = 10 * NANOSECONDS
@@ -284,7 +283,7 @@ def _class_names(columns: Columns) -> list[str]:
 
 def _thinned_kinds(data: DataSection) -> set[str]:
     """Return which kinds of messages a file says were dropped when it grew old."""
-    steps = {record.get(THINNED) for record in data.metadata.get(METADATA, [])}
+    steps = {record.get(THINNED) for record in data.metadata.get(HEARTHLOG_METADATA, [])}
     return {kind for step in steps for kind in dropped_kinds(step)}
 
 
@@ -295,7 +294,7 @@ def _label_timing(
 
     In the first version nothing says it, and labels speak of the end of a window.
     """
-    records = data.metadata.get(METADATA, [])
+    records = data.metadata.get(HEARTHLOG_METADATA, [])
     if DESCRIPTION not in data.attachments and all(map(describes_model, records)):
         return None
     try:

@@ -25,12 +25,17 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
-from hearthlog.schemas.logs.log_stream import PROFILE, SCHEMA_ENCODING
-from hearthlog.schemas.logs.provenance import METADATA, describes_model, schema_version
-from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
-from hearthlog.schemas.logs.scenario_record import recorded_scenarios
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
+from hearthlog.schemas.logs.metadata import (
+    HEARTHLOG_METADATA,
+    describes_model,
+    recorded_scenarios,
+    schema_version,
+)
+from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA as ROSBAG2
+from hearthlog.schemas.logs.writer import PROFILE, SCHEMA_ENCODING
 from hearthlog.schemas.messages.fields import difference, type_hash_of
+from hearthlog.schemas.messages.message_types import SCHEMA_VERSION
 from hearthlog.schemas.messages.topics import (
     CANDIDATE,
     EmbeddingSource,
@@ -39,8 +44,6 @@ from hearthlog.schemas.messages.topics import (
     topics_of,
 )
 from hearthlog.schemas.messages.type_definitions import message_type
-from hearthlog.schemas.messages.versions import SCHEMA_VERSION
-from hearthlog.schemas.times import NANOSECONDS
 
 _TIME = "%Y%m%dT%H%M%SZ"
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
@@ -91,14 +94,15 @@ class MetadataChecks:
         self._findings.error(rule, what, DISTRUST)
 
     def _check_metadata(self) -> None:
-        records = self._data.metadata.get(METADATA, [])
+        records = self._data.metadata.get(HEARTHLOG_METADATA, [])
         if len(records) != 1:
             self._error(
-                "metadata", f"there are {len(records)} metadata records {METADATA}, not one"
+                "metadata",
+                f"there are {len(records)} metadata records {HEARTHLOG_METADATA}, not one",
             )
             return
         if missing := sorted(_KEYS - records[0].keys()):
-            self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
+            self._error("metadata", f"metadata {HEARTHLOG_METADATA} lacks {', '.join(missing)}")
         attachments = self._data.attachments
         one = 1 if records[0].get("model") else 0
         least_models = one if describes_model(records[0]) else 0
@@ -112,7 +116,8 @@ class MetadataChecks:
             digest = hashlib.sha256(attachments[_CONFIGURATION][0]).hexdigest()
             if records[0].get("configuration_sha256") != digest:
                 self._error(
-                    "attachments", f"{_CONFIGURATION} is not the one of metadata {METADATA}"
+                    "attachments",
+                    f"{_CONFIGURATION} is not the one of metadata {HEARTHLOG_METADATA}",
                 )
 
     def _check_name(self) -> None:
@@ -121,7 +126,7 @@ class MetadataChecks:
         named = LOG_NAME.fullmatch(path.name)
         if named is None:
             return
-        records = self._data.metadata.get(METADATA, [])
+        records = self._data.metadata.get(HEARTHLOG_METADATA, [])
         node = records[0].get("node", named["node"]) if records else named["node"]
         if node != named["node"]:
             self._error("name", f"the name says node {named['node']}, the file {node}")
@@ -149,7 +154,7 @@ class MetadataChecks:
             expected["window_seconds"] = features.window_seconds
             expected["feature_names"] = list(features.feature_names)
         is_first = microphone == next(iter(self._infos))  # the record is about its model
-        for record in self._data.metadata.get(METADATA, [])[:is_first]:
+        for record in self._data.metadata.get(HEARTHLOG_METADATA, [])[:is_first]:
             expected |= {k: record.get(k) for k in ("feature_set", "model", "model_sha256")}
         for name, value in expected.items():
             if _plain(info[name]) != value:
@@ -163,7 +168,7 @@ class MetadataChecks:
     def _check_topics(self) -> None:
         """Compare the channels with those that a recorder writes."""
         expected: dict[str, Topic] = {}
-        records = self._data.metadata.get(METADATA, [])
+        records = self._data.metadata.get(HEARTHLOG_METADATA, [])
         candidates = [CANDIDATE] if any(record.get("candidate") for record in records) else []
         scenarios = [one for record in records for one in recorded_scenarios(record)]
         for microphone, info in self._infos.items():
@@ -215,7 +220,7 @@ class MetadataChecks:
 
     def _check_definition(self, channel: Channel, schema: Schema) -> None:
         """Compare a definition with those of released versions, and its hash with the channel's."""
-        records = self._data.metadata.get(METADATA, [{}])
+        records = self._data.metadata.get(HEARTHLOG_METADATA, [{}])
         try:
             kind = message_type(schema.name, schema.encoding, schema.data)
             what = difference(kind, schema_version(records[0]) or SCHEMA_VERSION)

@@ -12,8 +12,7 @@ from hearthlog.analyzer.evaluation.event_scores import Events, events_of
 from hearthlog.analyzer.logs.labellings import NamedLabelling
 from hearthlog.analyzer.logs.spans import Overlay, overlay
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS

@@ -26,12 +26,11 @@ from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import REVIEW, microphone_of, parse_topic, scenario_name
-from hearthlog.schemas.times import NANOSECONDS
 
 _BLOCK = 300 * NANOSECONDS
 _MOST_BLOCKS = 1000

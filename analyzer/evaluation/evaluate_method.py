@@ -17,7 +17,7 @@ from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, r
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.errors import Progress
 
 Kind = Literal["segment", "source", "collection"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -36,10 +36,9 @@ from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Float32, Float64, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
+from hearthlog.schemas.errors import Progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
-from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _LEAST = 1e-30
 _ROOM_SECONDS = 2  # longer than any label lasts by its window

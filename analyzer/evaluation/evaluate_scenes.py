@@ -43,9 +43,8 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 
 _START = 1_772_323_200 * NANOSECONDS  # of every scene; any full hour does
 _APART = 24 * 3600 * NANOSECONDS

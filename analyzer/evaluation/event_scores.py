@@ -17,7 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces, ranges
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 COLLAR = NANOSECONDS // 5
 _PART_OF_LENGTH = 0.5

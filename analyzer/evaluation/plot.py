@@ -9,8 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hearthlog.analyzer.training.scores import Bin, Scores
-from hearthlog.schemas.storage.new_files import new_file
-from hearthlog.schemas.text import shortened
+from hearthlog.schemas.errors import shortened
+from hearthlog.schemas.new_files import new_file
 
 _NAME_WIDTH = 16
 

@@ -11,7 +11,7 @@ from hearthlog.analyzer.evaluation.evaluate_scenes import ScenesEvaluation
 from hearthlog.analyzer.evaluation.plot import draw_f1, new_figure, plot_names, save_figure
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _ROW_MINUTES = 10
 _MOST_ROWS = 3

@@ -6,11 +6,11 @@ from typing import BinaryIO
 from hearthlog.analyzer.export.exporter import Table, table_exporter
 from hearthlog.analyzer.logs.selection import Damages, Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.schemas.errors import printable
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, iterate_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic as topic_of
-from hearthlog.schemas.text import printable
-from hearthlog.schemas.times import NANOSECONDS
 
 
 class LabelTrack:

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.export.merge import bag_metadata
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.files import is_local
 from hearthlog.schemas.logs.files import find_logs, is_active, is_layer
-from hearthlog.schemas.logs.rosbag2 import FileCounts, TopicCount, metadata_yaml
+from hearthlog.schemas.logs.metadata import FileCounts, TopicCount, rosbag2_yaml
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.byte_ranges import is_local
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.new_files import replaced_file
 
 METADATA = "metadata.yaml"
 _DESCRIPTION = {"offered_qos_profiles", "topic_type_hash"}
@@ -58,7 +57,7 @@ def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagIn
     counts.sort(key=lambda file: file.span)
     path = folder / METADATA
     with replaced_file(path) as temporary:
-        temporary.write_text(metadata_yaml(counts), "utf-8")
+        temporary.write_text(rosbag2_yaml(counts), "utf-8")
     return BagInPlace(path, unfinished, [folder / name for name in _overlapping(counts)])
 
 

@@ -24,8 +24,8 @@ from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.text_files import FORMULA, NUMBER
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.fields import DURATION, Field
-from hearthlog.schemas.times import NANOSECONDS
 
 _CONTROLS = r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # CSV has tabs and the ends of lines alone
 _IN_THEIR_PLACE = "\ufffd"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.export.file_names import file_stem, unused_name
 from hearthlog.analyzer.logs.selection import Described, Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
-from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, abridged, listed
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import (
     DURATION,
@@ -26,8 +26,6 @@ from hearthlog.schemas.messages.fields import (
 )
 from hearthlog.schemas.messages.message_types import number_type
 from hearthlog.schemas.messages.type_definitions import message_type
-from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.text import abridged, listed
 
 MOST_COLUMNS = 4096  # of an array whose elements have no names; images have more
 _NAMED = 8  # fields in a line

@@ -22,27 +22,24 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from hearthlog.analyzer.export.file_names import unused_name
 from hearthlog.analyzer.export.repeats import without_repeats
 from hearthlog.analyzer.logs.selection import Damages, Described, Selection, identity
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.logs.counted_writer import CountedWriter
-from hearthlog.schemas.logs.log_stream import ENCODING
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunk_table import RecordLocation
+from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA, TopicCount, rosbag2_metadata
+from hearthlog.schemas.logs.writer import ENCODING, CountedWriter
+from hearthlog.schemas.mcap.chunk_index import RecordLocation
+from hearthlog.schemas.mcap.chunk_writer import Block, message_blocks
 from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
-from hearthlog.schemas.mcap.formats import HEAD, UINT32
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, UINT32
 from hearthlog.schemas.messages.message_types import PACKAGE
-from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.new_files import new_file
 from hearthlog.schemas.salvage.whole_records import (
     AttachmentHead,
     attachment_head,
     encode_attachment,
 )
-from hearthlog.schemas.storage.new_files import new_file
-from hearthlog.schemas.times import NANOSECONDS
 
 _PIECE = 1 << 20  # bytes
 _CHANNELS_LIMIT = (1 << 16) - 1
@@ -193,9 +190,9 @@ class _Log:
         """Complete the log; return its `rosbag2` record, if it has one."""
         topics = self._topics()
         span = self._span if self._counts else (0, 0)
-        record = None if topics is None else rosbag2.file_metadata(name, topics, span)
+        record = None if topics is None else rosbag2_metadata(name, topics, span)
         if record is not None:
-            self._writer.add_metadata(rosbag2.METADATA, record)
+            self._writer.add_metadata(ROSBAG2_METADATA, record)
         self._writer.finish()
         return record
 
@@ -264,13 +261,13 @@ class _Log:
             self._schemas[key] = self._writer.register_schema(*key)
         return self._schemas[key]
 
-    def _topics(self) -> dict[str, rosbag2.TopicCount] | None:
+    def _topics(self) -> dict[str, TopicCount] | None:
         """Describe the topics for rosbag2; None if it cannot describe them."""
-        topics: dict[str, rosbag2.TopicCount] = {}
+        topics: dict[str, TopicCount] = {}
         channels: dict[str, list[Described]] = {}
         for number, (channel, schema) in self._described.items():
             name = "" if schema is None else schema.name
-            topic = rosbag2.TopicCount(name, bag_metadata(channel))
+            topic = TopicCount(name, bag_metadata(channel))
             topics.setdefault(channel.topic, topic).messages += self._counts[number]
             channels.setdefault(channel.topic, []).append((channel, schema))
         return topics if all(map(is_for_rosbag2, channels.values())) else None
@@ -318,7 +315,7 @@ def _pieces(file: LogFile, place: RecordLocation) -> Iterator[bytes]:
 
 def _key(record: McapRecord | None) -> Hashable:
     """Return a key that equal records share; None for those that are not copied."""
-    if isinstance(record, Metadata) and record.name != rosbag2.METADATA:
+    if isinstance(record, Metadata) and record.name != ROSBAG2_METADATA:
         return record.name, frozenset(record.metadata.items())
     if isinstance(record, Attachment):
         return record.name, record.media_type, hashlib.sha256(record.data).digest()

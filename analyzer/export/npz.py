@@ -19,11 +19,10 @@ from hearthlog.analyzer.export.text import json_texts
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress
 from hearthlog.schemas.logs.columns import Columns, join
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 from hearthlog.schemas.messages.message_types import number_type
-from hearthlog.schemas.progress import Progress
 
 _TEXTS_LIMIT = 1 << 30  # bytes
 _MEMORY = 128 << 20  # bytes of all tables at once; what is larger is read alone

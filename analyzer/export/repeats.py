@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Indices
-from hearthlog.schemas.mcap.message_blocks import message_blocks
+from hearthlog.schemas.mcap.chunk_writer import message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 
 

@@ -24,14 +24,13 @@ from rosbags.typesys.store import Typestore
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import held_count
 from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import decode, unreadable, without_unreadable
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.message_types import typestore
 from hearthlog.schemas.messages.type_definitions import defined_types, message_type
-from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _HEADER = "std_msgs/msg/Header"
 _NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)

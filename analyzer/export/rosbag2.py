@@ -6,9 +6,8 @@ from typing import Any
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import is_for_rosbag2, write_log
 from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress
 from hearthlog.schemas.messages.type_definitions import defined_types
-from hearthlog.schemas.progress import Progress
 
 _NO_PLACE = (
     "channels of different types or qualities of service, or without ROS 2 messages, for which "

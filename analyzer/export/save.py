@@ -8,10 +8,8 @@ from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.formats import ExportFormat
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.new_files import new_file, new_folder
-from hearthlog.schemas.text import abridged
+from hearthlog.schemas.errors import LogError, Progress, abridged, ignore_progress
+from hearthlog.schemas.new_files import new_file, new_folder
 
 
 def exportable(selection: Selection, format_: ExportFormat) -> Selection:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.frames import NANOSECONDS, seconds_text
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
-from hearthlog.schemas.times import NANOSECONDS, seconds_text
 
 _SHOWN = 4  # elements of an array
 _LENGTH = 120  # characters of a field

@@ -10,10 +10,9 @@ from hearthlog.analyzer.export.exporter import Exporter, OutputFiles, Table, wri
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, Clip, clips_of
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
-from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _HOLE = 5_000_000  # ns: stamps are as good as 1 ms, and what is lost is a frame at least
 _FILE_LIMIT = 2 << 30  # bytes; WAV has no more than 4 GiB

@@ -16,8 +16,8 @@ from foxglove.websocket import (
 
 from hearthlog.analyzer.foxglove.publisher import Publisher
 from hearthlog.analyzer.foxglove.recording import Recording
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.mcap.raw_messages import RawMessages, in_order_of_time
-from hearthlog.schemas.times import NANOSECONDS
 
 _SLOWEST, _FASTEST = 0.01, 100.0
 _TICK_SECONDS = 0.05  # so often viewers are told the time

@@ -7,13 +7,13 @@ from mcap import records
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.message_types import STREAM_INFO
-from hearthlog.schemas.times import NANOSECONDS
 
 _WINDOW = 3600 * NANOSECONDS  # whose logs are looked into at once
 _RECENT = NANOSECONDS  # what was said so long before a moment is still seen then

@@ -17,8 +17,8 @@ from hearthlog.analyzer.gate.home_sample import (
 from hearthlog.analyzer.gate.recent_time import RecentLog
 from hearthlog.analyzer.gate.two_models import LabelledFrames, TwoModels, joined_frames
 from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,8 @@ from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 
 SURE = 0.9  # probability
 _REFERENCE_SECONDS = 3_600.0

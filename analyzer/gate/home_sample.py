@@ -20,8 +20,7 @@ from hearthlog.analyzer.gate.reference import Sound, reference, spans_of
 from hearthlog.analyzer.gate.two_models import NO_FRAMES, LabelledFrames, TwoModels
 from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.errors import LogError, Progress
 
 KnownSounds = list[tuple[RecentLog, list[Sound]]]
 

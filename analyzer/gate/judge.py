@@ -15,8 +15,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.judgement import Judgement, read_judgement, write_judgement
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import CHAMPION, find_model, load
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 
 _LONGEST = 400  # characters of a reason
 

@@ -19,7 +19,7 @@ from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.metadata import read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE
 

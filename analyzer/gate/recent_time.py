@@ -14,11 +14,11 @@ from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, without
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _DAY = 86_400 * NANOSECONDS
 _RECENT = 14 * _DAY

@@ -15,8 +15,8 @@ from hearthlog.analyzer.logs.spans import Spans, joined, remains
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import UNKNOWN, class_name
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE, relabelling
-from hearthlog.schemas.times import NANOSECONDS
 
 _SHORTEST = NANOSECONDS // 2  # sound that counts
 _REMAINS = 2 * NANOSECONDS  # what is shorter beside a mark is the marked sound, not cut exactly

@@ -16,7 +16,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _FLOOR_WARM_UP = 150 * NANOSECONDS
 _LABELS_WARM_UP = 5 * NANOSECONDS

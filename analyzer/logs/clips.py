@@ -10,10 +10,10 @@ from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.times import NANOSECONDS
 
 CLIP_FIELDS = ("timestamp", "data", "format", "sample_rate", "number_of_channels")
 SAMPLE_BYTES = 2

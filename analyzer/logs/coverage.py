@@ -7,12 +7,11 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import iterate_columns
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _KIND = "features"
 _FIELDS = {"header.stamp"}

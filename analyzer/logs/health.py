@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.logs.statuses import Status
+from hearthlog.schemas.logs.contents import Status
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
 
 _LONGEST = 200  # characters

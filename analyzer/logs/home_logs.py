@@ -12,10 +12,9 @@ from hearthlog.analyzer.logs.labelled_by import NO_MODEL, LabelledBy, models_of
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name
-from hearthlog.schemas.logs.scenario_record import recorded_scenarios
-from hearthlog.schemas.mcap.statistics import time_span
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name, time_span
+from hearthlog.schemas.logs.metadata import recorded_scenarios
 
 _NEVER = 1 << 62
 _TAIL = 60 * NANOSECONDS  # of a day that may be missing from a whole one

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.logs.recorder_info import first_message, microphones_of
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.logs.scenario_record import recorded_scenarios
+from hearthlog.schemas.logs.metadata import read_provenance, recorded_scenarios
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic

@@ -18,7 +18,8 @@ from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import one, pieces
 from hearthlog.models.classes import translation
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
@@ -31,8 +32,6 @@ from hearthlog.schemas.messages.topics import (
     relabelling,
     scenario_labelling,
 )
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.byte_ranges import map_logs
 
 LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
 _EVER = 1 << 62  # nanoseconds

@@ -17,11 +17,12 @@ from hearthlog.schemas.logs.files import (
     is_layer,
     is_log,
     log_name,
+    stated_span,
     stem,
+    time_span,
 )
-from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.metadata import read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import stated_span, time_span
 
 _DAY = re.compile(r"\d{4}/\d\d/\d\d")
 _DAYS = "[0-9]*/[0-9]*/[0-9]*/*"

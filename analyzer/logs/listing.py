@@ -9,10 +9,10 @@ from time import time_ns
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from hearthlog.schemas.files import is_local, store_errors
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, find_logs, look_into
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
-from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
-from hearthlog.schemas.times import NANOSECONDS
 
 _TIMES = ("mtime", "LastModified", "last_modified", "updated", "created")  # of different stores
 _NAME = attrgetter("name")

@@ -6,7 +6,7 @@ from datetime import UTC, date, datetime, timedelta, tzinfo
 from hearthlog.analyzer.errors import DataError
 from hearthlog.recorder.timezone import DEFAULT, time_zone
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 KEY = "timezone"  # in the `hearthlog` metadata record of a log
 EVENING, MORNING = 22, 7  # of the clock: between them is the night

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from hearthlog.analyzer.extras import remedy
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.byte_ranges import store_errors
+from hearthlog.schemas.files import store_errors
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
 _FILES = {"file", "local"}

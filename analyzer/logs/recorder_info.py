@@ -20,15 +20,15 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.feature_record import (
-    DIGEST,
-    DISTRIBUTION,
-    VERSION,
-    features_of_microphone,
-)
 from hearthlog.schemas.logs.files import check_node_name
-from hearthlog.schemas.logs.log_stream import Attachment
-from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.metadata import (
+    FEATURE_SET_DIGEST,
+    FEATURE_SET_DISTRIBUTION,
+    FEATURE_SET_VERSION,
+    features_of_microphone,
+    read_provenance,
+)
+from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
@@ -238,16 +238,16 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
     try:
         features = feature_set(name)
     except ModelError as error:
-        source = origin.metadata.get(DISTRIBUTION, "")
+        source = origin.metadata.get(FEATURE_SET_DISTRIBUTION, "")
         known = f" (the recorder had it from {source[:64]})" if source else ""
         raise LogError(f"{origin.path}: {error}{known}") from error
-    version = origin.metadata.get(VERSION, "1")
+    version = origin.metadata.get(FEATURE_SET_VERSION, "1")
     if version != str(features.version):
         raise LogError(
             f"{origin.path}: has features of {name}, version {version[:20]!r}; here is version "
             f"{features.version}, which gives other values"
         )
-    digest = origin.metadata.get(DIGEST, "")
+    digest = origin.metadata.get(FEATURE_SET_DIGEST, "")
     if digest != features.digest:
         raise LogError(
             f"{origin.path}: has features of the network {name} with sha256 {digest[:12]!r}; here "

@@ -14,18 +14,16 @@ from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.logs.log_spans import LogSpans, find_spans
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, abridged, ignore_progress
+from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.columns import leave_out, unreadable
+from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.metadata import read_provenance
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
-from hearthlog.schemas.mcap.formats import MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import RECOVER, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.statistics import time_span
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.byte_ranges import map_logs
-from hearthlog.schemas.text import abridged
+from hearthlog.schemas.mcap.records import MESSAGE_HEAD
 
 _LAST = (1 << 63) - 1  # log time
 _NAMED = 5  # topics of which none can be decoded

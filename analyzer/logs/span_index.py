@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.listing import UNSURE, KnownFolder, ListedLog, Listing
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import is_local, open_file, store_errors
 from hearthlog.schemas.logs.files import CATALOG_INDEX, log_readers
-from hearthlog.schemas.storage.byte_ranges import is_local, open_file, store_errors
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.new_files import replaced_file
 
 NEVER = -1
 SPAN = np.dtype(

@@ -14,14 +14,13 @@ from hearthlog.analyzer.logs.summary import Summary, TopicSummary, worse
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.logs.contents import Contents, has_contents, is_review
-from hearthlog.schemas.logs.contents_record import stated_contents
+from hearthlog.schemas.logs.contents import LogContents, has_contents, is_review, stated_contents
 from hearthlog.schemas.logs.files import is_layer
-from hearthlog.schemas.logs.provenance import read_provenance, version_text
-from hearthlog.schemas.mcap.chunk_table import RecordLocation
+from hearthlog.schemas.logs.metadata import read_provenance, version_text
+from hearthlog.schemas.mcap.chunk_index import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches
-from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import HEAD
 
 _NAME_LENGTH = struct.Struct("<I")
 _NAME_LIMIT = 1000
@@ -110,7 +109,7 @@ def _count_by_index(file: LogFile, summary: Summary) -> None:
             topic.add(count, None, (int(chunks["start"].min()), int(chunks["end"].max())))
 
 
-def _stated(file: LogFile, summary: Summary) -> Contents | None:
+def _stated(file: LogFile, summary: Summary) -> LogContents | None:
     """Read what a finished log says of its messages."""
     contents = stated_contents(file)
     if contents is not None:
@@ -119,11 +118,11 @@ def _stated(file: LogFile, summary: Summary) -> Contents | None:
     return contents
 
 
-def _read(file: LogFile, summary: Summary) -> Contents:
+def _read(file: LogFile, summary: Summary) -> LogContents:
     """Read all messages of a log."""
     for channel in _channels(file):
         _topic(summary, *channel)
-    contents = Contents()
+    contents = LogContents()
     damages = Damages()
     for batch in read_in_batches(file, file.chunks, on_damage=damages.add):
         for raw in batch:
@@ -141,7 +140,7 @@ def _topic(summary: Summary, channel: Channel, schema: Schema | None) -> TopicSu
     return summary.topics.setdefault(channel.topic, new)
 
 
-def _add_contents(summary: Summary, contents: Contents) -> None:
+def _add_contents(summary: Summary, contents: LogContents) -> None:
     for name, counted in contents.topics.items():
         span = counted.start, counted.end
         summary.topics[name].add(counted.messages, counted.bytes, span)

@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hearthlog.schemas.logs.contents import Gap
-from hearthlog.schemas.logs.statuses import Status
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.contents import LoggedGap, Status
 
 Span = tuple[int, int]
 
@@ -70,7 +69,7 @@ class Summary:
     segment_seconds: dict[str, Counter[str]] = field(default_factory=dict)  # but for reviews
     # `segments` and `seconds` of them whose labels are likelier wrong than right, likewise
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
-    gaps: list[Gap] = field(default_factory=list)
+    gaps: list[LoggedGap] = field(default_factory=list)
     # what the files say of themselves: microphone, device, feature set, model
     streams: list[dict[str, Any]] = field(default_factory=list)
     health: Status | None = None  # the worst that was said, and of that the last

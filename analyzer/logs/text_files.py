@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
 
 # A spreadsheet takes such a text for a formula, unless it is a number; apostrophes before it
 # disarm it, and one more is written than it has, so that reading gives the same text back.

@@ -9,7 +9,7 @@ from mcap.records import Channel, Schema
 
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import Columns, decode, decode_readable
-from hearthlog.schemas.logs.log_stream import ENCODING
+from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.fields import Field, fields_of, missing_fields
 from hearthlog.schemas.messages.type_definitions import message_type

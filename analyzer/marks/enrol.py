@@ -32,13 +32,19 @@ from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.recorder.stream.sound_watch import ClipWatch, problem_of_file
 from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import CUT, ENROLLED, SUFFIX, find_logs, is_log, log_path
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.logs.files import (
+    CUT,
+    ENROLLED,
+    SUFFIX,
+    find_logs,
+    is_log,
+    log_path,
+    time_span,
+)
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.schemas.storage.new_files import new_file, private_folder
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.new_files import new_file, private_folder
 
 SECONDS = 5.0  # of a microphone, by default
 LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0

@@ -14,8 +14,9 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.review_layer import Key, Row, layer_bytes, read_rows
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, review_path, stem
-from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.metadata import provenance
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     LIVE,
@@ -24,8 +25,7 @@ from hearthlog.schemas.messages.topics import (
     review_labelling,
     scenario_name,
 )
-from hearthlog.schemas.storage.new_files import locked_folder, readers_of, replaced_file
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.new_files import locked_folder, readers_of, replaced_file
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
 PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling

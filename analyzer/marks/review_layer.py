@@ -11,8 +11,7 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column

@@ -7,8 +7,8 @@ from hearthlog.analyzer.logs.layers import Chain
 from hearthlog.analyzer.relabel.layer import LayerMetadata
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.digest import earlier_digests
 from hearthlog.schemas.logs.files import relabel_path, stem
+from hearthlog.schemas.logs.metadata import earlier_digests
 
 _MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has a minute only
 

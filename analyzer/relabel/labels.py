@@ -40,12 +40,11 @@ from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.logs.digest import log_digest
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import stem
-from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
-from hearthlog.schemas.logs.provenance import METADATA
-from hearthlog.schemas.storage.new_files import new_file, readers_of, replaced_file
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.logs.metadata import HEARTHLOG_METADATA, log_digest
+from hearthlog.schemas.logs.writer import LogStreamWriter, TopicBatch
+from hearthlog.schemas.new_files import new_file, readers_of, replaced_file
 
 _CHUNK_SPAN = 60 * NANOSECONDS  # who wants segments alone reads the minutes in which some end
 _PIECE_SPAN = 600 * NANOSECONDS  # of labels that are encoded at once
@@ -235,7 +234,7 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
             for batch in _in_pieces([*labels, *segments]):
                 writer.write_columns(batch)
             record = layer_record(metadata, job.log.name, labelled.node, more)
-            writer.add_metadata(METADATA, record)
+            writer.add_metadata(HEARTHLOG_METADATA, record)
             writer.finish(job.layer.name)
     except LogError:
         if read_layer_metadata(job.layer) != metadata:  # else another run was quicker

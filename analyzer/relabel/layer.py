@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.provenance import provenance, read_provenance
+from hearthlog.schemas.logs.metadata import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import Topic, label_topics, relabelling
 

@@ -15,10 +15,10 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import is_local
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import is_active
 from hearthlog.schemas.salvage.recover import recover_log
-from hearthlog.schemas.storage.byte_ranges import is_local
-from hearthlog.schemas.times import NANOSECONDS
 
 _WARM_UP = 30 * NANOSECONDS
 _FLOOR_WARM_UP = 150 * NANOSECONDS  # a minute, and the four seconds of steadiness behind it

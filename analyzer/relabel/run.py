@@ -19,12 +19,10 @@ from hearthlog.analyzer.relabel.layer import (
 )
 from hearthlog.analyzer.workers import Workers
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.logs.digest import log_digest
+from hearthlog.schemas.errors import HearthlogError, Progress, ignore_progress
+from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.files import is_active, relabel_path
-from hearthlog.schemas.logs.provenance import check_version
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.byte_ranges import map_logs
+from hearthlog.schemas.logs.metadata import check_version, log_digest
 
 _LONGEST_STRETCH = 8  # logs that follow each other and are labelled in one task
 

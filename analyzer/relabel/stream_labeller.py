@@ -7,9 +7,8 @@ from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.recorder.events import Gap
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import EmbeddingSource
-from hearthlog.schemas.times import NANOSECONDS
 
 _LARGEST_STEP = NANOSECONDS // 5  # by which the time of a sound card may jump between two frames
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 _JOINED = 10_000_000  # nanoseconds at most between clips that follow each other
 _REASON = "no clip holds it"

@@ -11,8 +11,7 @@ from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.log.description import LogDescription, with_scenarios
 from hearthlog.recorder.stream.messages import stream_info
-from hearthlog.schemas.logs.feature_record import FEATURE_SET
-from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.metadata import FEATURE_SET, provenance
 from hearthlog.schemas.messages.topics import (
     CANDIDATE,
     SCENARIO,

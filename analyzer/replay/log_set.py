@@ -5,10 +5,9 @@ from pathlib import Path
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_infos
 from hearthlog.analyzer.replay.options import ReplayOptions
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, listed
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.merged_reading import time_spans
-from hearthlog.schemas.text import listed
-from hearthlog.schemas.times import NANOSECONDS
 
 _NEVER = (1 << 63) - 1
 

@@ -23,9 +23,8 @@ from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, SCENARIO, scenario_labelling, topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096

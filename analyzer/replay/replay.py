@@ -17,10 +17,9 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _WARM_UP = 60 * NANOSECONDS
 _LONGEST_NAME = 200

@@ -33,7 +33,7 @@ from hearthlog.analyzer.report.summary_text import (
 )
 from hearthlog.analyzer.report.values import Count, Minutes, Value
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, in_words
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95

@@ -24,10 +24,11 @@ from hearthlog.analyzer.logs.spans import Spans, common, joined, one
 from hearthlog.analyzer.marks.formats.class_names import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import CLASS_NAME, OTHER, class_name
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
+from hearthlog.schemas.logs.contents import Status, statuses_of
 from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer
-from hearthlog.schemas.logs.statuses import Status, statuses_of
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     DIAGNOSTICS,
@@ -36,8 +37,6 @@ from hearthlog.schemas.messages.topics import (
     microphone_of,
     relabelling,
 )
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
 _FIELDS = {"header.stamp", "duration", "label"}

@@ -24,10 +24,9 @@ from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes, read_sce
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.analyzer.routine.compare import Routines
 from hearthlog.analyzer.routine.day_profile import Profiles
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.new_files import check_new, new_file
+from hearthlog.schemas.new_files import check_new, new_file
 
 WEEK = 7
 

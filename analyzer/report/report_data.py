@@ -14,7 +14,7 @@ from hearthlog.analyzer.report.sections import Figure
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
 from hearthlog.analyzer.routine.compare import Judgement
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 _CHANGES = {
     (Clock, 1): "later",

@@ -9,10 +9,10 @@ from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.models.classes import OF_EVERY_SCENARIO, class_name
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import SCENARIO, is_scenario, parse_topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = {"header.stamp", "duration", "label"}
 _MINUTE = 60 * NANOSECONDS

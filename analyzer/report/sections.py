@@ -7,7 +7,7 @@ from hearthlog.analyzer.report.class_words import several_in_words
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.values import Value
 from hearthlog.models.classes import COUGHING, CRYING, FLUSHING_WATER, SHOWER, TAP_WATER, in_words
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
 

@@ -18,7 +18,7 @@ from hearthlog.analyzer.report.routine_text import WEEK, judgement_text, too_few
 from hearthlog.analyzer.report.values import Minutes
 from hearthlog.analyzer.routine.compare import FEWEST
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 _MOST = 6  # kinds of gaps, or of trouble
 _MINUTE = HOUR // 60

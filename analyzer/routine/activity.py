@@ -7,7 +7,7 @@ import numpy as np
 from hearthlog.analyzer.accuracy.events import MINUTE
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, one, without
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 

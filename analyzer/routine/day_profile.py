@@ -37,7 +37,7 @@ from hearthlog.models.classes import (
     find_class,
 )
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 COUNT, LENGTH, CLOCK = "count", "minutes", "clock"
 STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "quiet"

@@ -30,7 +30,7 @@ from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed, 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Bool, Float64, Indices
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 
 _FEWEST_SEGMENTS = 10
 _FOLDS = 3  # by which the temperature is found

@@ -22,11 +22,10 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import is_quiet
 from hearthlog.models.features.window_inputs import of_segments, window_places
 from hearthlog.schemas.arrays import Bool, Float64, Indices
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import relabel_path
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
-from hearthlog.schemas.times import NANOSECONDS
 
 MOST_CONFIRMED = 60  # segments of a class
 _WEIGHT = 1.0  # of a segment: with that of marks, windows of half a sound become silence

@@ -9,7 +9,7 @@ import numpy as np
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.schemas.arrays import Float64, Indices
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.errors import Progress
 
 Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
 

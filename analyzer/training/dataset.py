@@ -30,8 +30,8 @@ from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.errors import SourceError
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
+from hearthlog.schemas.errors import Progress
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
-from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24

@@ -20,10 +20,9 @@ from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.errors import HearthlogWarning
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import CUT
 from hearthlog.schemas.messages.topics import EmbeddingSpace
-from hearthlog.schemas.times import NANOSECONDS
 
 _DAY = 86_400 * NANOSECONDS
 HOME_WEIGHT = 3.0  # of a segment of the home; others have 1

@@ -4,7 +4,7 @@ import numpy as np
 
 from hearthlog.models.classifiers.description import MOST_SPANS
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _NEAR = 60 * NANOSECONDS
 

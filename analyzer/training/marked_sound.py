@@ -20,7 +20,7 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import ENROLLED, find_logs
 from hearthlog.schemas.messages import message_types
@@ -31,7 +31,6 @@ from hearthlog.schemas.messages.topics import (
     scenario_labelling,
     topic,
 )
-from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = ("header.stamp", "frame", "values")
 _WARM_UP = 600 * NANOSECONDS

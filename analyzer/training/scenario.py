@@ -9,7 +9,7 @@ from hearthlog.models import classes as sound
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.classifiers.description import MOST_CLASSES, TEXT
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.storage.small_file import read_toml
+from hearthlog.schemas.files import read_toml
 
 _GENERAL = (
     *(sound.SILENCE, sound.SPEECH, sound.MUSIC, sound.PHONE_RING, sound.COUGHING, sound.CRYING),

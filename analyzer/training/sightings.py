@@ -16,7 +16,7 @@ from hearthlog.models.classifiers.description import (
 from hearthlog.models.classifiers.directions import SECTORS, Directions, sectors_of
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64, Indices, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _SPREAD = np.deg2rad(10.0)  # of a sound that is always at one place
 _DOUBT = 2.0  # sounds, with which a direction says half as much as with many

@@ -18,10 +18,9 @@ from hearthlog.models.classes import OTHER, SILENCE, SPEECH, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32, Indices
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import CUT
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 
 SPEAKERS = "speakers"
 APART = 1800 * NANOSECONDS  # of one time from the next

@@ -56,8 +56,8 @@ from hearthlog.models.classifiers.description import (
 )
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog.schemas.errors import Progress
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.progress import Progress
 
 MOST_FOLDS = 5
 SMOOTHINGS = ("hmm", "merge")

@@ -16,9 +16,9 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, scenario_labelling
-from hearthlog.schemas.times import NANOSECONDS
 
 _RECENT = 14 * 86_400 * NANOSECONDS
 _SILENT_LOGS = 4  # that are read for silence

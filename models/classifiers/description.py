@@ -16,9 +16,9 @@ from pydantic import (
 
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.errors import ModelError
+from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.messages.topics import EmbeddingSpace
-from hearthlog.schemas.text import printable
 
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
 MOST_SPANS = 1000  # forty kilobytes

@@ -21,10 +21,9 @@ from hearthlog.models.embedding.sounds import BURSTS, NOISE, SILENCE, TONE, synt
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, printable
+from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.messages.topics import EmbeddingSource
-from hearthlog.schemas.storage.small_file import read_whole
-from hearthlog.schemas.text import printable
 
 __all__ = [
     "NETWORKS",

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from hearthlog.models.embedding.embeddings import Int8
 from hearthlog.models.embedding.session import NetworkOutput
 from hearthlog.models.errors import ModelError
-from hearthlog.schemas.arrays import Float32, Float64, Indices
-from hearthlog.schemas.storage.sealed_file import read_sealed, write_sealed
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.arrays import Float32, Float64, Indices, read_sealed, write_sealed
+from hearthlog.schemas.files import read_whole
 
 _KEY = "projection"
 _SIZE_LIMIT = 16 << 20

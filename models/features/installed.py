@@ -11,7 +11,7 @@ from hearthlog.models.features.network import (
     network_features,
     network_folders,
 )
-from hearthlog.schemas.logs.feature_record import feature_entries
+from hearthlog.schemas.logs.metadata import feature_entries
 
 DEFAULT = HOME33
 FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [HOME33, AUROS21])

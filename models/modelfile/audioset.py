@@ -36,8 +36,8 @@ from hearthlog.models.embedding.sound_names import RELEASE, SoundName, audioset_
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.schemas.arrays import write_sealed
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.storage.sealed_file import write_sealed
 
 AUDIOSET = "audioset"
 KEY = "hearthlog"  # of the description, in a model file

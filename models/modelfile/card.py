@@ -8,7 +8,7 @@ from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.licences import may_be_shipped
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.logs.log_stream import Attachment
+from hearthlog.schemas.logs.writer import Attachment
 
 CARD = "model_card.md"
 DESCRIPTION = "model.json"

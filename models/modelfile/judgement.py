@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import private_folder, replaced_file
+from hearthlog.schemas.new_files import private_folder, replaced_file
 
 _FOLDER = "judgements"
 _LARGEST = 1 << 16  # bytes

@@ -38,10 +38,10 @@ from hearthlog.models.starter import (
     starter_file,
     with_network,
 )
+from hearthlog.schemas.arrays import damage, read_sealed, write_sealed
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import check_new, new_file
-from hearthlog.schemas.storage.sealed_file import damage, read_sealed, write_sealed
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.new_files import check_new, new_file
 
 SUFFIX = ".safetensors"
 _SIZE_LIMIT = 64 << 20  # a hundred times the usual size

@@ -21,7 +21,7 @@ from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.models.starter import GENERAL, STARTERS, starter_file, with_network
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import (
+from hearthlog.schemas.new_files import (
     locked_folder,
     private_folder,
     replaced_file,

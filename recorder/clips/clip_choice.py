@@ -12,8 +12,7 @@ from hearthlog.recorder.config import Keep
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.stream.private_frames import PrivateFrames
 from hearthlog.schemas.arrays import Bool, Float32, Int16, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 
 _UNSURE_CONFIDENCE = 0.5
 _UNSURE_NOVELTY = 0.7

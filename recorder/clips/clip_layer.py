@@ -13,15 +13,14 @@ from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.recorder.stream.private_frames import PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE
 from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.files import audio_path
-from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.metadata import provenance
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, message, time_message
 from hearthlog.schemas.messages.topics import audio_topic
-from hearthlog.schemas.times import NANOSECONDS
 
 _MESSAGE_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
 _SAMPLE_BYTES = 2

@@ -12,8 +12,7 @@ from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, event_time
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.recorder.stream.veil import TOGETHER
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 
 class ClipRecorder:

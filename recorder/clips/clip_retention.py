@@ -5,8 +5,8 @@ from pathlib import Path
 
 from hearthlog.recorder.disk.recorded import recorded_days, start_of, walk
 from hearthlog.recorder.events import OK, WARNING, Notice
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, AUDIO_SUFFIX, log_name
-from hearthlog.schemas.times import NANOSECONDS
 
 _EVERY = 3600 * NANOSECONDS
 

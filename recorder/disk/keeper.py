@@ -16,8 +16,8 @@ from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import ROSOUT
-from hearthlog.schemas.times import NANOSECONDS
 
 _COMMAND = module_command("hearthlog.recorder.disk.keeper")
 _EVERY = 3600 * NANOSECONDS

@@ -30,7 +30,7 @@ class ThinningDays(NamedTuple):
     rest: int = 0
 
     def step(self, age: int) -> int:
-        """Return how far a log is to be thinned: a place in `hearthlog.schemas.salvage.thin.STEPS`.
+        """Return the step of thinning: a place in `hearthlog.schemas.salvage.recover.STEPS`.
 
         Parameters
         ----------

@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, log_name
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
-from hearthlog.schemas.times import NANOSECONDS
 
 KEEP_SUFFIX = ".keep"  # of a file beside a log that is not to be deleted
 THINNING_SUFFIX = ".thinning"  # of a thinner copy of a log in the making

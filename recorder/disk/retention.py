@@ -13,9 +13,9 @@ from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, Reco
 from hearthlog.recorder.disk.sizes import size_text
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import review_path
-from hearthlog.schemas.logs.provenance import provenance_records
+from hearthlog.schemas.logs.metadata import provenance_records
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
+from hearthlog.schemas.new_files import locked_folder, sync_folder
 
 REVIEWED = "reviewed"
 _FEW = 2  # logs, all of which but the newest may go without a question

@@ -9,14 +9,13 @@ from hearthlog.recorder.disk.limits import ThinningDays
 from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, RecordedLog
 from hearthlog.recorder.disk.retention import REVIEWED, is_reviewed, kept_because
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.salvage.recover import lock_abandoned
-from hearthlog.schemas.salvage.thin import thin_log, thinned_step
-from hearthlog.schemas.storage.new_files import (
+from hearthlog.schemas.new_files import (
     hand_over,
     locked_folder,
     sync_file,
     sync_folder,
 )
+from hearthlog.schemas.salvage.recover import lock_abandoned, thin_log, thinned_step
 
 _STATISTICS = 1  # the step that lessons do not miss
 _RIGHTS = 0o666  # of a file that nobody runs

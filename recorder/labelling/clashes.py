@@ -4,8 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from hearthlog.models.classes import OF_EVERY_SCENARIO, class_name
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.messages.labels import spelt
-from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.messages.topics import LIVE, spelt
 
 
 def clash(model: Model, others: Mapping[str, Model]) -> str:

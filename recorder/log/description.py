@@ -11,10 +11,13 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile.card import attachment_of, model_attachments
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.logs.feature_record import other_features
-from hearthlog.schemas.logs.log_stream import Attachment
-from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.scenario_record import RecordedScenario, scenario_entries
+from hearthlog.schemas.logs.metadata import (
+    RecordedScenario,
+    other_features,
+    provenance,
+    scenario_entries,
+)
+from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.messages.topics import (
     CANDIDATE,
     SCENARIO,

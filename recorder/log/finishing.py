@@ -18,7 +18,7 @@ from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.storage.new_files import sync_folder
+from hearthlog.schemas.new_files import sync_folder
 
 _COMMAND = module_command("hearthlog.recorder.log.finishing")
 _NICENESS = 19

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import is_node_name
-from hearthlog.schemas.storage.new_files import make_folders, open_lock
+from hearthlog.schemas.new_files import make_folders, open_lock
 
 # With these a disk may be used again later; the recorder waits for that.
 _PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}

@@ -16,7 +16,7 @@ from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.memory import give_back
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _HELD_BYTES = 8 << 20  # twenty minutes of one microphone
 _RETRY_SECONDS = 2.0

@@ -4,20 +4,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, is_log, log_name, log_path, stem
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.new_files import sync_file, sync_folder
 from hearthlog.schemas.salvage.recover import (
     NothingWholeError,
+    Recovery,
     check_copy,
     lock_abandoned,
     recover_log,
 )
-from hearthlog.schemas.salvage.salvaged_copy import Recovery
-from hearthlog.schemas.storage.new_files import sync_file, sync_folder
-from hearthlog.schemas.times import NANOSECONDS
 
 _CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log: it is read as a whole, not as it grows
 

@@ -12,10 +12,10 @@ from hearthlog.recorder.log.finishing import LogFinisher
 from hearthlog.recorder.log.recovery import active_logs
 from hearthlog.recorder.stream.messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import free_log_path, log_path
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import header
-from hearthlog.schemas.times import NANOSECONDS
 
 # The longest time from a sound to its writing: a block of frames, and the delay of the capture.
 _DELAY_SECONDS = 0.9

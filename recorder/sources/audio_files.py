@@ -28,9 +28,8 @@ from hearthlog.recorder.sources.framing import frames_of
 from hearthlog.recorder.sources.open_audio import audio_seconds, is_audio
 from hearthlog.recorder.sources.wall_clock import check_times
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s

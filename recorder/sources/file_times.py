@@ -11,7 +11,7 @@ from typing import BinaryIO, NamedTuple
 
 from hearthlog.recorder.errors import ConfigurationError, SourceError
 from hearthlog.recorder.sources.open_audio import audio_seconds, text_fields
-from hearthlog.schemas.times import NANOSECONDS, millisecond_text, read_time
+from hearthlog.schemas.frames import NANOSECONDS, millisecond_text, read_time
 
 NAME, METADATA, GUESS = "its name", "its metadata", "a guess"
 

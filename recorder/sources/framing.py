@@ -9,9 +9,8 @@ from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.recorder.sources.sample_clock import SampleClock
 from hearthlog.schemas.arrays import Float32, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.messages.gaps import CLOCK_SET
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
+from hearthlog.schemas.messages.message_types import CLOCK_SET
 
 _ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on an unknown clock
 STEP_SECONDS = 0.25  # of the time of day: less is a clock that is steered

@@ -34,7 +34,7 @@ from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
 from hearthlog.recorder.stream.sound_watch import DEAD_STEPS
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _RETRY_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0)

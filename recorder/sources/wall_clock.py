@@ -4,7 +4,7 @@ import time
 from datetime import UTC, datetime
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 # ROS has 32 bits for seconds, and MCAP no times before 1970. A minute for frames that were taken
 # before the clock was looked at, a day for what a log says of the time to come.

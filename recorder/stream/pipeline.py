@@ -34,7 +34,7 @@ from hearthlog.recorder.stream.statistics import LOGGED_EVERY, RollingStatistics
 from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames, Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.gaps import encode_gap
+from hearthlog.schemas.messages.message_types import encode_gap
 from hearthlog.schemas.messages.topics import LIVE, ROSOUT, EmbeddingSource, topic
 
 _REMEMBERED_WINDOWS = 4  # of embeddings: two seconds

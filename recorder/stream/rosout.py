@@ -4,9 +4,9 @@ from typing import Any
 
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder.events import OK, WARNING, Gap, Notice, SourceHealth
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, message, nanoseconds, time_message
-from hearthlog.schemas.times import NANOSECONDS
 
 _INFO, _WARN, _ERROR = 20, 30, 40  # levels of rcl_interfaces/msg/Log
 _LEVELS = {OK: _INFO, WARNING: _WARN}

@@ -10,8 +10,7 @@ from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, WINDOW_FRAMES, 
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.stream.private_frames import PrivateFrames
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 TOGETHER = NANOSECONDS // FRAME_NANOSECONDS  # frames that are averaged
 _NEVER = 2**63 - 1  # nanoseconds of UTC

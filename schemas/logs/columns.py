@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.files import map_logs
+from hearthlog.schemas.frames import millisecond_text
+from hearthlog.schemas.logs.files import topic_counts
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
-from hearthlog.schemas.mcap.chunk_table import LAST_TIME
+from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.chunks import OnDamage, TopicChoice
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
-from hearthlog.schemas.mcap.statistics import topic_counts
 from hearthlog.schemas.messages.cdr_codec import (
     Fields,
     UndecodableText,
@@ -28,8 +30,6 @@ from hearthlog.schemas.messages.cdr_codec import (
 )
 from hearthlog.schemas.messages.fields import fields_of
 from hearthlog.schemas.messages.type_definitions import message_type
-from hearthlog.schemas.storage.byte_ranges import map_logs
-from hearthlog.schemas.times import millisecond_text
 
 _DEFINITIONS_KEPT = 256
 _HEADS = ("log_times", "publish_times", "sequences")

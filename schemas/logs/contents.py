@@ -1,19 +1,46 @@
-"""What the messages of a log say, counted."""
+"""Message counts, labels, gaps and health of a log, and their record `hearthlog_contents`."""
 
+import hashlib
+import json
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
-from mcap.records import Channel, Schema
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Schema
 
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.logs.statuses import Status, statuses_of
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types, topics
 from hearthlog.schemas.messages.fields import missing_fields
-from hearthlog.schemas.messages.labels import is_sound
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.messages.topics import is_sound
+
+
+class Status(NamedTuple):
+    """What a part of the box said of itself, at a log time (ns of UTC).
+
+    `level` is that of `diagnostic_msgs/DiagnosticStatus`: 0 is well, higher is worse.
+    """
+
+    name: str
+    time: int
+    level: int
+    message: str
+
+
+def statuses_of(columns: Columns) -> Iterator[Status]:
+    """Yield each status of diagnostic messages.
+
+    Raise `LogError` if the field is missing.
+    """
+    for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
+        for status in statuses:
+            yield Status(status["name"], time, int(status["level"]), status["message"])
+
 
 STREAM = {
     "microphone": "header.frame_id",
@@ -44,7 +71,7 @@ class TopicContents(NamedTuple):
     end: int
 
 
-class Gap(NamedTuple):
+class LoggedGap(NamedTuple):
     """Audio that was not heard: when (ns of UTC), for how long (s), and why."""
 
     microphone: str
@@ -55,7 +82,7 @@ class Gap(NamedTuple):
 
 
 @dataclass
-class Contents:
+class LogContents:
     """What the messages of a log say, by microphone; of a layer, by the name of its topic."""
 
     topics: dict[str, TopicContents] = field(default_factory=dict)
@@ -64,7 +91,7 @@ class Contents:
     seconds: dict[str, Counter[str]] = field(default_factory=dict)  # of segments, by label
     # `segments` and `seconds` of sounds whose labels are likelier wrong than right
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
-    gaps: list[Gap] = field(default_factory=list)
+    gaps: list[LoggedGap] = field(default_factory=list)
     streams: list[dict[str, Any]] = field(default_factory=list)  # with the keys of `STREAM`
     health: Status | None = None  # the worst that was said, and of that the last
     # the last that each part of the box said; not in what a log says of itself
@@ -80,10 +107,10 @@ class Contents:
         for columns in _decoded(batch, readable or is_readable):
             self._add(columns)
 
-    def differing(self, other: "Contents") -> list[str]:
+    def differing(self, other: "LogContents") -> list[str]:
         """Name what is counted otherwise elsewhere; the order of gaps makes no difference."""
         mine, theirs = (replace(each, gaps=sorted(each.gaps)) for each in (self, other))
-        names = [each.name for each in fields(Contents) if each.compare]
+        names = [each.name for each in fields(LogContents) if each.compare]
         return [name for name in names if getattr(mine, name) != getattr(theirs, name)]
 
     def _add_topic(self, raw: RawMessages) -> None:
@@ -106,7 +133,7 @@ class Contents:
             starts, seconds = columns["header.stamp"], columns["duration"] / NANOSECONDS
             parts = starts, seconds, columns["reason"], columns["frames_lost"]
             rows = zip(*(part.tolist() for part in parts), strict=True)
-            self.gaps += [Gap(microphone, *row) for row in rows]
+            self.gaps += [LoggedGap(microphone, *row) for row in rows]
         elif columns.type == message_types.STREAM_INFO:
             for row in zip(*(columns[path].tolist() for path in STREAM.values()), strict=True):
                 stream = dict(zip(STREAM, row, strict=True))
@@ -158,7 +185,7 @@ def is_readable(
 def has_contents(
     channel: Channel, schema: Schema | None, readable: IsReadable = is_readable
 ) -> bool:
-    """Tell whether `Contents` reads the messages of a channel.
+    """Tell whether `LogContents` reads the messages of a channel.
 
     Parameters
     ----------
@@ -176,3 +203,143 @@ def _decoded(batch: Sequence[RawMessages], readable: IsReadable) -> Iterator[Col
 
 def _counter(counters: dict[str, Counter[str]], name: str) -> Counter[str]:
     return counters.setdefault(name, Counter())
+
+
+CONTENTS_METADATA = "hearthlog_contents"
+_VERSION = "1"  # another one is not read
+_LARGEST = 1 << 16  # bytes of the text
+_ROOM = 1 << 10  # bytes of the rest of the record, at most
+_MOST = 1 << 63
+
+
+def as_metadata(contents: LogContents) -> dict[str, str] | None:
+    """Make the record; None if it would be large."""
+    text = json.dumps(
+        {
+            "topics": contents.topics,
+            "frames": contents.frames,
+            "segments": contents.segments,
+            "seconds": contents.seconds,
+            "unsure": contents.unsure,
+            "gaps": contents.gaps,
+            "streams": contents.streams,
+            "health": contents.health,
+        }
+    )
+    if len(text) > _LARGEST:
+        return None
+    return {"version": _VERSION, "contents": text, "sha256": _digest(text)}
+
+
+def stated_contents(file: LogFile) -> LogContents | None:
+    """Read what a finished log says of its messages.
+
+    Returns
+    -------
+    Contents or None
+        None if it says nothing, or what does not fit its statistics: its messages tell it then.
+
+    Raises
+    ------
+    LogError
+        If the file cannot be read, or its last metadata record is damaged.
+    """
+    places = [place for place in file.record_locations if place.opcode == Opcode.METADATA]
+    if file.statistics is None or not places or places[-1].length > _LARGEST + _ROOM:
+        return None
+    record = file.record(places[-1])  # the writer has put it there
+    if not isinstance(record, Metadata) or record.name != CONTENTS_METADATA:
+        return None
+    contents = from_metadata(record.metadata)
+    return contents if contents is not None and _fits(file, contents) else None
+
+
+def from_metadata(record: Mapping[str, str]) -> LogContents | None:
+    """Read the record; None if it is damaged, or of another version.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        From any file: what it holds is checked for its form, not for its truth.
+    """
+    text = record.get("contents", "")
+    if record.get("version") != _VERSION or record.get("sha256") != _digest(text):
+        return None
+    try:
+        return _contents(json.loads(text))
+    except (ValueError, TypeError, KeyError, AttributeError, ArithmeticError, RecursionError):
+        return None
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode(errors="replace")).hexdigest()
+
+
+def _contents(values: Any) -> LogContents:
+    health = values["health"]
+    return LogContents(
+        topics={name: TopicContents(*map(_count, row)) for name, row in values["topics"].items()},
+        frames=_counters(values["frames"], _count),
+        segments=_counters(values["segments"], _count),
+        seconds=_counters(values["seconds"], _amount),
+        unsure=_counters(values["unsure"], _amount),
+        gaps=[
+            LoggedGap(_text(mic), _count(start), _amount(seconds), _text(reason), _count(lost))
+            for mic, start, seconds, reason, lost in values["gaps"]
+        ],
+        streams=[_stream(stream) for stream in values["streams"]],
+        health=None if health is None else _health(*health),
+    )
+
+
+def _health(name: Any, time: Any, level: Any, message: Any) -> Status:
+    return Status(_text(name), _count(time), _count(level), _text(message))
+
+
+def _stream(values: Any) -> dict[str, Any]:
+    return {name: (_amount if name == "frame_seconds" else _text)(values[name]) for name in STREAM}
+
+
+def _counters(values: Any, number: Any) -> dict[str, Counter[str]]:
+    return {
+        name: Counter({label: number(value) for label, value in row.items()})
+        for name, row in values.items()
+    }
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(value)
+    return value
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int or not -_MOST <= value < _MOST:
+        raise ValueError(value)
+    return value
+
+
+def _amount(value: Any) -> float:
+    if type(value) not in {int, float} or not math.isfinite(value) or abs(value) >= _MOST:
+        raise ValueError(value)
+    number: float = value  # a sum of nothing is the integer 0
+    return number
+
+
+def _fits(file: LogFile, contents: LogContents) -> bool:
+    """Compare what a file says of its messages with its statistics."""
+    statistics = file.statistics
+    assert statistics is not None
+    counts: Counter[str] = Counter()
+    for number, count in statistics.channel_message_counts.items():
+        if count and number not in file.channels:
+            return False
+        if count:
+            counts[file.channels[number].topic] += count
+    topics = contents.topics
+    if counts != {name: topic.messages for name, topic in topics.items()}:
+        return False
+    if not topics:
+        return True
+    span = min(t.start for t in topics.values()), max(t.end for t in topics.values())
+    return span == (statistics.message_start_time, statistics.message_end_time)

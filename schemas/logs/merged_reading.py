@@ -9,7 +9,9 @@ from typing import NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.schemas.mcap.chunk_table import not_empty
+from hearthlog.schemas.files import map_logs, prefetch
+from hearthlog.schemas.logs.files import stated_span, time_span
+from hearthlog.schemas.mcap.chunk_index import not_empty
 from hearthlog.schemas.mcap.chunks import (
     OnDamage,
     TopicChoice,
@@ -22,9 +24,6 @@ from hearthlog.schemas.mcap.chunks import (
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
-from hearthlog.schemas.mcap.statistics import stated_span, time_span
-from hearthlog.schemas.storage.byte_ranges import map_logs
-from hearthlog.schemas.storage.prefetch import prefetch
 
 _BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
 _READERS = 2  # threads: more than these wait for each other's Python

@@ -1,19 +1,256 @@
-"""Write a log: MCAP of profile `ros2`, under another name until it is complete."""
+"""Log writers: MCAP of profile `ros2` with a record of its contents, to a stream or a file."""
 
 import errno
 import fcntl
+import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain, zip_longest
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
+import numpy as np
+from mcap.records import Channel, Schema
+
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.contents import (
+    CONTENTS_METADATA,
+    LogContents,
+    as_metadata,
+    has_contents,
+)
 from hearthlog.schemas.logs.files import active_path
-from hearthlog.schemas.logs.log_stream import Attachment, LogStreamWriter, TopicBatch
-from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.logs.metadata import (
+    HEARTHLOG_METADATA,
+    ROSBAG2_METADATA,
+    TopicCount,
+    rosbag2_channel,
+    rosbag2_metadata,
+)
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter
+from hearthlog.schemas.mcap.chunks import BATCH_SIZE
+from hearthlog.schemas.mcap.compressed_chunk import LATEST, StoredChunk
+from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
+from hearthlog.schemas.mcap.records import INDEX_ENTRIES, MESSAGE_HEAD, Definitions
+from hearthlog.schemas.messages.cdr_codec import Column, encode_groups
+from hearthlog.schemas.messages.message_types import definition, type_hash
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.storage.new_files import create_file, make_folders, sync_folder
+from hearthlog.schemas.new_files import create_file, make_folders, sync_folder
+
+
+class CountedWriter(ChunkWriter):
+    """A `ChunkWriter` whose last metadata record is `hearthlog_contents`.
+
+    The record is left out where there would be nothing to say, where it or a chunk would be large,
+    and where a message cannot be read.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        definitions: Definitions | None = None,
+        chunk_span: int = LATEST,
+    ) -> None:
+        super().__init__(stream, chunk_span=chunk_span)
+        self._copied = definitions
+        self._contents: LogContents | None = LogContents()
+        self._waiting: list[StoredChunk] = []  # one batch of a reader, so that it counts alike
+        self._size = 0
+
+    def add_metadata(self, name: str, data: dict[str, str]) -> None:
+        """Write a metadata record; that of another file's contents is left out."""
+        if name != CONTENTS_METADATA:
+            super().add_metadata(name, data)
+
+    def finish(self) -> None:
+        """Write the chunk in progress, the record, the index and the footer."""
+        self.flush()
+        self._count_waiting()
+        channels, schemas = self._definitions()
+        ours = any(has_contents(c, schemas.get(c.schema_id)) for c in channels.values())
+        record = as_metadata(self._contents) if ours and self._contents is not None else None
+        if record is not None:
+            super().add_metadata(CONTENTS_METADATA, record)
+        super().finish()
+
+    def copy_large_chunk(self, chunk: StoredChunk, length: int, data: Iterable[bytes]) -> None:
+        """Write a chunk of another file; what it says is not counted."""
+        self._give_up()
+        super().copy_large_chunk(chunk, length, data)
+
+    def _put(self, chunk: StoredChunk) -> int:
+        length = super()._put(chunk)
+        batch = self._size // BATCH_SIZE
+        self._size += chunk.size + length
+        if self._size // BATCH_SIZE != batch:
+            self._count_waiting()
+        if chunk.size > BATCH_SIZE:
+            self._give_up()  # no recorder's, and too large to be kept
+        if self._contents is not None:
+            self._waiting.append(chunk)
+        return length
+
+    def _count_waiting(self) -> None:
+        if self._contents is None or not self._waiting:
+            return
+        try:
+            self._contents.add(_messages(self._waiting, *self._definitions()))
+        except LogError:
+            self._give_up()
+        else:
+            self._waiting = []
+            if as_metadata(self._contents) is None:
+                self._give_up()
+
+    def _give_up(self) -> None:
+        self._contents = None
+        self._waiting = []
+
+    def _definitions(self) -> tuple[dict[int, Channel], dict[int, Schema]]:
+        if self._copied is not None:
+            return self._copied.channels, self._copied.schemas
+        return {c.id: c for c in self._channels}, {s.id: s for s in self._schemas}
+
+
+def _messages(
+    chunks: list[StoredChunk], channels: dict[int, Channel], schemas: dict[int, Schema]
+) -> list[RawMessages]:
+    """Find the messages of some chunks, in the order in which a reader does."""
+    contents = [chunk.content() if chunk.raw is None else chunk.raw for chunk in chunks]
+    buffer = np.frombuffer(b"".join(contents), np.uint8)
+    bases = np.cumsum([0, *map(len, contents)]).tolist()
+    messages = []
+    numbers = chain.from_iterable(zip_longest(*(chunk.entries for chunk in chunks)))
+    for number in dict.fromkeys(n for n in numbers if n is not None):
+        starts = np.concatenate(
+            [
+                np.frombuffer(chunk.entries[number], INDEX_ENTRIES)["offset"] + base
+                for chunk, base in zip(chunks, bases, strict=False)
+                if number in chunk.entries
+            ]
+        )
+        heads = gather_heads(buffer, starts)
+        order = np.argsort(heads["log_time"], kind="stable")
+        channel = channels[number]
+        schema = schemas.get(channel.schema_id)
+        offsets = starts[order] + MESSAGE_HEAD.itemsize
+        messages.append(RawMessages(channel, schema, buffer, offsets, heads[order]))
+    return messages
+
+
+PROFILE = "ros2"
+ENCODING = "cdr"
+SCHEMA_ENCODING = "ros2msg"
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A file carried inside a log."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+class TopicBatch(NamedTuple):
+    """Messages of one topic as columns.
+
+    Attributes
+    ----------
+    log_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds; the publish times are the same.
+    """
+
+    topic: str
+    log_times: Int64
+    fields: Mapping[str, Column]
+
+
+class LogStreamWriter:
+    """Writes a log to a stream."""
+
+    def __init__(self, stream: BinaryIO, topics: Sequence[Topic], chunk_span: int = LATEST) -> None:
+        self._channels: dict[str, int] = {}
+        self._topics: dict[str, TopicCount] = {}
+        self._writer = CountedWriter(stream, chunk_span=chunk_span)
+        self._writer.start(profile=PROFILE, library="hearthlog")
+        schemas: dict[str, int] = {}
+        for topic in topics:
+            if topic.type not in schemas:
+                schemas[topic.type] = self._writer.register_schema(
+                    topic.type, SCHEMA_ENCODING, definition(topic.type).encode()
+                )
+            names = {f"{key}_names": json.dumps([*n]) for key, n in topic.array_names.items()}
+            ros = rosbag2_channel(type_hash(topic.type), topic.quality)
+            channel_metadata = ros | names | dict(topic.metadata)
+            self._topics[topic.name] = TopicCount(topic.type, channel_metadata)
+            self._channels[topic.name] = self._writer.register_channel(
+                topic.name, ENCODING, schemas[topic.type], channel_metadata
+            )
+
+    def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
+        """Append a metadata record."""
+        self._writer.add_metadata(name, dict(metadata))
+
+    def add_attachment(self, attachment: Attachment, created: int) -> None:
+        """Append a file.
+
+        Parameters
+        ----------
+        created : int
+            Time of the file, in nanoseconds of UTC.
+        """
+        item = attachment
+        self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
+
+    def write_messages(self, messages: Sequence[tuple[int, str, bytes]]) -> None:
+        """Append encoded messages, in the order of their log times.
+
+        Parameters
+        ----------
+        messages : sequence of (int, str, bytes)
+            Log time in nanoseconds of UTC, which is also the publish time; name of one of the
+            writer's topics; CDR.
+        """
+        if messages:
+            times, topics, payloads = zip(*messages, strict=True)
+            channels = [self._channels[topic] for topic in topics]
+            self._writer.add_messages(channels, times, payloads)
+
+    def write_columns(self, batch: Sequence[TopicBatch]) -> None:
+        """Append messages of several topics, in the order of their log times.
+
+        The file is the same as if they had been encoded and written one by one.
+
+        Raise `LogError` if a message cannot be encoded; see `encode_groups`.
+        """
+        blocks: list[Block] = []
+        first = 0
+        for part in batch:
+            count = len(part.log_times)
+            for rows, payloads in encode_groups(self._topics[part.topic].type, part.fields, count):
+                times = part.log_times[rows]
+                sequences = np.zeros(len(rows), np.uint32)
+                channel = self._channels[part.topic]
+                blocks.append(Block(channel, times, times, sequences, payloads, first + rows))
+            first += count
+        self._writer.write(blocks)
+
+    def flush(self) -> None:
+        """End the chunk in progress."""
+        self._writer.flush()
+
+    def finish(self, name: str) -> None:
+        """Complete the log."""
+        self._writer.flush()
+        for topic, channel in self._channels.items():
+            self._topics[topic].messages = self._writer.message_counts.get(channel, 0)
+        metadata = rosbag2_metadata(name, self._topics, self._writer.span)
+        self._writer.add_metadata(ROSBAG2_METADATA, metadata)
+        self._writer.finish()
 
 
 class LogWriter:
@@ -52,7 +289,7 @@ class LogWriter:
         self._status = os.fstat(self._stream.fileno())
         try:
             self._content = LogStreamWriter(self._stream, topics)
-            self._content.add_metadata(METADATA, metadata)
+            self._content.add_metadata(HEARTHLOG_METADATA, metadata)
             for attachment in attachments:
                 self._content.add_attachment(attachment, created)
         except OSError:

@@ -5,26 +5,172 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 
 import zlib
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
-from hearthlog.schemas.mcap import formats
-from hearthlog.schemas.mcap.formats import HEAD
-from hearthlog.schemas.mcap.message_blocks import (
-    Block,
-    MessageRecords,
-    join_messages,
-    merge_blocks,
+from hearthlog.schemas.arrays import Bytes, Int64, gather, scatter
+from hearthlog.schemas.files import prefetch
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.mcap.compressed_chunk import LATEST, ChunkBuilder, StoredChunk
+from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.mcap.records import (
+    CHUNK,
+    FOOTER,
+    HEAD,
+    INDEX_ENTRIES,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    UINT32,
+    UINT64,
+    encode,
 )
-from hearthlog.schemas.mcap.records import encode
-from hearthlog.schemas.mcap.stored_chunk import LATEST, ChunkBuilder, StoredChunk
-from hearthlog.schemas.storage.prefetch import prefetch
-from hearthlog.schemas.times import NANOSECONDS
+
+
+class Block(NamedTuple):
+    """Messages of one channel whose payloads have one size.
+
+    Attributes
+    ----------
+    log_times, publish_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds of UTC.
+    sequences : np.ndarray [shape=(n,)], uint32
+    payloads : np.ndarray [shape=(n,)], of a dtype of the payloads' size
+    rank : np.ndarray [shape=(n,)], int64
+        Where log times are equal, the message of lower rank comes first.
+    """
+
+    channel: int
+    log_times: Int64
+    publish_times: Int64
+    sequences: NDArray[np.uint32]
+    payloads: NDArray[np.void]
+    rank: Int64
+
+    def records(self) -> NDArray[np.void]:
+        """Encode the messages as MCAP records.
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], of dtype V`size`
+            One record in each row, with opcode and length; `size` is that of a whole record.
+        """
+        size = self.payloads.dtype.itemsize
+        records = np.empty(len(self.payloads), [("head", MESSAGE_HEAD), ("payload", f"V{size}")])
+        head = records["head"]
+        head["opcode"] = Opcode.MESSAGE
+        head["length"] = MESSAGE_FIXED + size
+        head["channel"] = self.channel
+        head["sequence"] = self.sequences
+        head["log_time"] = self.log_times
+        head["publish_time"] = self.publish_times
+        records["payload"] = self.payloads.view(f"V{size}")
+        return records.view(f"V{records.dtype.itemsize}")
+
+
+def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
+    """Group messages by the sizes of their payloads, to write them unchanged to a channel."""
+    for size in np.unique(messages.sizes).tolist():
+        rows = np.flatnonzero(messages.sizes == size)
+        heads = messages.heads[rows]
+        yield Block(
+            channel,
+            heads["log_time"],
+            heads["publish_time"],
+            heads["sequence"],
+            gather(messages.buffer, messages.offsets[rows], size),
+            first_rank + rows,
+        )
+
+
+class MessageRecords(NamedTuple):
+    """Message records of one or more channels, in the order of their log times.
+
+    Attributes
+    ----------
+    data : np.ndarray [shape=(b,)], uint8
+        The records, one behind the other.
+    ends : np.ndarray [shape=(n,)], int64
+        Bytes of the data before which each record ends.
+    sizes : np.ndarray [shape=(n,)], int64
+        Bytes of each record.
+    channels : np.ndarray [shape=(n,)], int64
+        Number of the channel of each.
+    times : np.ndarray [shape=(n,)], int64
+        Log time of each in nanoseconds, ascending.
+    """
+
+    data: Bytes
+    ends: Int64
+    sizes: Int64
+    channels: Int64
+    times: Int64
+
+
+def join_messages(
+    channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
+) -> MessageRecords:
+    """Encode messages as records, in their order.
+
+    Parameters
+    ----------
+    channels : sequence of int
+        Number of the channel of each; one message at least.
+    times : sequence of int
+        Log time of each, which is also its publish time, in nanoseconds; ascending.
+    """
+    heads = np.empty(len(payloads), MESSAGE_HEAD)
+    heads["opcode"] = Opcode.MESSAGE
+    heads["length"] = np.fromiter(map(len, payloads), np.int64, len(payloads)) + MESSAGE_FIXED
+    heads["channel"] = channels
+    heads["sequence"] = 0
+    heads["log_time"] = heads["publish_time"] = times
+    pieces = [b""] * (2 * len(payloads))
+    pieces[::2] = heads.view(f"V{MESSAGE_HEAD.itemsize}").tolist()  # bytes; S would lose zeros
+    pieces[1::2] = payloads
+    sizes = heads["length"].astype(np.int64) + HEAD.size
+    return MessageRecords(
+        np.frombuffer(b"".join(pieces), np.uint8),
+        np.cumsum(sizes),
+        sizes,
+        heads["channel"].astype(np.int64),
+        heads["log_time"].astype(np.int64),
+    )
+
+
+def merge_blocks(blocks: Sequence[Block]) -> MessageRecords:
+    """Encode the messages of several blocks in the order of their log times.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        One or more, none of them empty. Messages of the same log time are sorted by their ranks.
+    """
+    times = np.concatenate([block.log_times for block in blocks])
+    order = np.lexsort((np.concatenate([block.rank for block in blocks]), times))
+    counts = [len(block.log_times) for block in blocks]
+    records = [block.records() for block in blocks]
+    sizes = np.repeat([rows.dtype.itemsize for rows in records], counts)[order]
+    ends = np.cumsum(sizes)
+    starts = np.empty_like(ends)
+    starts[order] = ends - sizes
+    data = np.empty(int(ends[-1]), np.uint8)
+    first = 0
+    for rows in records:
+        scatter(rows, data, starts[first : first + len(rows)])
+        first += len(rows)
+    channels = np.repeat([block.channel for block in blocks], counts)[order]
+    return MessageRecords(data, ends, sizes, channels, times[order])
+
 
 CHUNK_SIZE = 1 << 20
 _LEAST = 4 << 10  # bytes that a chunk has before the span of time can end it
@@ -72,7 +218,7 @@ class ChunkWriter:
         profile : str
             Profile of the header: `ros2`, or empty for none.
         """
-        self._stream.write(formats.MAGIC)
+        self._stream.write(MAGIC)
         self._write(records.Header(profile, library))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
@@ -179,10 +325,10 @@ class ChunkWriter:
             0 to 2**32 - 1.
         """
         chunk = self._chunk
-        chunk.entries[channel_id] += formats.INDEX_ENTRY.pack(log_time, len(chunk.content))
-        chunk.content += formats.MESSAGE.pack(
+        chunk.entries[channel_id] += INDEX_ENTRY.pack(log_time, len(chunk.content))
+        chunk.content += MESSAGE.pack(
             Opcode.MESSAGE,
-            formats.MESSAGE_FIXED + len(data),
+            MESSAGE_FIXED + len(data),
             channel_id,
             sequence,
             log_time,
@@ -311,11 +457,11 @@ class ChunkWriter:
             summary += group
         offset_start = summary_start + len(summary)
         summary += offsets
-        footer = HEAD.pack(Opcode.FOOTER, formats.FOOTER.size + formats.UINT32.size)
-        footer += formats.FOOTER.pack(summary_start, offset_start)
+        footer = HEAD.pack(Opcode.FOOTER, FOOTER.size + UINT32.size)
+        footer += FOOTER.pack(summary_start, offset_start)
         crc = zlib.crc32(footer, zlib.crc32(summary))
         self._stream.write(summary)
-        self._stream.write(footer + formats.UINT32.pack(crc) + formats.MAGIC)
+        self._stream.write(footer + UINT32.pack(crc) + MAGIC)
 
     @property
     def message_counts(self) -> Mapping[int, int]:
@@ -349,8 +495,8 @@ class ChunkWriter:
         self, chunk: StoredChunk, length: int, data: Iterable[bytes | memoryview]
     ) -> int:
         text = len(chunk.compression)
-        head = formats.CHUNK.pack(chunk.start, chunk.end, chunk.size, chunk.crc, text)
-        head += chunk.compression + formats.UINT64.pack(length)
+        head = CHUNK.pack(chunk.start, chunk.end, chunk.size, chunk.crc, text)
+        head += chunk.compression + UINT64.pack(length)
         offset = self._stream.tell()
         self._stream.write(HEAD.pack(Opcode.CHUNK, len(head) + length) + head)
         for piece in data:
@@ -359,10 +505,10 @@ class ChunkWriter:
         index_offsets = {}
         for channel, entries in chunk.entries.items():
             index_offsets[channel] = self._stream.tell()
-            head = HEAD.pack(Opcode.MESSAGE_INDEX, formats.MESSAGE_INDEX.size + len(entries))
-            self._stream.write(head + formats.MESSAGE_INDEX.pack(channel, len(entries)))
+            head = HEAD.pack(Opcode.MESSAGE_INDEX, MESSAGE_INDEX.size + len(entries))
+            self._stream.write(head + MESSAGE_INDEX.pack(channel, len(entries)))
             self._stream.write(entries)
-            self._counts[channel] += len(entries) // formats.INDEX_ENTRY.size
+            self._counts[channel] += len(entries) // INDEX_ENTRY.size
         self._chunk_indexes += encode(
             records.ChunkIndex(
                 chunk_length=first - offset,
@@ -401,7 +547,7 @@ class ChunkWriter:
                 self._chunk = ChunkBuilder()
                 continue
             part = slice(first, last)
-            entries = np.empty(last - first, formats.INDEX_ENTRIES)
+            entries = np.empty(last - first, INDEX_ENTRIES)
             entries["time"] = times[part]
             entries["offset"] = ends[part] - sizes[part] - offset + len(chunk.content)
             chunk.add_messages(data[offset : ends[last - 1]], channels[part], entries)

@@ -18,23 +18,41 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.mcap import formats
-from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.chunk_table import CHUNKS, LAST_TIME, LATE, by_start, not_empty
-from hearthlog.schemas.mcap.decompression import decompress_together
-from hearthlog.schemas.mcap.formats import HEAD, MESSAGE, MESSAGE_HEAD
-from hearthlog.schemas.mcap.large_chunks import ContentStream, Part, TooLargeError, read_parts
+from hearthlog.schemas.frames import millisecond_text
+from hearthlog.schemas.mcap.chunk_index import CHUNKS, LAST_TIME, LATE, by_start, not_empty
+from hearthlog.schemas.mcap.compressed_chunk import (
+    ContentStream,
+    Part,
+    TooLargeError,
+    decompress_together,
+    read_parts,
+)
 from hearthlog.schemas.mcap.logfile import RECOVER, LogFile
-from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
-from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into
-from hearthlog.schemas.times import millisecond_text
+from hearthlog.schemas.mcap.raw_messages import (
+    RawMessages,
+    gather_heads,
+    index_messages,
+    iterate_records,
+)
+from hearthlog.schemas.mcap.records import (
+    HEAD,
+    INDEX_ENTRIES,
+    LIMIT,
+    MESSAGE,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX_HEAD,
+    ChunkHead,
+    chunk_head,
+    decompress_into,
+)
 
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
 _STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
 _AGAIN = 16  # times the bytes of a large chunk that are decompressed once more, for their order
 _INDEXES = "message indexes that do not belong to their chunks are not used"
 _WRONG_INDEX = "the index of a chunk does not belong to it"
-_ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
+_ENTRY_SIZE = INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
 BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
@@ -447,7 +465,7 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
         elif opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE:
             raise McapError("the records of a chunk are damaged")
     made = index_messages(content, np.frombuffer(starts, np.int64))
-    return {channel: np.frombuffer(rows, formats.INDEX_ENTRIES) for channel, rows in made.items()}
+    return {channel: np.frombuffer(rows, INDEX_ENTRIES) for channel, rows in made.items()}
 
 
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
@@ -501,11 +519,11 @@ class _Batch(NamedTuple):
 
     def _entries(self, parts: Int64) -> Entries:
         """Collect the index entries of some parts, as `_index_parts` gives them."""
-        width = formats.INDEX_ENTRIES.itemsize
+        width = INDEX_ENTRIES.itemsize
         counts = parts[:, 3] // width
         before = np.cumsum(counts) - counts
         places = np.repeat(parts[:, 2] - width * before, counts) + width * np.arange(counts.sum())
-        entries = gather(self.raw, places, width).view(formats.INDEX_ENTRIES)
+        entries = gather(self.raw, places, width).view(INDEX_ENTRIES)
         return np.repeat(parts[:, 0], counts), entries
 
     def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
@@ -516,7 +534,7 @@ class _Batch(NamedTuple):
         np.ndarray [shape=(n, 4)]
             Number of the chunk, of the channel, and place and size of its entries.
         """
-        index_head = formats.MESSAGE_INDEX_HEAD
+        index_head = MESSAGE_INDEX_HEAD
         parts = [np.empty((0, 4), np.int64)]
         numbers = np.flatnonzero(starts < ends)
         starts, ends = starts[numbers], ends[numbers]
@@ -577,7 +595,7 @@ class _Batch(NamedTuple):
             (heads["opcode"] == Opcode.MESSAGE)
             & (heads["channel"] == identity)
             & (heads["log_time"] == entries["time"])
-            & (heads["length"] >= formats.MESSAGE_FIXED)
+            & (heads["length"] >= MESSAGE_FIXED)
             & (heads["length"] <= rest - HEAD.size)
             & (heads["log_time"] >= self.chunks["start"][number])
             & (heads["log_time"] <= self.chunks["end"][number])

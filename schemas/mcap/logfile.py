@@ -1,4 +1,4 @@
-"""What one log consists of, from its index, or by walking from record to record."""
+"""Records of one log, located by its index or by a walk from record to record."""
 
 import struct
 import threading
@@ -19,8 +19,8 @@ from mcap.records import McapRecord
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
-from hearthlog.schemas.mcap.chunk_table import (
+from hearthlog.schemas.files import LocalFile, StoredFile, open_file
+from hearthlog.schemas.mcap.chunk_index import (
     CHUNKS,
     LAST_TIME,
     LATE,
@@ -30,27 +30,26 @@ from hearthlog.schemas.mcap.chunk_table import (
     not_empty,
     read_chunk_index,
     read_chunk_row,
+    read_records,
+    walk_records,
 )
-from hearthlog.schemas.mcap.formats import (
+from hearthlog.schemas.mcap.compressed_chunk import ContentStream
+from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
+from hearthlog.schemas.mcap.records import (
     FOOTER,
     FOOTER_SIZE,
     HEAD,
     INDEX_ENTRIES,
+    LIMIT,
     MAGIC,
     MESSAGE_INDEX_HEAD,
-    UINT16,
-    not_mcap,
-)
-from hearthlog.schemas.mcap.large_chunks import ContentStream
-from hearthlog.schemas.mcap.record_walk import read_records, walk_records
-from hearthlog.schemas.mcap.records import (
-    LIMIT,
     TOO_LARGE,
+    UINT16,
     begun_chunk_head,
+    not_mcap,
     parse_escaped,
     read_footer,
 )
-from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
 _NO_UTF8 = "bytes that are not UTF-8 stand as \\xNN in names of topics, types or records"

@@ -1,7 +1,11 @@
-"""MCAP at the level of its records: framing, parsing and decompression, within limits.
+"""MCAP records within limits: binary layouts (https://mcap.dev/spec), parsing, decompression.
 
 A file may come from anywhere: no length that it claims is believed before it is checked, and no
 record may be larger than `LIMIT`. A larger chunk is read in parts.
+
+All numbers are little-endian; times are nanoseconds. A record is its opcode, the length of its
+content, and its content. A `Struct` is the fixed beginning of a content, unless its comment says
+that opcode and length are part of it; a dtype has rows of entire records or entries.
 """
 
 import struct
@@ -10,14 +14,88 @@ import zlib
 from io import BytesIO
 from typing import Any, NamedTuple
 
+import numpy as np
 import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import McapRecord
+from mcap.records import Channel, McapRecord, Schema
 
-from hearthlog.schemas.mcap.formats import CHUNK, FOOTER_SIZE, HEAD, MAGIC, UINT64
+MAGIC = b"\x89MCAP0\r\n"
+UINT16, UINT32, UINT64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
+HEAD = struct.Struct("<BQ")  # opcode, length of the content
+MESSAGE = struct.Struct("<BQHIQQ")  # with HEAD: channel, sequence, log time, publish time; payload
+MESSAGE_FIXED = MESSAGE.size - HEAD.size  # bytes of a message's content before its payload
+MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<i8"),
+        ("publish_time", "<i8"),
+    ]
+)
+# First and last log time, size and CRC uncompressed, length of the compression's name; that name,
+# length of the data (UINT64), data.
+CHUNK = struct.Struct("<QQQII")
+ZSTD_CHUNK_HEAD = np.dtype(  # of a chunk whose compression's name has four letters
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("start", "<i8"),
+        ("end", "<i8"),
+        ("size", "<i8"),
+        ("crc", "<u4"),
+        ("name_length", "<u4"),
+        ("name", "S4"),
+        ("stored", "<i8"),
+    ]
+)
+MESSAGE_INDEX = struct.Struct("<HI")  # channel, bytes of the entries; entries
+MESSAGE_INDEX_HEAD = np.dtype(
+    [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")]
+)
+INDEX_ENTRY = struct.Struct("<QQ")  # log time of a message, offset in the uncompressed chunk
+INDEX_ENTRIES = np.dtype([("time", "<i8"), ("offset", "<i8")])
+# First and last log time, offset and length of the chunk, bytes of the index offsets; these, the
+# tail, the compression's name, size compressed and uncompressed (UINT64 each).
+CHUNK_INDEX = struct.Struct("<QQQQI")
+INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
+CHUNK_INDEX_TAIL = struct.Struct("<QI")  # bytes of the message indexes, length of a name
+ATTACHMENT = struct.Struct("<QQI")  # log time, time of creation, length of the name
+SUMMARY_OFFSET = struct.Struct("<9xBQQ")  # with HEAD: opcode, start and length of a group
+FOOTER = struct.Struct("<QQ")  # start of the summary, start of the summary offsets; CRC (UINT32)
+FOOTER_SIZE = HEAD.size + FOOTER.size + UINT32.size + len(MAGIC)
+_OTHERS = {  # formats that are taken for MCAP, by how they begin, and what makes MCAP of them
+    b"\x28\xb5\x2f\xfd": "is compressed as a whole: `zstd -d -o NEW.mcap` makes a log of it",
+    b"\x04\x22\x4d\x18": "is compressed as a whole: `lz4 -d` makes a log of it",
+    b"\x1f\x8b": "is compressed as a whole: `gzip -d` makes a log of it",
+    b"BZh": "is compressed as a whole: `bzip2 -d` makes a log of it",
+    b"\xfd7zXZ\0": "is compressed as a whole: `xz -d` makes a log of it",
+    b"PK\3\4": "is an archive: `unzip` takes out what is in it",
+    b"SQLite format 3\0": "is a bag in SQLite, no MCAP: `ros2 bag convert` makes MCAP of it",
+    b"#ROSBAG": "is a bag of ROS 1, no MCAP: `rosbags-convert` makes a bag of ROS 2 of it",
+}
+_COMPRESSED = (".zst", ".zstd", ".lz4", ".gz", ".bz2", ".xz")
+COMPRESSED_SUFFIXES = tuple(f".mcap{suffix}" for suffix in _COMPRESSED)
+OTHER_SUFFIXES = (*_COMPRESSED, ".db3", ".bag")
+
+
+def not_mcap(start: bytes) -> str:
+    """Say what a file is that does not begin as MCAP does.
+
+    Parameters
+    ----------
+    start : bytes
+        The first 16 bytes of it, or all.
+    """
+    for magic, what in _OTHERS.items():
+        if start.startswith(magic):
+            return what
+    return "is not an MCAP file"
+
 
 LIMIT = 100 << 20  # bytes that are held at once; ours are below 2 MiB
 TOO_LARGE = f"it is larger than hearthlog reads at once ({LIMIT >> 20} MiB)"
@@ -258,3 +336,47 @@ def zstd_decompressor() -> zstandard.ZstdDecompressor:
 
 
 _DECOMPRESS = {b"zstd": _zstd, b"lz4": _lz4, b"": _stored}
+
+
+Definition = Schema | Channel
+
+
+class Definitions:
+    """Schemas and channels by number, wherever a file defines them.
+
+    Notes which numbers have contradictory definitions.
+    """
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._doubtful: set[tuple[type, int]] = set()
+
+    def add(self, record: Definition) -> bool:
+        """Add a definition, unless its number is taken."""
+        if isinstance(record, Schema):
+            return self.schemas.setdefault(record.id, record) == record
+        return self.channels.setdefault(record.id, record) == record
+
+    def doubt(self, record: Definition) -> None:
+        """Note that a definition contradicts another one of its number."""
+        self._doubtful.add((type(record), record.id))
+
+    def defines(self, number: int) -> bool:
+        """Tell whether it is certain what the messages of a channel are.
+
+        Returns
+        -------
+        bool
+            Whether the channel and its schema, if it has one, are defined without contradiction.
+        """
+        channel = self.channels.get(number)
+        if channel is None or (Channel, number) in self._doubtful:
+            return False
+        schema = channel.schema_id
+        is_defined = schema == 0 or schema in self.schemas
+        return is_defined and (Schema, schema) not in self._doubtful
+
+    def topic(self, number: int) -> str:
+        """Name the topic of a channel."""
+        return self.channels[number].topic if self.defines(number) else f"channel {number}"

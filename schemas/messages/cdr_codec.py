@@ -9,17 +9,19 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Indices, Int64, gather
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages.cdr_layout import (
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.message_types import APPENDED
+from hearthlog.schemas.messages.type_definitions import (
     AnyLeaf,
     Default,
+    EndlessTextError,
     Layout,
     Leaf,
     MessageArray,
+    MessageType,
     default_rows,
+    message_type,
 )
-from hearthlog.schemas.messages.type_definitions import EndlessTextError, MessageType, message_type
-from hearthlog.schemas.messages.versions import APPENDED
-from hearthlog.schemas.times import NANOSECONDS
 
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]

@@ -1,4 +1,4 @@
-"""What the fields of a message type are, and whether those of a file's definition will do."""
+"""Fields of message types, and their comparison with the definitions in files."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -9,10 +9,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages.cdr_layout import TEXTS
-from hearthlog.schemas.messages.message_types import PACKAGE
-from hearthlog.schemas.messages.type_definitions import MessageType, message_type
-from hearthlog.schemas.messages.versions import APPENDED
+from hearthlog.schemas.messages.message_types import APPENDED, PACKAGE
+from hearthlog.schemas.messages.type_definitions import TEXTS, MessageType, message_type
 
 TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"

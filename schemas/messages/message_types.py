@@ -1,16 +1,39 @@
-"""The messages of a log and their CDR encoding, on the typestore of rosbags."""
+"""The messages of a log, their CDR encoding on the typestore of rosbags, and their growth.
+
+Fields are only ever appended to `msg/*.msg`; none is renamed, moved, removed, or given another
+type. Who appends one raises `SCHEMA_VERSION` and enters the field in `APPENDED`: docs/log.md.
+"""
 
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from hearthlog.schemas.messages.versions import APPENDED
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
+
+SCHEMA_VERSION = 3  # of the messages and records that this version writes
+
+
+class Appended(NamedTuple):
+    """A field that messages did not have from the beginning.
+
+    Its default is what a message without it says; None stands for a number of 0, no time, an empty
+    text or sequence.
+    """
+
+    since: int  # the first schema version that has it
+    default: float | str | None = None
+
+
+# By type and name of the field.
+APPENDED: dict[str, dict[str, Appended]] = {
+    "hearthlog_msgs/msg/AudioMark": {"reason": Appended(since=3)},
+}
+
 
 PACKAGE = "hearthlog_msgs"
 STREAM_INFO = f"{PACKAGE}/msg/AudioStreamInfo"
@@ -207,3 +230,21 @@ def definition(typename: str) -> str:
 def type_hash(typename: str) -> str:
     """Return the RIHS01 hash of a type, by which ROS 2 compares the types of two sides."""
     return store_of(typename).hash_rihs01(typename)
+
+
+LOG_DAMAGED = "the log was damaged"  # the reason of a gap that `recover` writes
+CLOCK_SET = "the clock was set"  # in the reason: the gap may have any length, also less than none
+QUIET_HOURS, PAUSED = ON_PURPOSE = "quiet hours", "paused"  # nobody was to be listened to
+
+
+def encode_gap(microphone: str, start: int, end: int, reason: str, frames_lost: int) -> bytes:
+    """Encode an `AudioGap` as CDR."""
+    return encode(
+        message(
+            GAP,
+            header=header(start, microphone),
+            duration=duration_message(end - start),
+            reason=reason,
+            frames_lost=frames_lost,
+        )
+    )

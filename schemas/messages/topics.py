@@ -1,4 +1,4 @@
-"""The topics of a log: their types, their quality of service, the names behind their arrays."""
+"""The topics of a log: types, quality of service, array names; labels for no sound."""
 
 import json
 import re
@@ -282,3 +282,16 @@ def topics_of(  # noqa: PLR0913
 def audio_topic(microphone: str) -> Topic:
     """Return the only topic of a layer of sound."""
     return Topic(topic(microphone, "audio"), message_types.RAW_AUDIO)
+
+
+SILENCE, UNKNOWN = "silence", "unknown"
+
+
+def spelt(label: str) -> str:
+    """Spell a label as the names of classes are: `Crying, sobbing` as `crying_sobbing`."""
+    return re.sub("[ ,-]+", "_", label.lower())
+
+
+def is_sound(label: str) -> bool:
+    """Tell whether a label names a sound, and neither silence nor what the model does not know."""
+    return spelt(label) not in {SILENCE, UNKNOWN}

@@ -1,16 +1,118 @@
-"""The frames that could not be saved, where the log still tells how many they were."""
+"""Frames that could not be saved, where their number is known, and the channel of their gaps."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from mcap.records import Message
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message, Schema
 
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.topics import LIVE, parse_topic, topic
-from hearthlog.schemas.salvage.frame_marks import FEATURES, GAP, INFO, LABEL, Mark, read_marks
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
+from hearthlog.schemas.logs.columns import decode
+from hearthlog.schemas.logs.metadata import rosbag2_channel
+from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
+from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
+from hearthlog.schemas.mcap.records import INDEX_ENTRIES, MESSAGE, MESSAGE_FIXED, Definitions
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.fields import lacking
+from hearthlog.schemas.messages.message_types import GAP, definition, type_hash
+from hearthlog.schemas.messages.topics import LIVE, Quality, parse_topic, topic
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.whole_records import WholeChunk
-from hearthlog.schemas.times import NANOSECONDS
+
+_FEATURES, _LABEL, _GAP, _INFO = "features", "label", "gap", "info"
+_STAMP = "header.stamp"
+_FIELDS = {
+    (_FEATURES, message_types.FEATURES): [_STAMP, "frame"],
+    (_LABEL, message_types.LABEL): [_STAMP, "frame"],
+    (_GAP, message_types.GAP): [_STAMP, "frames_lost", "duration"],
+    (_INFO, message_types.STREAM_INFO): [],
+}
+_MOST = 1000  # gaps of a piece that are looked at
+
+
+class FramePosition(NamedTuple):
+    """A message that tells of frames, or of their lack."""
+
+    place: int  # byte of the content of its piece
+    kind: str  # `features`, `label`, `gap` or `info`
+    number: int  # of the frame; of a gap the frames that it lost
+    start: int  # nanoseconds of UTC
+    end: int
+
+
+def read_marks(
+    piece: WholeChunk | Message, definitions: Definitions
+) -> dict[str, list[FramePosition]]:
+    """Read the gaps of a piece, and the first and the last of its frames.
+
+    Returns
+    -------
+    dict of str to list of Mark
+        By microphone, in the order of the piece. Messages that are not of the type that their
+        channel names are left out.
+    """
+    marks: dict[str, list[FramePosition]] = {}
+    content = b""
+    for number, places in _places(piece):
+        channel = definitions.channels[number]
+        schema = definitions.schemas.get(channel.schema_id)
+        topic = parse_topic(channel.topic)
+        if schema is None or topic is None or topic.labelling != LIVE:
+            continue
+        fields = _FIELDS.get((topic.kind, schema.name))
+        if fields is None or not _defines(schema, fields):
+            continue
+        content = content or _content(piece)  # that of other files is not looked at
+        rows = places[:_MOST] if topic.kind in {_GAP, _INFO} else places[[0, -1]]
+        buffer, heads = np.frombuffer(content, np.uint8), gather_heads(content, rows)
+        raw = RawMessages(channel, schema, buffer, rows + MESSAGE.size, heads)
+        marks.setdefault(topic.microphone, []).extend(_decode(raw, topic.kind, fields, rows))
+    return {microphone: sorted(same) for microphone, same in marks.items()}
+
+
+def _defines(schema: Schema, fields: Sequence[str]) -> bool:
+    try:
+        return not lacking(message_type(schema.name, schema.encoding, schema.data), fields)
+    except LogError:
+        return False
+
+
+def _places(piece: WholeChunk | Message) -> Iterator[tuple[int, Int64]]:
+    """Yield each channel of a piece, and where in its content the messages are."""
+    if isinstance(piece, Message):
+        yield piece.channel_id, np.zeros(1, np.int64)
+    else:
+        for number, entries in piece.stored.entries.items():
+            yield number, np.frombuffer(entries, INDEX_ENTRIES)["offset"]
+
+
+def _content(piece: WholeChunk | Message) -> bytes:
+    if not isinstance(piece, Message):
+        return piece.stored.content()
+    length = MESSAGE_FIXED + len(piece.data)
+    times = piece.log_time, piece.publish_time
+    head = MESSAGE.pack(Opcode.MESSAGE, length, piece.channel_id, piece.sequence, *times)
+    return head + piece.data
+
+
+def _decode(
+    raw: RawMessages, kind: str, fields: Sequence[str], places: Int64
+) -> Iterator[FramePosition]:
+    try:
+        (columns,) = decode([raw], fields)
+    except LogError:
+        return
+    starts = columns.log_times if kind == _INFO else columns[_STAMP]  # `cut` repeats an older one
+    numbers = columns[fields[1]] if kind != _INFO else np.zeros(len(starts), np.int64)
+    lengths = columns[fields[2]] if kind == _GAP else np.full(len(starts), FRAME_NANOSECONDS)
+    rows = (places, numbers, starts, starts + lengths)
+    for place, number, start, end in zip(*(row.tolist() for row in rows), strict=True):
+        yield FramePosition(place, kind, number, start, end)
+
 
 _OF_SOUND = {"features", "statistics", "label", "segment"}  # say that there was sound
 _LATEST = NANOSECONDS << 31  # stamps have seconds of 32 bits
@@ -87,20 +189,20 @@ class _FrameFollower:
         self._name = microphone
         self._salvage = salvage
         # Without an index bytes can be missing between two records, and nothing is broken.
-        gaps = topic(microphone, GAP)
+        gaps = topic(microphone, _GAP)
         has_gaps = any(c.topic == gaps for c in salvage.definitions.channels.values())
         self._has_all_gaps = has_gaps and not salvage.complete
-        self._kind = LABEL
+        self._kind = _LABEL
         self._place: _Place | None = None  # behind the last mark
         self._damages = 0  # that lie before it
 
-    def follow(self, marks: Sequence[Mark]) -> list[LostFrames]:
-        if any(mark.kind == FEATURES for mark in marks):
-            self._kind = FEATURES
+    def follow(self, marks: Sequence[FramePosition]) -> list[LostFrames]:
+        if any(mark.kind == _FEATURES for mark in marks):
+            self._kind = _FEATURES
         lost: list[LostFrames] = []
         has_frames = False
         for mark in marks:
-            if mark.kind not in {self._kind, GAP, INFO} or self._is_repeated(mark):
+            if mark.kind not in {self._kind, _GAP, _INFO} or self._is_repeated(mark):
                 continue
             count = 0 if has_frames else self._missing(mark)  # a piece is whole in itself
             if count:
@@ -116,37 +218,37 @@ class _FrameFollower:
             return []
         start = self._place.time
         count = self._counted()
-        if not count and self._kind == FEATURES:  # labels end before the sound
+        if not count and self._kind == _FEATURES:  # labels end before the sound
             count = (heard - start) // FRAME_NANOSECONDS
         return self._lost(start, max(start + count * FRAME_NANOSECONDS, last), count)
 
-    def _is_repeated(self, mark: Mark) -> bool:
+    def _is_repeated(self, mark: FramePosition) -> bool:
         """Tell whether a mark was passed already: a damaged file may hold a piece twice."""
         return self._place is not None and mark.end <= self._place.time
 
-    def _missing(self, mark: Mark) -> int:
+    def _missing(self, mark: FramePosition) -> int:
         """Count the frames that are missing before a mark."""
-        if mark.kind == INFO:  # another recording begins, or the next log of a merged one
+        if mark.kind == _INFO:  # another recording begins, or the next log of a merged one
             return 0
         if self._place is None:
             return self._counted()
         number, time, of_frame = self._place
-        if not self._is_damaged() and not (of_frame and mark.kind != GAP and self._has_all_gaps):
+        if not self._is_damaged() and not (of_frame and mark.kind != _GAP and self._has_all_gaps):
             return 0
         by_time = max(round((mark.start - time) / FRAME_NANOSECONDS), 0)
-        if mark.kind == GAP:
+        if mark.kind == _GAP:
             return by_time
         return min(by_time, mark.number) if number is None else max(mark.number - number, 0)
 
-    def _start(self, mark: Mark, count: int) -> int:
+    def _start(self, mark: FramePosition, count: int) -> int:
         if self._place is None or self._place.number is None:
             return mark.start - count * FRAME_NANOSECONDS
         return self._place.time
 
-    def _behind(self, mark: Mark, missing: int) -> _Place:
-        if mark.kind == INFO:
+    def _behind(self, mark: FramePosition, missing: int) -> _Place:
+        if mark.kind == _INFO:
             return _Place(None, mark.start, of_frame=False)
-        if mark.kind != GAP:
+        if mark.kind != _GAP:
             return _Place(mark.number + 1, mark.end, of_frame=True)
         number = None if self._place is None else self._place.number
         if number is not None:
@@ -167,3 +269,57 @@ class _FrameFollower:
         if count <= 0 or not 0 <= start < end < _LATEST:
             return []
         return [LostFrames(end, start, self._name, count)]
+
+
+_LAST = 0xFFFF  # number of a schema or a channel
+
+
+def gap_channel(definitions: Definitions, microphone: str) -> int | None:
+    """Find the channel for the gaps of a microphone, or define it.
+
+    Parameters
+    ----------
+    definitions : Definitions
+        Are added to if there is none.
+
+    Returns
+    -------
+    int or None
+        Number of the channel; None if the topic has one for messages of another type.
+    """
+    name = topic(microphone, "gap")
+    for number, channel in definitions.channels.items():
+        if channel.topic == name:
+            is_ours = definitions.defines(number) and _is_ours(definitions, channel)
+            return number if is_ours else None
+    number = _free(definitions.channels)
+    metadata = rosbag2_channel(type_hash(GAP), Quality())
+    definitions.add(Channel(number, name, ENCODING, metadata, _schema(definitions)))
+    return number
+
+
+def _is_ours(definitions: Definitions, channel: Channel) -> bool:
+    schema = definitions.schemas.get(channel.schema_id)
+    if schema is None or schema.name != GAP or channel.message_encoding != ENCODING:
+        return False
+    try:
+        kind = message_type(schema.name, schema.encoding, schema.data)
+    except LogError:
+        return False
+    return kind.types[GAP] == message_type(GAP).types[GAP]
+
+
+def _schema(definitions: Definitions) -> int:
+    """Return the number of the schema of gaps, which is defined if there is none."""
+    data = definition(GAP).encode()
+    for number, schema in definitions.schemas.items():
+        if (schema.name, schema.encoding, schema.data) == (GAP, SCHEMA_ENCODING, data):
+            return number
+    number = _free(definitions.schemas)
+    definitions.add(Schema(number, data, SCHEMA_ENCODING, GAP))
+    return number
+
+
+def _free(numbers: dict[int, Channel] | dict[int, Schema]) -> int:
+    """Return a number that a definition further on in the file hardly has."""
+    return next(number for number in range(_LAST, 0, -1) if number not in numbers)

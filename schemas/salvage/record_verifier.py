@@ -1,4 +1,4 @@
-"""Whether a whole record begins at a certain byte of a file that may be damaged anywhere.
+"""Verification of records, and of message indexes, in a file that may be damaged anywhere.
 
 What has a checksum is compared with it. What has none is believed if the lengths inside a record
 add up to the length before it, or to less: the format allows that records grow at their end.
@@ -6,8 +6,11 @@ add up to the length before it, or to less: the format allows that records grow 
 
 import struct
 import zlib
+from array import array
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -15,44 +18,46 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from numpy.typing import NDArray
 
-from hearthlog.schemas.mcap.chunk_records import index_messages
-from hearthlog.schemas.mcap.chunk_table import LAST_TIME
-from hearthlog.schemas.mcap.definitions import Definition
-from hearthlog.schemas.mcap.formats import (
+from hearthlog.schemas.files import LocalFile
+from hearthlog.schemas.mcap.chunk_index import LAST_TIME
+from hearthlog.schemas.mcap.compressed_chunk import (
+    LATEST,
+    ContentStream,
+    StoredChunk,
+    TooLargeError,
+    read_parts,
+    stated_size,
+)
+from hearthlog.schemas.mcap.raw_messages import index_messages
+from hearthlog.schemas.mcap.records import (
     CHUNK,
     HEAD,
     INDEX_ENTRIES,
     INDEX_ENTRY,
+    LIMIT,
     MAGIC,
     MESSAGE,
     MESSAGE_INDEX,
     UINT32,
     UINT64,
-)
-from hearthlog.schemas.mcap.large_chunks import (
-    ContentStream,
-    TooLargeError,
-    read_parts,
-    stated_size,
-)
-from hearthlog.schemas.mcap.records import (
-    LIMIT,
     ChunkHead,
+    Definition,
     begun_chunk_head,
     decompress,
     parse_escaped,
 )
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage import whole_records
-from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
 from hearthlog.schemas.salvage.whole_records import (
+    FIELDS,
+    LARGEST,
+    SHORTEST,
+    UNKNOWN,
     LargeAttachment,
     LargeChunk,
     WholeAttachment,
     WholeChunk,
     WholeRecord,
 )
-from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 _VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # have lengths inside
 _LARGE = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT}  # may be larger than `LIMIT`
@@ -503,3 +508,96 @@ class RecordVerifier:
             raise McapError("a message index is damaged")
         rows = np.frombuffer(entries, INDEX_ENTRIES)
         return channel, rows[rows["time"].astype(np.uint64) <= LAST_TIME], outer
+
+
+_NO_TIMES = (LATEST, 0)
+_KEPT = 1000  # claims
+_INDEXES = 1 << 16  # behind a chunk: as many as there can be channels
+
+
+class Claim(NamedTuple):
+    """Messages that are listed by message indexes, and are in no chunk."""
+
+    start: int  # byte of the file behind which they are missing
+    messages: Counter[int]  # by channel
+    times: tuple[int, int]  # first and last log time
+
+
+class IndexClaims:
+    """Compares the message indexes behind each chunk with the messages of the chunk."""
+
+    def __init__(self) -> None:
+        self._claims: list[Claim] = []
+        self._spans = array("q")  # first and last log times of all chunks
+        self._own: dict[int, NDArray[np.void]] | None = {}  # entries that the chunk should have
+        self._listed: Counter[int] = Counter()  # entries by channel
+        self._others: set[tuple[int, int]] = set()  # indexes that are not its own
+        self._times = _NO_TIMES
+        self._start = 0
+
+    def add_chunk(self, end: int, chunk: StoredChunk) -> None:
+        """Begin with a chunk.
+
+        Parameters
+        ----------
+        end : int
+            Byte of the file at which it ends.
+        """
+        self._spans.extend([chunk.start, chunk.end])
+        self._begin(end)
+        rows = chunk.entries.items()
+        self._own = {channel: np.frombuffer(same, INDEX_ENTRIES) for channel, same in rows}
+
+    def add_index(self, channel: int, entries: NDArray[np.void]) -> None:
+        """Add the next message index.
+
+        Parameters
+        ----------
+        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
+        """
+        if self._own is None or not len(entries):
+            return
+        own = self._own.get(channel)
+        if own is not None and len(own) == len(entries) and (own == entries).all():
+            self._listed[channel] = max(self._listed[channel], len(entries))
+            return
+        key = channel, zlib.crc32(entries.tobytes())
+        if key not in self._others and len(self._others) < _INDEXES:
+            self._others.add(key)
+            self._listed[channel] += len(entries)
+            first, last = int(entries["time"].min()), int(entries["time"].max())
+            self._times = min(self._times[0], first), max(self._times[1], last)
+
+    def close(self, end: int) -> None:
+        """End with the indexes of a chunk: another record follows.
+
+        Parameters
+        ----------
+        end : int
+            Byte of the file at which that record begins.
+        """
+        if self._own is not None and self._others and len(self._claims) < _KEPT:
+            own = Counter({channel: len(same) for channel, same in self._own.items()})
+            if self._listed.total() > own.total():
+                self._claims.append(Claim(self._start, self._listed - own, self._times))
+        self._begin(end)
+
+    def give_up(self) -> None:
+        """Ignore the indexes that follow: the chunk before them is damaged, and tells of them."""
+        self._begin(0)
+        self._own = None
+
+    def _begin(self, start: int) -> None:
+        self._start, self._own, self._listed = start, {}, Counter()
+        self._others, self._times = set(), _NO_TIMES
+
+    def unmet(self) -> Iterator[Claim]:
+        """List the claims whose time no chunk covers, wherever that is in the file."""
+        spans = np.frombuffer(self._spans, np.int64).reshape(-1, 2)
+        spans = spans[np.argsort(spans[:, 0], kind="stable")]
+        ends = np.maximum.accumulate(spans[:, 1])
+        for claim in self._claims:
+            middle = sum(claim.times) // 2
+            before = int(np.searchsorted(spans[:, 0], middle, side="right"))
+            if not before or ends[before - 1] < middle:
+                yield claim

@@ -1,25 +1,41 @@
-"""Make a valid log of what is whole in one that was cut or damaged."""
+"""New logs from old ones: recovered from a damaged log, or thinned to save space."""
 
 import fcntl
 import os
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple, Protocol
 
-from hearthlog.schemas.errors import LogError
+import numpy as np
+from mcap.records import Channel, Header, Message
+
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.files import open_regular
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, stem
+from hearthlog.schemas.logs.metadata import (
+    HEARTHLOG_METADATA,
+    ROSBAG2_METADATA,
+    THINNED,
+    THINNED_OF,
+    TopicCount,
+    log_digest,
+    provenance_records,
+    rosbag2_counts,
+    rosbag2_metadata,
+)
+from hearthlog.schemas.logs.writer import ENCODING, PROFILE, CountedWriter
+from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.chunks import in_parts, read_in_batches
-from hearthlog.schemas.mcap.definitions import Definition
-from hearthlog.schemas.mcap.formats import MAGIC, not_mcap
-from hearthlog.schemas.mcap.large_chunks import most_content
+from hearthlog.schemas.mcap.compressed_chunk import most_content
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import LIMIT
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.salvage.salvage import Salvage
-from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, TopicRecovery
-from hearthlog.schemas.storage.new_files import (
+from hearthlog.schemas.mcap.records import LIMIT, MAGIC, Definition, not_mcap
+from hearthlog.schemas.messages.message_types import EMBEDDING, LOG_DAMAGED, encode_gap
+from hearthlog.schemas.messages.topics import LIVE, is_scenario, parse_topic
+from hearthlog.schemas.new_files import (
     check_new,
     create_file,
     hand_over,
@@ -27,7 +43,335 @@ from hearthlog.schemas.storage.new_files import (
     sync_file,
     sync_folder,
 )
-from hearthlog.schemas.storage.regular_file import open_regular
+from hearthlog.schemas.salvage.damage import Damage
+from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames, gap_channel
+from hearthlog.schemas.salvage.salvage import Piece, Salvage
+from hearthlog.schemas.salvage.whole_records import (
+    LargeAttachment,
+    LargeChunk,
+    UnknownRecord,
+    WholeAttachment,
+    WholeChunk,
+    chunk_messages,
+    encode_attachment,
+)
+
+
+@dataclass
+class TopicRecovery:
+    """What was saved of a topic."""
+
+    type: str
+    messages: int = 0
+    stated: int = 0  # gaps that were not in the log, and say what could not be saved
+    expected: int | None = None  # messages that there should be, if the index of the log says so
+    end: int = 0  # log time of the last message, in nanoseconds
+    unread: int = 0  # of the messages: copied, and larger than is read
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What was saved of a log, and what was lost."""
+
+    topics: dict[str, TopicRecovery]
+    damages: list[Damage]
+    complete: bool  # whether the log was finished, and its index is whole
+    escaped: Sequence[str] = ()  # names of what has texts that are not UTF-8
+
+    @property
+    def messages(self) -> int:
+        """Messages that were saved."""
+        return sum(topic.messages for topic in self.topics.values())
+
+    @property
+    def lossless(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.losses
+
+    @property
+    def losses(self) -> list[str]:
+        """What was lost: a text for each damage, or one where only the frames tell of it."""
+        losses = [str(damage) for damage in self.damages if not damage.lossless]
+        if not losses and any(topic.stated for topic in self.topics.values()):
+            return ["frames are missing, or lie elsewhere in the log: see its gaps"]
+        return losses
+
+
+class TopicFilter(Protocol):
+    """What a copy leaves out, and says of it."""
+
+    @property
+    def note(self) -> Mapping[str, str]:
+        """What the `hearthlog` record of the copy says besides."""
+
+    def drops(self, topic: str) -> bool:
+        """Tell whether the messages of a topic are left out."""
+
+
+class SalvagedCopy:
+    """Copies the whole pieces of a damaged log into a new one.
+
+    Parameters
+    ----------
+    chunk_span : int
+        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged. Where they
+        are joined, embeddings get chunks of their own.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        salvage: Salvage,
+        profile: str,
+        chunk_span: int = 0,
+        selection: TopicFilter | None = None,
+    ) -> None:
+        self.pieces = 0  # pieces that were copied
+        self._salvage = salvage
+        self._profile = profile
+        self._chunk_span = chunk_span
+        self._selection = selection
+        self._search = FrameSearch(salvage)
+        self._writer = CountedWriter(stream, salvage.definitions)
+        self._begun = False
+        self._counted: dict[str, int] = {}  # messages by topic, as the `rosbag2` record has them
+        self._written: set[tuple[type, int]] = set()
+        self._counts: Counter[int] = Counter()
+        self._stated: Counter[int] = Counter()  # gaps that were not in the log
+        self._unread: Counter[int] = Counter()
+        self._ends: dict[int, int] = {}
+        self._span = (1 << 63, 0)
+
+    def write(self, name: str, progress: Progress) -> None:
+        """Write all pieces, and complete the file.
+
+        Parameters
+        ----------
+        progress : callable
+            Called after each piece with the share of the damaged log that is passed, 0 to 1.
+        """
+        for piece in self._salvage.pieces():
+            self._add(piece)
+            progress(self._salvage.offset / self._salvage.size)
+            del piece  # before the next is read, which may be as large
+        self._begin()
+        for lost in self._search.at_end(self._ends):
+            self._add_gap(lost)
+        self._writer.flush()
+        definitions = self._salvage.definitions
+        schemas = definitions.schemas
+        channels = [c for c in definitions.channels.values() if c.schema_id in {0, *schemas}]
+        metadata = self._rosbag2(name)
+        if metadata is not None:
+            self._writer.add_metadata(ROSBAG2_METADATA, metadata)
+        self._writer.define(list(schemas.values()), channels)
+        self._writer.finish()
+
+    def could_be_better(self) -> bool:
+        """Tell whether another attempt would know definitions or a profile from the start."""
+        defines = self._salvage.definitions.defines
+        late = any(defines(channel) for channel in self._salvage.unnamed)
+        return late or (self._salvage.header is None and self.profile() != self._profile)
+
+    def profile(self) -> str:
+        """Guess the profile of a log without header by how its messages are encoded.
+
+        Returns
+        -------
+        str
+            `ros2` if a channel is encoded as CDR; else an empty text.
+        """
+        channels = self._salvage.definitions.channels.values()
+        return PROFILE if any(c.message_encoding == ENCODING for c in channels) else ""
+
+    def recovery(self) -> Recovery:
+        """Count what was saved, and list what was lost."""
+        topics: dict[str, TopicRecovery] = {}
+        expected = self._salvage.expected
+        for number, channel, kind in self._channel_types():
+            topic = topics.setdefault(channel.topic, TopicRecovery(kind))
+            topic.messages += self._counts[number] - self._stated[number]
+            topic.stated += self._stated[number]
+            topic.unread += self._unread[number]
+            topic.end = max(topic.end, self._ends.get(number, 0))
+            if expected is not None and not self._drops(number):
+                topic.expected = (topic.expected or 0) + expected.get(number, 0)
+        if expected is None and self._selection is None:
+            for name, count in self._counted.items():
+                if name in topics and count > topics[name].messages:
+                    topics[name].expected = count
+        damages = self._salvage.damages()
+        untraced = [] if self._salvage.unnamed else _untraced(topics, damages)
+        escaped = list(self._salvage.escaped)
+        return Recovery(topics, [*damages, *untraced], self._salvage.complete, escaped)
+
+    def _channel_types(self) -> Iterator[tuple[int, Channel, str]]:
+        definitions = self._salvage.definitions
+        for number, channel in definitions.channels.items():
+            schema = definitions.schemas.get(channel.schema_id)
+            yield number, channel, "" if schema is None else schema.name
+
+    def _add(self, piece: Piece) -> None:
+        self._begin()
+        self.pieces += 1
+        if self._chunk_span and not isinstance(piece, WholeChunk):
+            self._writer.flush()
+        if isinstance(piece, WholeChunk):
+            self._add_chunk(piece, self._search.before(piece))
+        elif isinstance(piece, Message):
+            for lost in self._search.before(piece):
+                self._add_gap(lost)
+            self._add_message(piece)
+        elif isinstance(piece, LargeChunk):
+            self._add_large(piece)
+        elif isinstance(piece, UnknownRecord):
+            self._writer.copy_record(self._salvage.stored(*piece.data))
+        elif isinstance(piece, WholeAttachment | LargeAttachment):
+            self._writer.copy_attachment(self._record_of(piece), piece.index_record)
+        elif piece.name == HEARTHLOG_METADATA and self._selection is not None:
+            self._writer.add_metadata(piece.name, {**piece.metadata, **self._selection.note})
+        elif piece.name == ROSBAG2_METADATA:
+            self._counted = rosbag2_counts(piece.metadata)
+        else:
+            self._writer.add_metadata(piece.name, piece.metadata)
+
+    def _add_chunk(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
+        """Copy a chunk, as it is unless something is dropped or gaps stand between its messages."""
+        chunk = piece.stored
+        if any(lost.end > chunk.start for lost in losses):
+            self._add_messages(piece, losses)
+            return
+        for lost in losses:
+            self._add_gap(lost)
+        dropped = {number for number in chunk.entries if self._drops(number)}
+        kept = [number for number in chunk.entries if number not in dropped]
+        if not kept:
+            return
+        self._define(kept, piece.definitions[: piece.leading])
+        if self._chunk_span:
+            gathered = {number for number in kept if self._is_gathered(number)}
+            self._writer.join_chunk(chunk, self._chunk_span, dropped, gathered)
+        else:
+            self._writer.copy_chunk(chunk)
+        for number in kept:
+            times = chunk.times(number)
+            self._count(number, len(times), int(times.min()), int(times.max()))
+
+    def _record_of(self, piece: WholeAttachment | LargeAttachment) -> Iterable[bytes | memoryview]:
+        if isinstance(piece, WholeAttachment):
+            return [piece.record]
+        if piece.escaped:
+            return encode_attachment(piece.index_record, self._salvage.stored(*piece.inner))
+        return self._salvage.stored(*piece.data)
+
+    def _add_large(self, piece: LargeChunk) -> None:
+        """Copy a chunk that was not opened."""
+        chunk, (start, end) = piece.stored, piece.data
+        dropped = [self._drops(number) for number in chunk.entries]
+        if dropped and all(dropped):
+            return
+        if any(dropped):
+            what = f"a chunk at byte {start} is too large to be thinned"
+            raise LogError(f"{self._salvage.path}: {what}")
+        self._define(chunk.entries, piece.definitions[: piece.leading])
+        self._writer.copy_large_chunk(chunk, end - start, self._salvage.stored(start, end))
+        self._unread.update(piece.unread)
+        for number in chunk.entries:
+            times = chunk.times(number)
+            times = times[times.astype(np.uint64) <= LAST_TIME]
+            if len(times):
+                self._count(number, len(times), int(times.min()), int(times.max()))
+
+    def _drops(self, number: int) -> bool:
+        if self._selection is None:
+            return False
+        return self._selection.drops(self._salvage.definitions.channels[number].topic)
+
+    def _is_gathered(self, number: int) -> bool:
+        """Return whether the messages of a channel get chunks of their own.
+
+        Among features, whose bytes are as good as random, embeddings take half as much again.
+        """
+        definitions = self._salvage.definitions
+        schema = definitions.schemas.get(definitions.channels[number].schema_id)
+        return schema is not None and schema.name == EMBEDDING
+
+    def _add_messages(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
+        waiting = deque(losses)
+        for message in chunk_messages(piece.stored):
+            while waiting and waiting[0].end <= message.log_time:
+                self._add_gap(waiting.popleft())
+            self._add_message(message)
+        for lost in waiting:
+            self._add_gap(lost)
+
+    def _add_message(self, message: Message) -> None:
+        number, time = message.channel_id, message.log_time
+        if self._drops(number):
+            return
+        self._define([number])
+        self._writer.add_message(number, time, message.data, message.publish_time, message.sequence)
+        self._count(number, 1, time, time)
+
+    def _add_gap(self, lost: LostFrames) -> None:
+        """Say that frames are missing, unless log time is beyond them already."""
+        end, start, microphone, frames = lost
+        number = gap_channel(self._salvage.definitions, microphone)
+        if number is None or end < self._span[1]:
+            return
+        self._add_message(
+            Message(number, end, encode_gap(microphone, start, end, LOG_DAMAGED, frames), end, 0)
+        )
+        self._stated[number] += 1
+
+    def _begin(self) -> None:
+        if not self._begun:
+            header = self._salvage.header or Header(self._profile, library="")
+            self._writer.start(header.profile, header.library)
+            self._begun = True
+
+    def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
+        """Write what defines these channels before their first message, unless it stands there."""
+        self._written.update((type(record), record.id) for record in inside)
+        definitions = self._salvage.definitions
+        for number in numbers:
+            channel = definitions.channels[number]
+            schema = definitions.schemas.get(channel.schema_id)
+            for record in (schema, channel):
+                if record is not None and (type(record), record.id) not in self._written:
+                    if self._chunk_span:
+                        self._writer.flush()  # what it refers to may be in there
+                    self._writer.write_definition(record)
+                    self._written.add((type(record), record.id))
+
+    def _count(self, number: int, count: int, first: int, last: int) -> None:
+        self._counts[number] += count
+        self._ends[number] = max(self._ends.get(number, 0), last)
+        self._span = min(self._span[0], first), max(self._span[1], last)
+
+    def _rosbag2(self, name: str) -> dict[str, str] | None:
+        """Make the `rosbag2` record, by which rosbag2 lists topics; None if that is impossible."""
+        topics: dict[str, TopicCount] = {}
+        for number, channel, kind in self._channel_types():
+            topic = topics.setdefault(channel.topic, TopicCount(kind, channel.metadata))
+            topic.messages += self._counts[number]
+        try:
+            return rosbag2_metadata(name, topics, self._span if self._counts else (0, 0))
+        except (KeyError, ValueError, RecursionError):  # other writers describe channels otherwise
+            return None
+
+
+def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[Damage]:
+    """List messages that a count in the log has, while nothing shows where they were."""
+    if not all(damage.exact for damage in damages):
+        return []
+    missing = {
+        name: topic.expected - topic.messages - sum(d.messages.get(name, 0) for d in damages)
+        for name, topic in topics.items()
+        if topic.expected is not None
+    }
+    missing = {name: count for name, count in missing.items() if count > 0}
+    return [Damage(0, 0, "a count in the log has more", missing)] if missing else []
 
 
 class NothingWholeError(LogError):
@@ -187,3 +531,68 @@ def _is_at(stream: BinaryIO, path: Path) -> bool:
         return os.path.samestat(os.fstat(stream.fileno()), path.stat())
     except OSError:
         return False
+
+
+_CHUNK_SPAN = 10 * NANOSECONDS
+_REST = "all but labels, segments and gaps"
+STEPS = ("", "statistics", "statistics and features", _REST)  # what a log is thinned of
+_SOUND = {"statistics", "features", "embedding"}
+_DROPPED = (set[str](), {"statistics"}, _SOUND, _SOUND)
+_KEPT = {"info", "label", "segment", "gap"}
+
+
+class Thinning(NamedTuple):
+    """A step of thinning."""
+
+    step: int
+    note: Mapping[str, str]
+
+    def drops(self, topic: str) -> bool:
+        """Tell whether the messages of a topic are dropped."""
+        parts = parse_topic(topic)
+        if STEPS[self.step] == _REST:
+            if parts is None or parts.kind not in _KEPT:
+                return True
+            return parts.labelling != LIVE and not is_scenario(parts.labelling)
+        return parts is not None and parts.kind in _DROPPED[self.step]
+
+
+def dropped_kinds(text: str | None) -> set[str]:
+    """Return which of a log's frame by frame messages were dropped."""
+    return _DROPPED[STEPS.index(text)] if text in STEPS else set()
+
+
+def thinned_step(log: Path) -> int:
+    """Return how far a log was thinned already, a place in `STEPS`.
+
+    Raise `LogError` if it cannot be read or is damaged, or a newer version has thinned it
+    otherwise.
+    """
+    with LogFile(log) as file:
+        texts = {record.get(THINNED, "") for record in provenance_records(file)}
+    try:
+        return max((STEPS.index(text) for text in texts), default=0)
+    except ValueError as error:
+        raise LogError(f"{log}: was thinned in a way that this version does not know") from error
+
+
+def thin_log(source: Path, copy: Path, step: int) -> None:
+    """Copy a log without what a step of thinning drops, and check the copy.
+
+    All other messages stay as they are, in their order. Channels stay defined, without messages.
+
+    Raise `LogError` if the log is damaged, or the copy does not hold what was written to it.
+    Raise `OSError` if the copy cannot be written.
+    """
+    with LogFile(source) as file:
+        before = [record.get(THINNED_OF, "") for record in provenance_records(file)]
+    digests = " ".join([*filter(None, before), log_digest(source)])
+    thinning = Thinning(step, {THINNED: STEPS[step], THINNED_OF: digests})
+    copy.unlink(missing_ok=True)
+    with Salvage(source) as salvage, create_file(copy, 0o666) as stream:
+        thinned = SalvagedCopy(stream, salvage, PROFILE, _CHUNK_SPAN, thinning)
+        thinned.write(source.name, ignore_progress)
+    recovery = thinned.recovery()
+    if recovery.damages or not recovery.complete:
+        raise LogError(f"{source}: is damaged, and not thinned; `hearthlog recover` saves the rest")
+    check_copy(copy, recovery.topics)

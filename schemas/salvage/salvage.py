@@ -1,4 +1,4 @@
-"""Everything that is whole in an MCAP file that was cut or damaged, and what is not.
+"""The undamaged pieces of an MCAP file that was cut or damaged, and its damages.
 
 The file is walked from record to record. Where no whole record follows, the next one is searched
 for: a length that is wrong hides nothing behind it.
@@ -20,17 +20,21 @@ from mcap import records
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
-from hearthlog.schemas.mcap.chunk_table import LAST_TIME
-from hearthlog.schemas.mcap.definitions import Definition, Definitions
-from hearthlog.schemas.mcap.formats import MAGIC, MESSAGE
-from hearthlog.schemas.mcap.records import LIMIT
-from hearthlog.schemas.salvage.damage import Damage, DamagedRange, DamageList, loss_in
-from hearthlog.schemas.salvage.file_index import MetRecords, read_index
-from hearthlog.schemas.salvage.index_claims import IndexClaims
-from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
-from hearthlog.schemas.salvage.record_verifier import RecordVerifier
+from hearthlog.schemas.files import LocalFile
+from hearthlog.schemas.mcap.chunk_index import LAST_TIME
+from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
+from hearthlog.schemas.mcap.records import LIMIT, MAGIC, MESSAGE, Definition, Definitions
+from hearthlog.schemas.salvage.damage import (
+    Damage,
+    DamagedRange,
+    DamageList,
+    MetRecords,
+    loss_in,
+    read_index,
+)
+from hearthlog.schemas.salvage.record_verifier import IndexClaims, RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
+    SHORTEST,
     LargeAttachment,
     LargeChunk,
     UnknownRecord,
@@ -39,8 +43,8 @@ from hearthlog.schemas.salvage.whole_records import (
     WholeChunk,
     WholeRecord,
     chunk_messages,
+    find_record_heads,
 )
-from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 _VAIN = 8
 _KEPT_LIMIT = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep

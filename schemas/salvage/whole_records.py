@@ -1,4 +1,4 @@
-"""Records of a damaged file that are whole, and what is in them."""
+"""Undamaged records of a damaged file: sizes that are possible, and contents."""
 
 import struct
 import zlib
@@ -13,14 +13,66 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.chunk_table import LAST_TIME
-from hearthlog.schemas.mcap.definitions import Definition
-from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, INDEX_ENTRIES, MESSAGE, UINT32, UINT64
-from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import encode, parse_escaped
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
-from hearthlog.schemas.salvage.record_sizes import SHORTEST
+from hearthlog.schemas.mcap.chunk_index import LAST_TIME
+from hearthlog.schemas.mcap.compressed_chunk import StoredChunk, compress_chunk
+from hearthlog.schemas.mcap.raw_messages import gather_heads, index_messages, iterate_records
+from hearthlog.schemas.mcap.records import (
+    ATTACHMENT,
+    HEAD,
+    INDEX_ENTRIES,
+    LIMIT,
+    MESSAGE,
+    MESSAGE_FIXED,
+    UINT32,
+    UINT64,
+    Definition,
+    encode,
+    parse_escaped,
+)
+
+UNKNOWN = 1 << 62  # bytes, more than any file has
+# The content of each kind of record: so many bytes, or a length of this format and so many bytes.
+FIELDS: dict[int, tuple[int | struct.Struct, ...]] = {
+    Opcode.HEADER: (UINT32, UINT32),
+    Opcode.FOOTER: (20,),
+    Opcode.SCHEMA: (2, UINT32, UINT32, UINT32),
+    Opcode.CHANNEL: (4, UINT32, UINT32, UINT32),
+    Opcode.CHUNK: (28, UINT32, UINT64),
+    Opcode.MESSAGE_INDEX: (2, UINT32),
+    Opcode.CHUNK_INDEX: (32, UINT32, 8, UINT32, 16),
+    Opcode.ATTACHMENT: (16, UINT32, UINT32, UINT64, 4),
+    Opcode.ATTACHMENT_INDEX: (40, UINT32, UINT32),
+    Opcode.STATISTICS: (42, UINT32),
+    Opcode.METADATA: (UINT32, UINT32),
+    Opcode.METADATA_INDEX: (16, UINT32),
+    Opcode.SUMMARY_OFFSET: (17,),
+    Opcode.DATA_END: (4,),
+}
+SHORTEST = np.full(256, UNKNOWN)  # bytes of the shortest content, by opcode
+for _opcode, _fields in FIELDS.items():
+    SHORTEST[_opcode] = sum(f if isinstance(f, int) else f.size for f in _fields)
+SHORTEST[Opcode.MESSAGE] = MESSAGE_FIXED
+LARGEST = np.full(256, 16 << 20)  # bytes of the largest record that is read, by opcode
+LARGEST[[Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX]] = LIMIT
+
+
+def find_record_heads(window: bytes) -> list[int]:
+    """Search for the heads of records, damaged or not.
+
+    Returns
+    -------
+    list of int
+        Bytes of the window at which an opcode and a length may stand that go together, ascending.
+    """
+    count = len(window) - HEAD.size + 1
+    if count <= 0:
+        return []
+    shortest = SHORTEST[np.frombuffer(window, np.uint8)[:count]]
+    places = np.flatnonzero(shortest <= LIMIT)
+    lengths = np.ndarray((count,), "<u8", window, 1, (1,))[places]
+    heads: list[int] = places[(lengths <= LIMIT) & (lengths >= shortest[places])].tolist()
+    return heads
+
 
 _DEFINITIONS_LIMIT = 1 << 19
 

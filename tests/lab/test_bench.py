@@ -18,10 +18,9 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
-from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import queue

@@ -7,7 +7,7 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.record import record_composition

@@ -18,11 +18,11 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import active_path, find_logs, is_layer
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.salvage.thin import thin_log
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.salvage.recover import thin_log
 from hearthlog.tools.lab.home.copies import copy_logs
 
 START = 1_772_323_200 * NANOSECONDS  # midnight

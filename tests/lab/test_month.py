@@ -17,9 +17,8 @@ from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.month.account import account_for, holes
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults
 

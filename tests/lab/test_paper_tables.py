@@ -13,7 +13,7 @@ from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import paper
 from hearthlog.tools.lab.command import run

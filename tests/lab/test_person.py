@@ -10,8 +10,8 @@ from hearthlog.analyzer.logs.spans import one, overlay, pieces
 from hearthlog.analyzer.marks.marks import read_marks, read_reviewed
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.record import record_composition

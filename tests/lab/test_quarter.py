@@ -7,8 +7,7 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.starter import GENERAL
-from hearthlog.schemas.frames import FRAME_SAMPLES
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.routine import Habits, plan_days

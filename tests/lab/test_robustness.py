@@ -12,8 +12,8 @@ from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import scenario_of
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.lab import robustness as evaluation
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.robustness import CONDITIONS, Condition, robustness

@@ -13,8 +13,8 @@ from hearthlog.analyzer.accuracy.minute_kinds import quiet_weight
 from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged, read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.models.classes import UNKNOWN, in_words
+from hearthlog.schemas.errors import listed
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.text import listed
 from hearthlog.tools.cli.text import number
 
 _EVER = 1 << 61

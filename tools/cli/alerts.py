@@ -95,7 +95,7 @@ def replay(
 def _check_node(home: "HomeLogs", node: str) -> None:
     from hearthlog.analyzer.bridge.alerts.read_logs import nodes_of
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.schemas.text import listed
+    from hearthlog.schemas.errors import listed
 
     nodes = nodes_of(home)
     if node not in nodes:
@@ -117,7 +117,7 @@ def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> t
 
 
 def _utc(time: int) -> str:
-    from hearthlog.schemas.times import millisecond_text
+    from hearthlog.schemas.frames import millisecond_text
 
     return f"{millisecond_text(time)[:16]}Z"
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
-from hearthlog.schemas.text import listed, shortened
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import listed, shortened
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.options import LocalLog, Microphone, logs_folder, reviewer_name
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
 from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, number, tell, wrong_use
@@ -160,7 +160,7 @@ def export_labels(
     from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
-    from hearthlog.schemas.storage.new_files import check_new
+    from hearthlog.schemas.new_files import check_new
 
     _check_use(output, scenario)
     check_new(output)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.schemas.text import abridged
+from hearthlog.schemas.errors import abridged
 from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
 

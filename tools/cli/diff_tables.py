@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hearthlog.schemas.text import shortened
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import shortened
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 from hearthlog.tools.cli.text import moment
 

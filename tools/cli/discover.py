@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.schemas.text import printable
+from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.options import (
     End,
     Json,
@@ -107,7 +107,7 @@ def _default_file(logs: Sequence[Path]) -> Path:
 def _names(given: Sequence[str]) -> dict[int, str]:
     """Read the options --name."""
     from hearthlog.models.classes import CLASS_NAME, SILENCE
-    from hearthlog.schemas.messages.labels import spelt
+    from hearthlog.schemas.messages.topics import spelt
 
     names: dict[int, str] = {}
     for text in given:
@@ -237,7 +237,7 @@ def _print(summary: "HomeSummary", zone: "tzinfo") -> None:
 
 def _place(group: "GroupSummary", zone: "tzinfo") -> str:
     from hearthlog.analyzer.logs.local_time import local_time
-    from hearthlog.schemas.times import read_time
+    from hearthlog.schemas.frames import read_time
 
     example = group.examples[0]
     start = local_time(read_time(example.start), zone)

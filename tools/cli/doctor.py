@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.text import printable
+from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.options import Json, LocalLogs, check_output
 from hearthlog.tools.cli.text import number, print_lines, tell, wrong_use
 
@@ -94,7 +94,7 @@ def _write_bundle(bundle: Path, folder: Path) -> None:
     from zipfile import ZIP_DEFLATED, ZipFile
 
     from hearthlog.analyzer.support import support_bundle
-    from hearthlog.schemas.storage.new_files import new_file
+    from hearthlog.schemas.new_files import new_file
 
     check_output("--bundle", bundle, ".zip", "a bundle")
     with new_file(bundle) as temporary, ZipFile(temporary, "x", ZIP_DEFLATED) as archive:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from hearthlog.schemas.text import shortened
+from hearthlog.schemas.errors import shortened
 from hearthlog.tools.cli.evaluate_scenes import learned_lines, scenes
 from hearthlog.tools.cli.options import (
     METHOD,
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
-    from hearthlog.schemas.progress import Progress
+    from hearthlog.schemas.errors import Progress
 
 _MOVED = {  # options of one verb that is several now
     "--folds": "method",

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from hearthlog.analyzer.export.formats import FORMATS
-from hearthlog.schemas.text import abridged, listed
+from hearthlog.schemas.errors import abridged, listed
 from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
 

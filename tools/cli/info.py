@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.progress import Progress
-from hearthlog.schemas.text import printable
+from hearthlog.schemas.errors import LogError, Progress, printable
 from hearthlog.tools.cli.options import Json, Log
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
@@ -19,8 +17,8 @@ from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.summary import Summary
-    from hearthlog.schemas.logs.scenario_record import RecordedScenario
-    from hearthlog.schemas.logs.statuses import Status
+    from hearthlog.schemas.logs.contents import Status
+    from hearthlog.schemas.logs.metadata import RecordedScenario
     from hearthlog.tools.cli.accuracy_text import Accuracy
 
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
@@ -103,7 +101,7 @@ def _candidate(summary: "Summary", path: Path) -> str | None:
 def _scenarios(summary: "Summary", path: Path) -> "list[RecordedScenario]":
     """Return the scenarios that have labels, each with the last model that labelled for it."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.schemas.logs.scenario_record import recorded_scenarios
+    from hearthlog.schemas.logs.metadata import recorded_scenarios
     from hearthlog.schemas.messages.topics import SCENARIO
 
     if not any(f"/{SCENARIO}/" in name for name in summary.topics):

@@ -17,8 +17,8 @@ from rich.cells import cell_len, set_cell_size
 from hearthlog.models.classes import in_words
 from hearthlog.recorder.journal import lines_to
 from hearthlog.recorder.timezone import time_zone
+from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.text import printable
 
 if TYPE_CHECKING:
     from hearthlog.recorder.config import Settings

@@ -24,7 +24,7 @@ from typer.core import TyperArgument, TyperOption
 
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
-from hearthlog.schemas.storage.regular_file import denied_text, is_denied
+from hearthlog.schemas.files import denied_text, is_denied
 from hearthlog.tools.cli.output import OutputClosedError, checked_output
 from hearthlog.tools.cli.text import tell
 

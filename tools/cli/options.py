@@ -229,7 +229,7 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
     Raise `LogError` if the file exists.
     """
-    from hearthlog.schemas.storage.new_files import check_new
+    from hearthlog.schemas.new_files import check_new
 
     if path is not None and path.suffix != suffix:
         wrong_use(f"{option} {path}: {what} is named *{suffix}")
@@ -239,7 +239,7 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
 def parse_time(text: str, option: str) -> int:
     """Read a time, in nanoseconds of UTC; it is wrong use if the text is not a time."""
-    from hearthlog.schemas.times import read_time
+    from hearthlog.schemas.frames import read_time
 
     try:
         return read_time(text)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.errors import Progress
 from hearthlog.tools.cli.text import tell
 
 _SPEED_SECONDS = 1800.0  # over which speed is measured, for the time left: steps may be long

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import HearthlogError, ignore_progress
 from hearthlog.tools.cli.options import (
     MaxBagFiles,
     MaxRecordSize,
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
     from hearthlog.recorder.recording_session import RecorderState, RecordingSummary
     from hearthlog.recorder.sources.audio_files import FileSource
-    from hearthlog.schemas.progress import Progress
+    from hearthlog.schemas.errors import Progress
 
 _HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # from others, by `readable_by`
 

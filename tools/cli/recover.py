@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.text import abridged, shortened
+from hearthlog.schemas.errors import abridged, shortened
 from hearthlog.tools.cli.options import Json
 from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.schemas.salvage.salvaged_copy import Recovery
+    from hearthlog.schemas.salvage.recover import Recovery
 
 
 def recover(
@@ -65,8 +65,8 @@ def recover(
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
     from hearthlog.schemas.logs.files import SUFFIX, stem
+    from hearthlog.schemas.new_files import new_file
     from hearthlog.schemas.salvage.recover import recover_in_place, recover_log
-    from hearthlog.schemas.storage.new_files import new_file
     from hearthlog.tools.cli.progress import share_done
 
     with share_done(f"recovering {log.name}") as progress:

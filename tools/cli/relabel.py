@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location, starter_of
 from hearthlog.tools.cli.text import first_of, number, tell
 

@@ -192,7 +192,7 @@ def _parse_rate(text: str) -> float | None:
 def _check_output(output: Path | None, source: Path) -> None:
     """Refuse an output that exists, or that would get among what is replayed."""
     from hearthlog.schemas.errors import LogError
-    from hearthlog.schemas.storage.new_files import check_new
+    from hearthlog.schemas.new_files import check_new
 
     if output is None:
         return

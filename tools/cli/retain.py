@@ -104,7 +104,7 @@ def _retain(rules: "KeepingRules", *, dry_run: bool) -> _Done:
 
 def _print(done: _Done, *, dry_run: bool) -> None:
     from hearthlog.recorder.disk.sizes import size_text
-    from hearthlog.schemas.salvage.thin import STEPS
+    from hearthlog.schemas.salvage.recover import STEPS
 
     would = "would be " if dry_run else ""
     print_lines(f"{log.path}: {why} ({size_text(log.size)})" for log, why in done.deleted)
@@ -115,7 +115,7 @@ def _print(done: _Done, *, dry_run: bool) -> None:
 
 
 def _as_json(done: _Done, *, dry_run: bool) -> dict[str, Any]:
-    from hearthlog.schemas.salvage.thin import STEPS
+    from hearthlog.schemas.salvage.recover import STEPS
 
     return {
         "dry_run": dry_run,

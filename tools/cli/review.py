@@ -12,9 +12,8 @@ import typer
 from typer.core import TyperCommand
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.text import printable
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import HearthlogError, printable
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
 from hearthlog.tools.cli.options import (
@@ -347,7 +346,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     )
     from hearthlog.analyzer.review.queue.review_list import write_list
     from hearthlog.schemas.messages.topics import scenario_name
-    from hearthlog.schemas.storage.new_files import check_new, new_file
+    from hearthlog.schemas.new_files import check_new, new_file
 
     if find_format(path) is None:
         wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from hearthlog.schemas.text import shortened
+from hearthlog.schemas.errors import shortened
 from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 
 if TYPE_CHECKING:

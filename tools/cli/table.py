@@ -4,7 +4,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Sequence
 
-from hearthlog.schemas.text import printable, shortened
+from hearthlog.schemas.errors import printable, shortened
 
 NAME_WIDTH = 18  # of a class in a table of figures
 _PLAIN_WIDTH = 160

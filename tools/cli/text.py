@@ -9,8 +9,8 @@ from typing import Any, NoReturn
 
 import typer
 
-from hearthlog.schemas.text import printable
-from hearthlog.schemas.times import millisecond_text
+from hearthlog.schemas.errors import printable
+from hearthlog.schemas.frames import millisecond_text
 
 JUDGED_BY = "leave it recording, for ten minutes that it has not learned from judge it"
 _SHOWN = 10  # of a list

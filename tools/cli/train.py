@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 from hearthlog.tools.cli.options import (
     CLIPS,
     METHOD,
@@ -194,7 +194,7 @@ def _print_next(verdict: "Verdict", output: Path) -> None:
 
 def _next_model(name: str) -> Path:
     """Name the next model of the home or of a scenario, in the folder of models, which is made."""
-    from hearthlog.schemas.storage.new_files import private_folder
+    from hearthlog.schemas.new_files import private_folder
 
     folder = models_folder()
     numbers = (path.stem.removeprefix(f"{name}-") for path in folder.glob(f"{name}-*.safetensors"))

@@ -4,7 +4,7 @@ from typing import Any
 
 from hearthlog.analyzer.gate.changes import time_words
 from hearthlog.analyzer.gate.on_trial import Trial, gain_interval
-from hearthlog.schemas.text import printable
+from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.changes_table import print_changes
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hearthlog.schemas.text import printable
+from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.changes_table import print_changes
 from hearthlog.tools.cli.text import tell
 

@@ -109,7 +109,7 @@ def _default_file(logs: Sequence[Path]) -> Path:
 def _names(given: Sequence[str]) -> dict[int, str]:
     """Read the options --name."""
     from hearthlog.models.classes import CLASS_NAME, find_class
-    from hearthlog.schemas.messages.labels import spelt
+    from hearthlog.schemas.messages.topics import spelt
 
     names: dict[int, str] = {}
     for text in given:
@@ -158,8 +158,8 @@ def _write_turns(output: Path, speech: "HomeSpeech", voices: "Voices", of: "Int6
 
     from hearthlog.analyzer.discover.voice_summary import spoken_spans
     from hearthlog.analyzer.logs.text_files import disarmed
-    from hearthlog.schemas.storage.new_files import new_file
-    from hearthlog.schemas.times import time_text
+    from hearthlog.schemas.frames import time_text
+    from hearthlog.schemas.new_files import new_file
 
     with (
         new_file(output) as temporary,
@@ -217,7 +217,7 @@ def _tell_next(
 def _as_json(
     summaries: "Sequence[VoiceSummary]", speech: "HomeSpeech", file: Path, zone: "tzinfo"
 ) -> dict[str, Any]:
-    from hearthlog.schemas.times import time_text
+    from hearthlog.schemas.frames import time_text
 
     def turn(each: Any) -> dict[str, Any]:
         times = {key: time_text(getattr(each, key)) for key in ("start", "end")}

@@ -27,10 +27,8 @@ from urllib.request import (
 )
 
 from hearthlog import __version__
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.new_files import sync_folder
-from hearthlog.schemas.text import printable
+from hearthlog.schemas.errors import HearthlogError, Progress, ignore_progress, printable
+from hearthlog.schemas.new_files import sync_folder
 
 _TIMEOUT_SECONDS = 20.0  # without a byte
 _WAIT_SECONDS = (1.0, 2.0, 4.0)  # between tries that brought nothing

@@ -19,8 +19,8 @@ from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Int16
+from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
-from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.tools.home.composition import Composition, full_scale
 
 _PUSHED_FRAMES = 200  # as `FileSource` yields them, with a report of health before

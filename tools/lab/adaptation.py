@@ -24,8 +24,8 @@ from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.person import Person, read_truth, write_review
 from hearthlog.tools.lab.labelling import label_logs

@@ -24,7 +24,7 @@ from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64, Indices
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.errors import Progress
 from hearthlog.tools.cli.evaluate import Scenario, end_with_left_out, learning
 from hearthlog.tools.cli.options import Clips, Json, Scheduler
 from hearthlog.tools.cli.table import print_table

@@ -44,8 +44,8 @@ from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.lab.bench.timing import best_of
 

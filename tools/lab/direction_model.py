@@ -42,8 +42,7 @@ from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.direction_room import (
     Room,

@@ -31,10 +31,9 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.errors import ignore_progress
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.progress import ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.lab.command import run
 

@@ -37,8 +37,8 @@ from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.arrays import Float64, Indices
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.person import read_truth
 

@@ -16,7 +16,7 @@ from hearthlog.analyzer.training.installed import DEFAULT
 from hearthlog.analyzer.training.method import Method, prepare
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.analyzer.training.train import check_varied
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.errors import Progress
 from hearthlog.tools.cli.evaluate import Folds, Scenario, end_with_left_out, learning
 from hearthlog.tools.cli.options import Clips, Json, Scheduler, chosen_method
 from hearthlog.tools.cli.scores import between

@@ -31,8 +31,7 @@ from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.cast import LEVELS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition

@@ -29,8 +29,7 @@ from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import check_varied
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.text import shortened
+from hearthlog.schemas.errors import Progress, ignore_progress, shortened
 from hearthlog.tools.cli.options import Clips, Json, labelled_clips
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import between, share

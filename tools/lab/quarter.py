@@ -23,9 +23,8 @@ from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.plan import LIVING_ROOM, Plan

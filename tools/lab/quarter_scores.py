@@ -9,7 +9,7 @@ from hearthlog.analyzer.evaluation.event_scores import events_of, false_alarms_p
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 WRONG_WEEK, MICROPHONE_WEEK = 6, 9  # counted from 1
 _NO_EVENTS = {SILENCE, UNKNOWN, OTHER_NEGATIVE}

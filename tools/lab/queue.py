@@ -40,10 +40,9 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.messages.topics import LIVE, EmbeddingSource, topic
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.command import run

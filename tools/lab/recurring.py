@@ -27,7 +27,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.recurring_scene import OTHER, Sounded, names_of, record_scene

@@ -17,8 +17,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS, SAMPLE_RATE
 
 OTHER = ""  # in place of the name of a sound that does not recur
 _LONGEST = 8 * SAMPLE_RATE

@@ -39,7 +39,7 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64, Indices
-from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.tools.cli.evaluate_scenes import ModelFile, learned_lines, read_model_and_clips
 from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output
 from hearthlog.tools.cli.progress import share_done

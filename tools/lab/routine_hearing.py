@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.labelling import Labelling, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.plan import RADIO, TELEVISION
 from hearthlog.tools.lab.command import run
 

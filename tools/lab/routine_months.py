@@ -23,8 +23,7 @@ from hearthlog.models.classes import (
     TAP_WATER,
 )
 from hearthlog.schemas.arrays import Bool, Float64, Int64
-from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.plan import BATHROOM, LIVING_ROOM, RADIO, TELEVISION
 from hearthlog.tools.home.routine import Habits, plan_days

@@ -28,10 +28,9 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.command import run
 
 _PAUSES = (0.5, 2.0, 6.0)  # seconds

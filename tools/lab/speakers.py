@@ -28,11 +28,10 @@ from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32, Float64
-from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.errors import ignore_progress
+from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.progress import ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.bench.table import Row, Table
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.conversations import (

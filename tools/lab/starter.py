@@ -39,10 +39,8 @@ from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BY_FEATURES, starter_file
 from hearthlog.schemas.arrays import Float32, Indices
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, ignore_progress, listed
 from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.schemas.progress import ignore_progress
-from hearthlog.schemas.text import listed
 from hearthlog.tools.home.sounds import synthesize
 
 _FEWEST_SOURCES = 3  # a class of fewer would only mislead

@@ -20,9 +20,8 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.frames import SAMPLE_RATE
+from hearthlog.schemas.frames import NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.command import run
 
 LEVELS = -60.0, -50.0, -40.0, -36.0, -34.0, -25.0  # dBFS

@@ -23,8 +23,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.tools.lab.bench.table import Row, Table
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.conversations import Turn, clips_of_voices, converse, record_samples

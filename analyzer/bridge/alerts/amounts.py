@@ -9,7 +9,7 @@ from hearthlog.analyzer.bridge.alerts.rules import MoreThan
 from hearthlog.analyzer.bridge.alerts.sound_events import SoundEvents, events_of_rule
 from hearthlog.analyzer.logs.spans import Spans, joined, lengths, rows_at
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 
 def more_than_alarms(rule: MoreThan, heard: HomeHeard, until: int) -> list[Alarm]:

@@ -4,7 +4,7 @@ from datetime import UTC, date, datetime, timedelta, tzinfo
 
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.recorder.rest import QuietHours
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 
 def wall_times(day: date, minute: int, zone: tzinfo) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_sp
 from hearthlog.analyzer.logs.spans import cut
 from hearthlog.analyzer.report.baseline import DAYS, Usual, usual
 from hearthlog.analyzer.report.values import Count, Minutes
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _MINUTE = 60 * NANOSECONDS
 

@@ -10,7 +10,7 @@ from hearthlog.analyzer.bridge.alerts.outbox import Outbox
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.analyzer.bridge.alerts.targets import Target
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _LOOK_SECONDS = 0.5
 _CLOSE_SECONDS = 2.0

@@ -10,9 +10,8 @@ from hearthlog.analyzer.bridge.listeners import is_of_scenario, microphone_of_li
 from hearthlog.analyzer.logs.spans import NONE, Spans, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.times import NANOSECONDS
 
 SEGMENT_FIELDS = "header.stamp", "duration", "label", "confidence"
 _PAUSE = 60 * NANOSECONDS  # between what the recorder writes, as one span

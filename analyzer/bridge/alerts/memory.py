@@ -8,8 +8,8 @@ from pathlib import Path
 from hearthlog.analyzer.bridge.alerts.ring import RuleState
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import replaced_file
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.new_files import replaced_file
 
 _LIMIT = 1 << 20  # bytes
 _DAMAGED = (ValueError, TypeError, KeyError, AttributeError, RecursionError, HearthlogError)

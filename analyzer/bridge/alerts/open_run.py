@@ -3,7 +3,7 @@
 from collections import Counter, deque
 from typing import NamedTuple
 
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _UNDECIDED = 5 * NANOSECONDS  # of the newest labels: a segment may still begin among them
 _SETTLED = 5 * NANOSECONDS  # of a run, before it is taken for one

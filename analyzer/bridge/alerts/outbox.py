@@ -10,9 +10,9 @@ from typing import Any
 
 from hearthlog.analyzer.bridge.alerts.ring import Ring
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import private_folder, replaced_file
-from hearthlog.schemas.storage.small_file import read_whole
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.new_files import private_folder, replaced_file
 
 MOST = 1000
 UNREAD = "?"  # who is meant by a line that cannot be read, in the place of the name of a target

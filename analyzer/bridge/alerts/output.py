@@ -28,11 +28,11 @@ from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.times import NANOSECONDS
 
 # Told the name of a rule, a text, and when it rang; returns whether somebody has taken it.
 OnRing = Callable[[str, str, int], bool]

@@ -10,14 +10,13 @@ from hearthlog.analyzer.bridge.listeners import listener_of
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import Described, select
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import labelling_topic, parse_topic
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
 

@@ -14,8 +14,7 @@ from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.models.embedding.sound_names import audioset_names
 from hearthlog.models.modelfile.audioset import AUDIOSET
 from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import HearthlogError, listed
 
 ANY_SOUND = ""  # in place of a class: whatever is not silence
 _LONGEST_WINDOW = 7 * DAY

@@ -8,7 +8,7 @@ from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.alerts.rules import SoundRule, pause_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, first_of_groups, joined
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 
 class SoundEvents(NamedTuple):

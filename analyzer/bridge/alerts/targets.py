@@ -14,8 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.extras import remedy
-from hearthlog.schemas.storage.regular_file import exposed_secret
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import exposed_secret, read_whole
 
 _LIMIT = 1 << 16  # bytes of the file
 _HOST = re.compile(r"localhost|\[[0-9a-f:.]+\]|[\w-]+(\.[\w-]+)+", re.ASCII | re.IGNORECASE)

@@ -17,13 +17,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.mqtt.topics import Place
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.new_files import (
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.new_files import (
     create_file,
     open_lock,
     private_folder,
     replaced_file,
 )
-from hearthlog.schemas.storage.small_file import read_whole
 
 _PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
 _LIMIT = 4 << 20  # bytes

@@ -15,7 +15,7 @@ from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.recorder import rest
-from hearthlog.schemas.messages.labels import spelt
+from hearthlog.schemas.messages.topics import spelt
 
 _WAITING = 20  # commands; more are refused
 _LONGEST = 4096  # bytes of one

@@ -18,7 +18,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import MqttSettings
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
 
 _KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
 _QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection

@@ -31,8 +31,8 @@ from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.recorder.log.folder_lock import node_locks
+from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.logs.files import log_name, walk_logs
-from hearthlog.schemas.text import shortened
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.bridge.mqtt.commands import Answer, Commands

@@ -11,7 +11,7 @@ from hearthlog.analyzer.bridge.page.words import class_words, long_date, room, t
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as wide as in the picture of the report
 _HOUR = 3600 * NANOSECONDS

@@ -7,8 +7,8 @@ from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.words import class_words, length, room, sureness, when
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.schemas.messages.labels import is_sound
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import is_sound
 
 _SHOWN = 20
 _DAY = 24 * 3600 * NANOSECONDS

@@ -10,9 +10,9 @@ from hearthlog.analyzer.bridge.home_state import MicrophoneState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.words import class_words, reason, room, told, when
 from hearthlog.models.classes import SILENCE, in_words
-from hearthlog.schemas.messages.labels import is_sound
-from hearthlog.schemas.text import listed
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.errors import listed
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import is_sound
 
 _QUIETEST = -80.0  # dBFS, the left end of the bar
 _GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # behind the end of a segment

@@ -7,8 +7,8 @@ from pathlib import Path
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import create_file, private_folder, replaced_file
-from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.new_files import create_file, private_folder, replaced_file
 
 _TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
 _FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # what an address can have as it is

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 from hearthlog.analyzer.bridge.page.words import class_words, length, room, times, when
 from hearthlog.analyzer.discover.hours import usual_hours
 from hearthlog.analyzer.discover.summary_file import GroupSummary, HomeSummary
-from hearthlog.schemas.text import listed
-from hearthlog.schemas.times import read_time
+from hearthlog.schemas.errors import listed
+from hearthlog.schemas.frames import read_time
 
 _MOST_UNNAMED, _MOST_NAMED = 10, 50
 _LABELS = 2

@@ -13,7 +13,7 @@ from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.models.classes import CLASS_NAME, CLASSES, SILENCE, class_name
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import find_logs, log_name, review_path
-from hearthlog.schemas.messages.labels import spelt
+from hearthlog.schemas.messages.topics import spelt
 
 REVIEWER = "page of the home"
 READ_ONLY = (

@@ -7,7 +7,7 @@ from hearthlog.analyzer.bridge.listeners import microphone_of_listener, scenario
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.now_heard import heard_classes
 from hearthlog.analyzer.bridge.page.words import class_words, length, room, times
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 
 def scenario_lines(news: News) -> list[Any]:

@@ -4,7 +4,7 @@ from datetime import timedelta, tzinfo
 
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import in_words
-from hearthlog.schemas.text import printable, shortened
+from hearthlog.schemas.errors import printable, shortened
 
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60

@@ -5,7 +5,7 @@ import zlib
 from pathlib import Path
 from typing import Self
 
-from hearthlog.schemas.storage.regular_file import open_regular
+from hearthlog.schemas.files import open_regular
 
 _PIECE = 1 << 20  # bytes
 _READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and has no end

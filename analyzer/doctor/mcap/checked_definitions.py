@@ -8,10 +8,8 @@ from mcap.records import Channel, McapRecord, Schema
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.schemas.logs.columns import definition_fault
-from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE, SCHEMA_ENCODING
-from hearthlog.schemas.mcap.definitions import Definitions
-from hearthlog.schemas.mcap.formats import HEAD
-from hearthlog.schemas.mcap.records import encode, parse
+from hearthlog.schemas.logs.writer import ENCODING, PROFILE, SCHEMA_ENCODING
+from hearthlog.schemas.mcap.records import HEAD, Definitions, encode, parse
 
 ROS_ENCODINGS = (SCHEMA_ENCODING, "ros2idl")
 _SIZE_LIMIT = 16 << 20  # bytes of a record that is neither chunk nor attachment

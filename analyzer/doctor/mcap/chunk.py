@@ -15,12 +15,18 @@ from hearthlog.analyzer.doctor.mcap.checked_definitions import CheckedDefinition
 from hearthlog.analyzer.doctor.mcap.message_batch import ChunkContent
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.mcap import formats
-from hearthlog.schemas.mcap.chunk_records import iterate_records
-from hearthlog.schemas.mcap.formats import HEAD
-from hearthlog.schemas.mcap.raw_messages import gather_heads
+from hearthlog.schemas.mcap.raw_messages import gather_heads, iterate_records
 from hearthlog.schemas.mcap.records import (
+    CHUNK_INDEX,
+    CHUNK_INDEX_TAIL,
+    HEAD,
+    INDEX_ENTRIES,
+    INDEX_OFFSET,
     LIMIT,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    UINT64,
     ChunkHead,
     begun_chunk_head,
     chunk_head,
@@ -72,18 +78,18 @@ class Chunk:
         """Add a message index that stands behind the chunk."""
         self._index_length += record.length
         try:
-            channel, size = formats.MESSAGE_INDEX.unpack_from(record.content)
+            channel, size = MESSAGE_INDEX.unpack_from(record.content)
         except struct.error:
             channel, size = 0, -1
-        most = len(record.content) - formats.MESSAGE_INDEX.size
-        if size % formats.INDEX_ENTRIES.itemsize or not 0 <= size <= most:
+        most = len(record.content) - MESSAGE_INDEX.size
+        if size % INDEX_ENTRIES.itemsize or not 0 <= size <= most:
             what = "a message index has another length than it says"
             self._findings.error("message-index", what, REINDEX, offset=record.offset)
         elif channel in self._indexes:
             what = f"a second message index of channel {channel} behind one chunk"
             self._findings.error("message-index", what, REINDEX, offset=record.offset)
         else:
-            entries = record.content[formats.MESSAGE_INDEX.size : formats.MESSAGE_INDEX.size + size]
+            entries = record.content[MESSAGE_INDEX.size : MESSAGE_INDEX.size + size]
             self._indexes[channel] = entries
             if entries:
                 self._index_offsets.append((channel, record.offset))
@@ -98,8 +104,8 @@ class Chunk:
         """
         if not self.whole:
             return
-        counts = [len(e) // formats.INDEX_ENTRIES.itemsize for e in self._indexes.values()]
-        entries = np.frombuffer(b"".join(self._indexes.values()), formats.INDEX_ENTRIES)
+        counts = [len(e) // INDEX_ENTRIES.itemsize for e in self._indexes.values()]
+        entries = np.frombuffer(b"".join(self._indexes.values()), INDEX_ENTRIES)
         channels = np.repeat([*self._indexes], counts)
         order = np.argsort(entries["offset"], kind="stable")
         entries, channels = entries[order], channels[order]
@@ -120,14 +126,12 @@ class Chunk:
         if self._head is None:
             return None
         head = self._head
-        places = b"".join(formats.INDEX_OFFSET.pack(*pair) for pair in self._index_offsets)
-        first = formats.CHUNK_INDEX.pack(
-            head.start, head.end, self.offset, self._length, len(places)
-        )
-        text = formats.CHUNK_INDEX_TAIL.pack(self._index_length, len(head.compression))
+        places = b"".join(INDEX_OFFSET.pack(*pair) for pair in self._index_offsets)
+        first = CHUNK_INDEX.pack(head.start, head.end, self.offset, self._length, len(places))
+        text = CHUNK_INDEX_TAIL.pack(self._index_length, len(head.compression))
         text += head.compression
         size = head.data.stop - head.data.start
-        return first + places + text + formats.UINT64.pack(size) + formats.UINT64.pack(head.size)
+        return first + places + text + UINT64.pack(size) + UINT64.pack(head.size)
 
     def _find_records(self, hints: Int64) -> None:
         """Find messages, take schemas and channels."""
@@ -231,13 +235,13 @@ def _split(records: bytes, hints: Int64, budget: RecordBudget) -> tuple[Int64, I
     end : int
         Of the last record; not the length of the chunk if that is damaged.
     """
-    if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - formats.MESSAGE_HEAD.itemsize:
+    if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
         heads = gather_heads(records, hints)
         lengths = np.minimum(heads["length"], len(records))  # or their sums may overflow
         firsts = np.concatenate([[0], hints + HEAD.size + lengths])
         lasts = np.concatenate([hints, [len(records)]])
         if ((firsts <= lasts) & (lasts <= len(records))).all() and (
-            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= formats.MESSAGE_FIXED)
+            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= MESSAGE_FIXED)
         ).all():
             others = [np.empty(0, np.int64)]
             for place in np.flatnonzero(firsts < lasts).tolist():
@@ -258,7 +262,7 @@ def _walk(content: bytes, start: int, end: int, budget: RecordBudget) -> tuple[I
             budget.left -= 1
             if opcode == 0 or budget.left < 0:
                 break
-            if opcode == Opcode.MESSAGE and last - first >= formats.MESSAGE_HEAD.itemsize:
+            if opcode == Opcode.MESSAGE and last - first >= MESSAGE_HEAD.itemsize:
                 messages.append(first)
             else:
                 others.append(first)

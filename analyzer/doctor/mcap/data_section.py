@@ -23,11 +23,9 @@ from hearthlog.analyzer.doctor.mcap.message_batch import (
     batches,
 )
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
-from hearthlog.schemas.mcap.chunk_records import iterate_records
-from hearthlog.schemas.mcap.chunk_table import LAST_TIME
-from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, MESSAGE_HEAD, UINT32, UINT64
-from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import encode
+from hearthlog.schemas.mcap.chunk_index import LAST_TIME
+from hearthlog.schemas.mcap.raw_messages import gather_heads, iterate_records
+from hearthlog.schemas.mcap.records import ATTACHMENT, HEAD, MESSAGE_HEAD, UINT32, UINT64, encode
 
 _KEPT_SIZE = 1 << 20  # bytes
 _INDEX_SIZE = 4096  # bytes; what has a longer name is not compared with its index

@@ -8,8 +8,8 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64
-from hearthlog.schemas.mcap.formats import MESSAGE_HEAD
 from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.mcap.records import MESSAGE_HEAD
 
 BATCH_SIZE = 4 << 20  # bytes
 

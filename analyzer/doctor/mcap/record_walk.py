@@ -8,9 +8,8 @@ from mcap.opcode import Opcode
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.analyzer.doctor.mcap.byte_source import ByteSource
-from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
-from hearthlog.schemas.mcap.formats import HEAD, MAGIC
-from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC
 
 _WINDOW = 1 << 20  # bytes
 _CUT = 2 << 20  # bytes; a longer end was not left by a writer that was killed

@@ -12,8 +12,7 @@ from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.mcap.checked_definitions import name_of, parse_strictly
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
-from hearthlog.schemas.mcap.formats import CHUNK_INDEX, HEAD, INDEX_OFFSET, UINT64
-from hearthlog.schemas.mcap.records import parse
+from hearthlog.schemas.mcap.records import CHUNK_INDEX, HEAD, INDEX_OFFSET, UINT64, parse
 
 _ALLOWED = {
     Opcode.SCHEMA,

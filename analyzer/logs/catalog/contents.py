@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.labelling import MOST_CLASSES
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.files import time_span
+from hearthlog.schemas.logs.metadata import read_provenance
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     LIVE,
@@ -24,7 +25,6 @@ from hearthlog.schemas.messages.topics import (
     parse_topic,
     scenario_name,
 )
-from hearthlog.schemas.times import NANOSECONDS
 
 _FEATURES: dict[str, Sequence[str]] = {message_types.FEATURES: ("header.stamp", "frame")}
 _EVENTS: dict[str, Sequence[str]] = {

@@ -8,8 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, LOG, UNFINISHED, Catalog
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 _HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames
 _FUNCTIONS = {"start": "min", "end": "max"}

@@ -16,9 +16,8 @@ from hearthlog.analyzer.logs.catalog.rows import read_rows
 from hearthlog.analyzer.logs.listing import ListedLog, list_logs
 from hearthlog.analyzer.logs.span_index import NEVER, SPAN, write_index
 from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, Progress, ignore_progress
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 _TASK = 100  # files
 

@@ -11,9 +11,9 @@ import pyarrow.compute as pc
 
 from hearthlog.analyzer.logs.catalog.file import read_table, write_table
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import is_local, map_logs, store_errors
 from hearthlog.schemas.logs.files import CATALOG, log_readers
-from hearthlog.schemas.storage.byte_ranges import is_local, map_logs, store_errors
-from hearthlog.schemas.storage.new_files import private_folder, replaced_file
+from hearthlog.schemas.new_files import private_folder, replaced_file
 
 _SUFFIX = ".parquet"
 _LONGEST = 150  # bytes of a home's name in that of its part

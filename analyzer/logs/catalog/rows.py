@@ -14,10 +14,10 @@ from hearthlog.analyzer.logs.catalog.contents import Contents, read_contents
 from hearthlog.analyzer.logs.catalog.file import table_of
 from hearthlog.analyzer.logs.listing import catalogued_name, size_and_time
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.files import log_name, log_of_layer
-from hearthlog.schemas.logs.scenario_record import recorded_scenarios
+from hearthlog.schemas.logs.metadata import recorded_scenarios
 from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW
-from hearthlog.schemas.storage.byte_ranges import map_logs
 
 _HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
 

@@ -12,7 +12,7 @@ from hearthlog.analyzer.logs.text_files import numbered_lines
 from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, with_point
 from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import seconds_text
+from hearthlog.schemas.frames import seconds_text
 
 
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001

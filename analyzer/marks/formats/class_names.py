@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME, find_class
-from hearthlog.schemas.storage.small_file import read_toml
+from hearthlog.schemas.files import read_toml
 
 _LONGEST = 200  # characters of a label; to normalise many accents takes the square of their number
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue"})

@@ -10,7 +10,7 @@ from hearthlog.analyzer.logs.text_files import disarmed
 from hearthlog.analyzer.marks.formats.labels import made_text
 from hearthlog.analyzer.marks.formats.tables import read
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import time_text
+from hearthlog.schemas.frames import time_text
 
 __all__ = ["read", "write"]
 _COLUMNS = ("start", "end", "label", "microphone", "reviewer", "made", "corrects")

@@ -22,8 +22,8 @@ from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, made_text
 from hearthlog.analyzer.marks.formats.left_out import WRONG_TIME, LineError
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.text import listed
-from hearthlog.schemas.times import seconds_text, time_text
+from hearthlog.schemas.errors import listed
+from hearthlog.schemas.frames import seconds_text, time_text
 
 _MILLISECOND = 1_000_000  # ns
 _START = "hearthlog:start"  # the property that says when the document begins

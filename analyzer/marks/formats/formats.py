@@ -6,7 +6,7 @@ A format is a module of this folder, with the functions of `label_files.LabelCod
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 _MEGABYTE = 1 << 20
 

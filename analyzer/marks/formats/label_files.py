@@ -13,7 +13,7 @@ from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel
 from hearthlog.analyzer.marks.formats.left_out import LineError
 from hearthlog.analyzer.marks.formats.tables import is_table
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.storage.new_files import new_file
+from hearthlog.schemas.new_files import new_file
 
 _CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # that a name may have
 

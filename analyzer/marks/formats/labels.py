@@ -16,8 +16,8 @@ from hearthlog.analyzer.marks.formats.left_out import (
     place_text,
 )
 from hearthlog.analyzer.marks.marks import LATEST, PERSON_NAME, Mark
-from hearthlog.schemas.text import shortened
-from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
+from hearthlog.schemas.errors import shortened
+from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
 
 _SECONDS = re.compile(r"[-+]?([0-9]{1,10}(\.[0-9]{0,18})?|\.[0-9]{1,18})([eE][-+]?[0-9]{1,2})?")
 _DECIMAL_COMMA = re.compile(r"([-+]?[0-9]*),([0-9]+([eE][-+]?[0-9]{1,2})?)")

@@ -11,7 +11,7 @@ from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, made_text
 from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import seconds_text, time_text
+from hearthlog.schemas.frames import seconds_text, time_text
 
 _TYPE = "labels"
 _NO_TASK = "unreadable task"

@@ -7,7 +7,7 @@ from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import made_text
 from hearthlog.analyzer.marks.formats.tables import read
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import seconds_text
+from hearthlog.schemas.frames import seconds_text
 
 __all__ = ["read", "write"]
 _BAND = ("0.000", "8000.000")  # Hz, of sound at 16 kHz

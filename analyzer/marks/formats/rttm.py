@@ -8,7 +8,7 @@ from hearthlog.analyzer.logs.text_files import numbered_lines
 from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, add_seconds
 from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import seconds_text
+from hearthlog.schemas.frames import seconds_text
 
 _TYPE = "SPEAKER"
 _FIELDS = 9, 10  # the last one, how far a system listened ahead, came later

@@ -15,7 +15,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     with_point,
 )
 from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
-from hearthlog.schemas.text import listed
+from hearthlog.schemas.errors import listed
 
 _NAMES: Mapping[str, Sequence[str]] = {
     "start": ("start", "start time", "begin", "begin time", "onset", "time"),

@@ -21,10 +21,10 @@ from hearthlog.analyzer.marks.formats.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name
 from hearthlog.schemas.messages.topics import LIVE, RELABEL, labelling_topic, scenario_name
-from hearthlog.schemas.storage.new_files import new_folder
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.new_files import new_folder
 
 _SUFFIX = ".queue.csv"
 _EVER = 1 << 62  # nanoseconds

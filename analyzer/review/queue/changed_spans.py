@@ -20,8 +20,8 @@ from hearthlog.analyzer.review.queue.ranking import spread
 from hearthlog.analyzer.review.queue.review_list import CHANGE, ReviewSpan
 from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
 from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 
 def changed_by(  # noqa: PLR0913, PLR0917

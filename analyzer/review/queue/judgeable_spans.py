@@ -9,7 +9,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events
 from hearthlog.analyzer.logs.spans import Spans, overlay, ranges, remains
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 SHORTEST = NANOSECONDS // 2
 LONGEST = 10 * NANOSECONDS

@@ -9,7 +9,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.schemas.arrays import Bool, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 MINUTE = 60 * NANOSECONDS
 SOUND_SHARE = 0.75  # of the minutes that are drawn has a sound, so that nights take no one's time

@@ -24,11 +24,10 @@ from hearthlog.analyzer.review.queue.uncertainty import ModelUncertainty
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.messages.topics import labelling_topic, scenario_name
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 # Of two that differ one may be right, and what is new may be labelled well.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])

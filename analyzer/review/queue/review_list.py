@@ -16,9 +16,9 @@ from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.queue.ranking import USEFUL, ReviewQueue
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import read_time, time_text
 from hearthlog.schemas.messages.topics import LABELLING, check_microphone_name
-from hearthlog.schemas.storage.new_files import new_file
-from hearthlog.schemas.times import read_time, time_text
+from hearthlog.schemas.new_files import new_file
 
 MOST_SPANS = 100_000
 _PARTS = ("uncertainty", "disagreement", "novelty")

@@ -22,11 +22,10 @@ from hearthlog.models.features.window_inputs import Inputs, WindowStatistics
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import find_model
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 _FIELDS = ("header.stamp", "frame", "values")
 _BEFORE = 60 * NANOSECONDS  # in which the floor of the room is found

@@ -30,8 +30,8 @@ from hearthlog.models.classes import in_words
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
+from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.messages.topics import is_review, scenario_name
-from hearthlog.schemas.progress import Progress, ignore_progress
 
 QUEUES = (*RANKINGS, RANDOM, HINT)
 _TEN = 10  # which takes a person ten minutes

@@ -15,7 +15,7 @@ from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.models.classes import UNKNOWN, in_words
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS

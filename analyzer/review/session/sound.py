@@ -6,7 +6,7 @@ import numpy as np
 
 from hearthlog.analyzer.review.timeline.model import SoundClip
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _FULL_SCALE = np.float32(32768.0)
 

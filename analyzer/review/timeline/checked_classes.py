@@ -8,8 +8,8 @@ from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.timeline.model import Timeline
 from hearthlog.models.classes import in_words
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 
 Checked = Mapping[tuple[str, str], ClassCheck]  # by microphone, and class in words
 _AROUND = 28 * 86_400 * NANOSECONDS

@@ -48,12 +48,10 @@ from hearthlog.analyzer.review.timeline.state_lanes import (
 )
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs, is_layer, time_span
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.topics import LIVE, is_scenario
-from hearthlog.schemas.times import NANOSECONDS
 
 _MEMORY = 600  # seconds that the scale of a feature follows
 _SPREAD = 2.0  # standard deviations from its middle to its ends

@@ -12,8 +12,8 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.home_clock import HomeClock, home_clock
 from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import scenario_name
-from hearthlog.schemas.times import NANOSECONDS
 
 
 class LabelledSpans(NamedTuple):

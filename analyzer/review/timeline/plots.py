@@ -12,7 +12,7 @@ from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.review.timeline.model import MicrophoneTimeline, Timeline
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 _BRIGHT: Colour = (235, 215, 140)
 _GROUND: Colour = (200, 120, 90)

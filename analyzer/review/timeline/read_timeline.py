@@ -28,16 +28,14 @@ from hearthlog.analyzer.review.timeline.model import (
 )
 from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
 from hearthlog.schemas.arrays import Float32, Int16
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import AUDIO_LAYER, REVIEW_LAYER, log_of_layer
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.times import NANOSECONDS
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB

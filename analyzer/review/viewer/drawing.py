@@ -13,8 +13,8 @@ from hearthlog.analyzer.review.timeline.model import FrameValues, Timeline
 from hearthlog.analyzer.review.timeline.plots import LEVEL, SHARES, Plot, Style, timeline_plots
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.models.classes import in_words
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 
 LINES, CLIP, WORDS = "events", "clip", "words"
 NOTHING = "words/nothing"  # an empty text

@@ -16,8 +16,8 @@ from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import draw, draw_frames, write_checked
 from hearthlog.analyzer.review.viewer.layout import APPLICATION, review_layout
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.new_files import check_new, new_file
-from hearthlog.schemas.times import time_text
+from hearthlog.schemas.frames import time_text
+from hearthlog.schemas.new_files import check_new, new_file
 
 SUFFIX = ".rrd"
 

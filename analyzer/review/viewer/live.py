@@ -32,7 +32,7 @@ from hearthlog.analyzer.review.viewer.layout import (
     states_view,
     tabs,
 )
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told
 _APPLICATION = "hearthlog_watch"  # of its own: viewers keep the layout of each

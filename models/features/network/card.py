@@ -14,9 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from hearthlog.models.embedding.folders import network_folders
 from hearthlog.models.errors import ModelError
+from hearthlog.schemas.errors import printable
+from hearthlog.schemas.files import read_toml, read_whole
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.storage.small_file import read_toml, read_whole
-from hearthlog.schemas.text import printable
 
 INPUTS = "embedding"
 MOST_VALUES = 4096

@@ -11,9 +11,8 @@ from hearthlog.models.embedding.onnx_session import OnnxModel
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.network.card import MOST_VALUES, NetworkCard, read_network
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, printable
 from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.schemas.text import printable
 
 _LARGEST = 65_504.0  # of half precision, to which values are rounded
 _SOUND_SEED = 20_261_125

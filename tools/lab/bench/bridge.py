@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HeardNow
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.bench.labmic import DEVICE, SECOND_DEVICE, make_microphone
 from hearthlog.tools.lab.bench.live import most_sounding, running, usage, wait_for_log
 from hearthlog.tools.lab.bench.table import Row, Table, Target

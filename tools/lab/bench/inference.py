@@ -25,8 +25,8 @@ from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.bench.timing import best_of
 from hearthlog.tools.lab.bench.workload import Workload

@@ -10,8 +10,8 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.salvage.recover import recover_log
-from hearthlog.schemas.times import NANOSECONDS
 
 _MIDNIGHT = 1_772_323_200 * NANOSECONDS
 _BLOCK = 10  # frames that the capture hands over at once

@@ -19,9 +19,8 @@ from rosbags.highlevel import AnyReader
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import chunk_head
+from hearthlog.schemas.mcap.records import HEAD, chunk_head
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.bench.timing import BenchError, Seconds, best_of

@@ -16,8 +16,8 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.schemas.arrays import Float32, Int16
+from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS
 from hearthlog.tools.lab.bench.hours import DENSE, lay_out, read_recordings

@@ -8,8 +8,7 @@ from typing import Any
 from mcap.writer import Writer
 
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.log_stream import TopicBatch
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.message_types import definition, encode, message, time_message
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.tools.lab.bench.table import Row, Table, Target

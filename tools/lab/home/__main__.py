@@ -9,8 +9,7 @@ import typer
 
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings
-from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.plan import LIVING_ROOM, ROOMS

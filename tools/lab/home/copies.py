@@ -15,20 +15,20 @@ import typer
 from mcap.records import Metadata
 
 from hearthlog.analyzer.logs.layers import find_with_layers, home_folder
-from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs import provenance, rosbag2
+from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
+from hearthlog.schemas.files import prefetch
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.digest import log_digest
-from hearthlog.schemas.logs.files import find_logs, is_layer, log_name
-from hearthlog.schemas.logs.provenance import provenance_records
+from hearthlog.schemas.logs.files import find_logs, is_layer, log_name, time_span
+from hearthlog.schemas.logs.metadata import (
+    HEARTHLOG_METADATA,
+    ROSBAG2_METADATA,
+    log_digest,
+    provenance_records,
+)
 from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
-from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.prefetch import prefetch
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.home.shifted_log import Shift, ShiftedLog
 
 _DAY = 86_400  # seconds
@@ -262,9 +262,9 @@ class _Edit:
     def __call__(self, record: Metadata, fewer: Mapping[str, int]) -> dict[str, str]:
         """Edit one record, of a copy that has so many messages of each topic less."""
         try:
-            if record.name == rosbag2.METADATA:
+            if record.name == ROSBAG2_METADATA:
                 return self._rosbag2(record.metadata, fewer)
-            if record.name == provenance.METADATA:
+            if record.name == HEARTHLOG_METADATA:
                 return self._provenance(record.metadata)
             return dict(record.metadata)
         except (ValueError, KeyError, TypeError, AttributeError) as error:

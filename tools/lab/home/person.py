@@ -17,9 +17,8 @@ from hearthlog.analyzer.review.session.queue_items import queue_spans, review_it
 from hearthlog.analyzer.review.session.session import ReviewItem
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.sounds import generator
 from hearthlog.tools.home.truth import LabelledSpan
 

@@ -13,19 +13,17 @@ from rosbags.interfaces import Nodetype
 
 from hearthlog.schemas.arrays import Bool, Bytes, Indices, Int64, scatter
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.counted_writer import CountedWriter
-from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
-from hearthlog.schemas.mcap.formats import HEAD, INDEX_ENTRIES, MESSAGE_FIXED, MESSAGE_HEAD
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.writer import ENCODING, PROFILE, CountedWriter
+from hearthlog.schemas.mcap.compressed_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import parse
-from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
+from hearthlog.schemas.mcap.records import HEAD, INDEX_ENTRIES, MESSAGE_FIXED, MESSAGE_HEAD, parse
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.topics import is_review, parse_topic
 from hearthlog.schemas.messages.type_definitions import MessageType, message_type
 from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
-from hearthlog.schemas.times import NANOSECONDS
 
 _TIME = "builtin_interfaces/msg/Time"
 _SPAN = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])  # of a stamp, and of a duration

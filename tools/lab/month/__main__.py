@@ -12,7 +12,7 @@ import typer
 
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.home.simulate import write_day
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults

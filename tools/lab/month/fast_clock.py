@@ -3,7 +3,7 @@
 import time
 from threading import Event as Flag
 
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.lab.month.shared_state import SharedState
 
 START = 1_767_225_600 * NANOSECONDS  # 2026-01-01, true time at which the month begins

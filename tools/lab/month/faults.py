@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 
 Kind = Literal[
     # to the recorder, done by whoever runs it

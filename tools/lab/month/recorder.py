@@ -11,7 +11,7 @@ import numpy as np
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_microphones
 from hearthlog.recorder.sources import microphone
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.lab.month.fast_clock import START, FastClock, FastFlag
 from hearthlog.tools.lab.month.fast_microphone import FastMicrophone, Sound
 from hearthlog.tools.lab.month.faults import Fault

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hearthlog.analyzer.doctor import examine
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import stem
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.month.account import holes
 from hearthlog.tools.lab.month.fast_microphone import PPM
 from hearthlog.tools.lab.month.faults import Fault

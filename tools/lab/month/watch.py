@@ -12,9 +12,9 @@ from pathlib import Path
 
 from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.modules import module_command
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, stem
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
-from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
 from hearthlog.tools.lab.month.account import LogAccount, account_for
 from hearthlog.tools.lab.month.faults import Fault

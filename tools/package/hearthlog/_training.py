@@ -12,7 +12,7 @@ from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.progress import ignore_progress
+from hearthlog.schemas.errors import ignore_progress
 
 __all__ = ["Comparison", "compare", "train"]
 

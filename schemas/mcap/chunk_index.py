@@ -1,6 +1,8 @@
-"""Where the chunks of a file are, and what span of time each of them holds."""
+"""The chunks of a file and their time spans, from its index or by a walk over its records."""
 
+import io
 import struct
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,8 +11,17 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from hearthlog.schemas.mcap import formats
-from hearthlog.schemas.mcap.formats import HEAD
+from hearthlog.schemas.files import LocalFile, Section, StoredFile
+from hearthlog.schemas.mcap.records import (
+    CHUNK,
+    CHUNK_INDEX,
+    CHUNK_INDEX_TAIL,
+    HEAD,
+    INDEX_OFFSET,
+    LIMIT,
+    MESSAGE,
+    UINT64,
+)
 
 CHUNKS = np.dtype(
     [
@@ -95,10 +106,10 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     opcode, offset, length = location
     try:
         if opcode == Opcode.CHUNK:
-            start, end, size, _, _ = formats.CHUNK.unpack_from(head, HEAD.size)
+            start, end, size, _, _ = CHUNK.unpack_from(head, HEAD.size)
             index_length = 0
         else:
-            start = end = formats.MESSAGE.unpack_from(head)[4]
+            start = end = MESSAGE.unpack_from(head)[4]
             size, index_length = length, -1
     except struct.error as error:
         raise McapError("a record is too short") from error
@@ -111,14 +122,14 @@ def read_chunk_index(content: bytes) -> ChunkRow:
     Raise `McapError` if a place or a size is 2**63 or more. Raise `struct.error` if the content
     is shorter than it claims, or holds a part of an index offset.
     """
-    start, end, offset, length, entries = formats.CHUNK_INDEX.unpack_from(content)
-    first = formats.CHUNK_INDEX.size
-    offsets = formats.INDEX_OFFSET.iter_unpack(content[first : first + entries])
+    start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
+    first = CHUNK_INDEX.size
+    offsets = INDEX_OFFSET.iter_unpack(content[first : first + entries])
     channels = {channel for channel, _ in offsets}
     first += entries
-    index_length, text = formats.CHUNK_INDEX_TAIL.unpack_from(content, first)
-    first += formats.CHUNK_INDEX_TAIL.size + text + formats.UINT64.size
-    (size,) = formats.UINT64.unpack_from(content, first)
+    index_length, text = CHUNK_INDEX_TAIL.unpack_from(content, first)
+    first += CHUNK_INDEX_TAIL.size + text + UINT64.size
+    (size,) = UINT64.unpack_from(content, first)
     row = _row((offset, length, index_length, size), start, end)
     row.channels = channels
     return row
@@ -159,3 +170,63 @@ def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
         A sorted copy; chunks of the same time keep their order.
     """
     return chunks[np.argsort(chunks["start"], kind="stable")]
+
+
+_RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
+_WINDOW = 1 << 14  # bytes that are read at once: an hour has half a million records
+
+
+def walk_records(
+    read: Callable[[int, int], bytes], start: int
+) -> Iterator[tuple[int, int, int, bytes]]:
+    """Go from record to record, as long as there is the head of one.
+
+    Parameters
+    ----------
+    read : callable
+        Returns bytes of the file from an offset on, fewer than asked for at its end.
+
+    Yields
+    ------
+    opcode, offset, length : int
+        Of the record, which may claim to be longer than the file; with opcode and length.
+    head : bytes
+        Its first bytes, opcode and length included, or all of them.
+    """
+    window, first = b"", start
+    while True:
+        place = start - first
+        if not 0 <= place <= len(window) - _RECORD_HEAD:
+            window, first, place = read(start, _WINDOW), start, 0
+        head = window[place : place + _RECORD_HEAD]
+        if len(head) < HEAD.size:
+            return
+        opcode, length = HEAD.unpack_from(head)
+        length += HEAD.size
+        yield opcode, start, length, head[:length]
+        start += length
+
+
+def read_records(
+    file: LocalFile | StoredFile, start: int, end: int
+) -> Iterator[tuple[RecordLocation, bytes]]:
+    """Read the records of a section one by one.
+
+    Parameters
+    ----------
+    start, end : int
+        Of the section, in bytes.
+
+    Raises
+    ------
+    McapError
+        If a record is longer than the section, or than `LIMIT`.
+    """
+    with io.BufferedReader(Section(file, start), 1 << 20) as stream:
+        while start < end:
+            head = stream.read(HEAD.size)
+            opcode, length = HEAD.unpack(head)
+            if length > min(LIMIT, end - start - HEAD.size):
+                raise McapError("a record claims to be too large")
+            yield RecordLocation(opcode, start, HEAD.size + length), head + stream.read(length)
+            start += HEAD.size + length

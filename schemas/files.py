@@ -1,22 +1,226 @@
-"""Read files by ranges: those of this machine, and those of a store that fsspec knows."""
+"""Files, on this machine or in a store of fsspec, read by ranges or entirely within limits."""
 
+import errno
 import io
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import pwd
+import re
+import stat
+import tomllib
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.prefetch import prefetch
-from hearthlog.schemas.storage.regular_file import open_regular
+
+
+def open_regular(path: Path) -> int:
+    """Open a regular file of this machine for reading.
+
+    Raise `OSError` if it cannot be opened, or is no regular file.
+    """
+    mode = os.stat(path).st_mode  # noqa: PTH116  goes with what follows
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "Is a directory", str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+
+
+def exposed_secret(path: Path) -> str:
+    """Return a warning if everybody may read a file of secrets; empty otherwise."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return ""
+    if not (stat.S_ISREG(mode) and mode & (stat.S_IROTH | stat.S_IWOTH)):
+        return ""
+    what = "read" if mode & stat.S_IROTH else "change"
+    return f"{path}: holds secrets, and everybody on this machine may {what} it: chmod 600 {path}"
+
+
+def may_be_regular(path: Path) -> bool:
+    """Tell whether a path is that of a regular file, or of one whose kind cannot be found out.
+
+    Returns
+    -------
+    bool
+        True, too, if there is no such file or its folder cannot be read: opening it says why.
+    """
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except OSError:
+        return True
+
+
+def is_denied(path: str | Path) -> bool:
+    """Return whether there is a file or a folder that this user may not read."""
+    if os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):  # noqa: PTH112
+        return False
+    try:
+        os.stat(path)  # noqa: PTH116  a name of one of many
+    except PermissionError:
+        return True
+    except OSError:  # there is none
+        return False
+    return True
+
+
+def denied_text(path: str | Path) -> str:
+    """Say whose a file or a folder is that this user may not read, and what to do."""
+    owner = ""
+    for place in (Path(path), *Path(path).absolute().parents):
+        with suppress(OSError, KeyError):
+            owner = pwd.getpwuid(place.stat().st_uid).pw_name
+            break
+    run = "sudo" if owner in {"", "root"} else f"sudo -u {owner}"
+    return (
+        f"may not be read by you{f' (owner {owner})' if owner else ''}: run this as "
+        f'`{run} …`, or let the recorder have readable_by = "group"'
+    )
+
+
+_TOML_LIMIT = 1 << 20
+_LINE = re.compile(r"at line (\d+)")
+_HINTS = (  # by what the parser says, and the line it stopped at
+    (
+        re.compile(r"overwrite|twice|redefine|mutate|duplicate", re.IGNORECASE),
+        "; a key or table is given twice",
+    ),
+    (
+        re.compile(r"\n.*\"[^\"]*\\"),
+        "; a text with a backslash stands in single quotes: 'C:\\logs'",
+    ),
+    (
+        re.compile(r"Invalid value"),
+        '; a text stands in quotes, as node = "home"; else true, false, a number',
+    ),
+    (
+        re.compile(
+            r"Expected '='|Invalid (initial )?(character|statement)|after (a )?(key|statement)"
+        ),
+        "; each line is KEY = VALUE, [TABLE] or # COMMENT",
+    ),
+    (
+        re.compile(r"Unclosed|Unterminated|newline|Illegal character '\\n'", re.IGNORECASE),
+        "; a quote or a bracket is not closed, or a comma is missing",
+    ),
+)
+_UTF_16 = {b"\xff\xfe", b"\xfe\xff"}
+_IS_UTF_16 = "no UTF-8: it is UTF-16"
+_DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of their number
+
+
+def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
+    """Read a regular file of this machine, or a file of a store.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes, at most.
+
+    Raises
+    ------
+    HearthlogError
+        Of the type `error`, if there is no such file, it is larger than the limit, cannot be read,
+        or is no regular file.
+    """
+    try:
+        if not path.exists():
+            raise error(f"{path}: no such {what}")
+        with _opened(path) as stream:
+            data = stream.read(limit + 1)
+    except OSError as reason:
+        raise error(f"{path}: cannot be read ({reason.strerror})") from reason
+    if len(data) > limit:
+        most = f"{limit >> 20} MB" if limit >= 1 << 20 else f"{limit / 1000:.3g} kB"
+        raise error(f"{path}: larger than {most}; this is no {what}")
+    return data
+
+
+def _opened(path: Path) -> IO[bytes]:
+    """Open a file, which in a store is a regular one."""
+    return os.fdopen(open_regular(path), "rb") if is_local(path) else path.open("rb")
+
+
+def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:
+    """Read a TOML file of at most 1 MB.
+
+    Raises
+    ------
+    HearthlogError
+        Of the type `error`, if there is no such file, it is larger than 1 MB, cannot be read, is
+        nested too deeply, or is no TOML in UTF-8.
+    """
+    data = read_whole(path, what, _TOML_LIMIT, error)
+    content: dict[str, Any] = {}
+    try:
+        text = data.decode("utf-8-sig")  # editors of Windows begin a file with a mark
+        keys = (line for line in text.split("\n") if not line.lstrip().startswith("#"))
+        if "\0" in text:
+            raise error(f"{path}: cannot be read as TOML ({_IS_UTF_16}); save it as UTF-8")
+        deep = any(line.count(".") > _DEEPEST for line in keys)
+        if not deep:
+            content = tomllib.loads(text)
+    except UnicodeDecodeError as reason:
+        line = data.count(b"\n", 0, reason.start) + 1
+        problem = _IS_UTF_16 if data[:2] in _UTF_16 else f"no UTF-8: at line {line}"
+        raise error(f"{path}: cannot be read as TOML ({problem}); save it as UTF-8") from reason
+    except ValueError as reason:
+        raise error(f"{path}: cannot be read as TOML ({_toml_problem(text, reason)})") from reason
+    except RecursionError:
+        deep = True
+    if deep:
+        raise error(f"{path}: cannot be read as TOML (it is nested too deeply)")
+    return content
+
+
+def _toml_problem(text: str, reason: ValueError) -> str:
+    """Say what the parser refuses, where, and what to write."""
+    last = f"at line {text.rstrip().count(chr(10)) + 1}, the last one"
+    problem = str(reason).replace("at end of document", last)[:200]
+    found = _LINE.search(problem)
+    lines = text.split("\n")
+    line = lines[int(found[1]) - 1] if found and int(found[1]) <= len(lines) else ""
+    return problem + next(
+        (hint for words, hint in _HINTS if words.search(f"{problem}\n{line}")), ""
+    )
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def prefetch(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int
+) -> Generator[Result, None, None]:
+    """Apply a function to items in threads, a few items ahead of the consumer.
+
+    Parameters
+    ----------
+    function : callable
+        Called with one item. Should spend its time where the interpreter is not needed: reading,
+        decompressing, numpy.
+    workers : int
+        Threads, 1 or more; one item more than these is worked on, or waits for the consumer.
+    """
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[Result]] = deque()
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) > workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
 
 _BLOCK = 1 << 17  # bytes: a store hands them out in hardly more time than a few
 _KEPT = 4  # blocks
 _ASKED = 8  # files of a store at once
-
-Result = TypeVar("Result")
 
 
 def is_local(path: object) -> bool:

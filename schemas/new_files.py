@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
+from hearthlog.schemas.files import is_local, store_errors
 
 _AT_ONCE = 8  # files that are synced: one after the other takes a disk milliseconds for each
 _READERS = stat.S_IRGRP | stat.S_IROTH

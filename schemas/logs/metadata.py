@@ -1,0 +1,375 @@
+"""Metadata records of a log: `hearthlog`, its features and scenarios, and `rosbag2`; digests."""
+
+import hashlib
+import json
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from hearthlog._version import __version__
+from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.message_types import SCHEMA_VERSION
+from hearthlog.schemas.messages.topics import (
+    SCENARIO,
+    Quality,
+    check_microphone_name,
+    check_scenario_name,
+)
+
+HEARTHLOG_METADATA = "hearthlog"
+THINNED = "thinned"  # what was dropped of a log
+THINNED_OF = "thinned_of"  # digests that it had before, one for each time
+_VERSION_KEY = "schema_version"
+_FIRST = "1"  # did not write it
+_KNOWN = {str(number): number for number in range(1, SCHEMA_VERSION + 1)}
+_LARGEST, _MOST = 1 << 20, 64 << 20  # bytes of one record, and of all; ours have less than 1000
+
+
+def provenance(node: str, **more: str) -> dict[str, str]:
+    """Make the record of a file that this version writes."""
+    return {"version": __version__, _VERSION_KEY: str(SCHEMA_VERSION), "node": node, **more}
+
+
+def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
+    """Read the records of a file, each different one once.
+
+    A record of a newer version gives a `HearthlogWarning`.
+
+    Returns
+    -------
+    list of mapping of str to str
+        One, or those of all logs that were merged; empty if the file is not of hearthlog.
+
+    Raises
+    ------
+    LogError
+        If a record is damaged.
+    """
+    records = provenance_records(file)
+    for record in records:
+        check_version(record, file.path)
+    return records
+
+
+def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
+    """Read the records of a file as `read_provenance` does, whatever their version.
+
+    Raise `LogError` if a record is damaged.
+    """
+    different: dict[frozenset[tuple[str, str]], Mapping[str, str]] = {}
+    size = 0
+    for place in file.record_locations:
+        if place.opcode == Opcode.METADATA and place.length <= _LARGEST and size < _MOST:
+            record = file.record(place)
+            size += place.length
+            if isinstance(record, Metadata) and record.name == HEARTHLOG_METADATA:
+                different.setdefault(frozenset(record.metadata.items()), record.metadata)
+    return list(different.values())
+
+
+def version_text(record: Mapping[str, str]) -> str:
+    """Return the schema version that a record names, which need not be a number."""
+    return record.get(_VERSION_KEY, _FIRST)
+
+
+def schema_version(record: Mapping[str, str]) -> int | None:
+    """Return the schema version of a record.
+
+    Returns
+    -------
+    int or None
+        None if this version of hearthlog does not know it.
+    """
+    return _KNOWN.get(version_text(record))
+
+
+def describes_model(record: Mapping[str, str]) -> bool:
+    """Tell whether a log with such a record has `model.json`, if it has labels."""
+    version = schema_version(record)
+    return version is not None and version > 1
+
+
+def unknown_version(record: Mapping[str, str]) -> str:
+    """Say that a record has a schema version that this version does not know.
+
+    Returns
+    -------
+    str
+        The rest of a sentence that begins with the file; empty if the version is known.
+    """
+    if schema_version(record) is not None:
+        return ""
+    return (
+        f"is of schema version {version_text(record)[:20]!r}, and this hearthlog knows up to "
+        f"{SCHEMA_VERSION}: what is newer in it is not read; update hearthlog"
+    )
+
+
+def check_version(record: Mapping[str, str], path: Path) -> None:
+    """Give a `HearthlogWarning` if a file has a schema version that this version does not know."""
+    text = unknown_version(record)
+    if text:
+        warnings.warn(HearthlogWarning(text, path), stacklevel=2)
+
+
+ROSBAG2_METADATA = "rosbag2"
+_COUNTED = re.compile(
+    r"^ *(?:name: *(?P<name>\S+)|message_count: *(?P<count>\d{1,18})) *$", re.MULTILINE
+)
+_FOREVER = {"sec": 9223372036, "nsec": 854775807}
+
+
+@dataclass
+class TopicCount:
+    """One topic of a file and the number of its messages."""
+
+    type: str
+    channel_metadata: Mapping[str, str]
+    messages: int = 0
+
+
+def rosbag2_channel(type_hash: str, quality: Quality) -> dict[str, str]:
+    """Return the metadata that a ROS 2 channel must have."""
+    seconds = quality.lifespan_seconds
+    profile = {
+        "history": "keep_last",
+        "depth": quality.depth,
+        "reliability": "reliable",
+        "durability": "transient_local" if quality.transient_local else "volatile",
+        "deadline": _FOREVER,
+        "lifespan": _FOREVER if seconds is None else {"sec": seconds, "nsec": 0},
+        "liveliness": "automatic",
+        "liveliness_lease_duration": _FOREVER,
+        "avoid_ros_namespace_conventions": False,
+    }
+    return {"offered_qos_profiles": json.dumps([profile]), "topic_type_hash": type_hash}
+
+
+class FileCounts(NamedTuple):
+    """What rosbag2 wants to know of one file of a bag."""
+
+    name: str  # relative to the folder of the bag
+    topics: Mapping[str, TopicCount]
+    span: tuple[int, int]  # first and last log time, in nanoseconds of UTC
+
+    @property
+    def times(self) -> dict[str, object]:
+        """When it begins, how long it lasts, and how many messages it has, in rosbag2's words."""
+        start, end = self.span
+        return {
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "duration": {"nanoseconds": end - start},
+            "message_count": sum(topic.messages for topic in self.topics.values()),
+        }
+
+
+def rosbag2_metadata(
+    name: str, topics: Mapping[str, TopicCount], span: tuple[int, int]
+) -> dict[str, str]:
+    """Return the `rosbag2` metadata record of a file (version 9 of its `metadata.yaml`).
+
+    Parameters
+    ----------
+    span : (int, int)
+        First and last log time, in nanoseconds of UTC.
+    """
+    return {"serialized_metadata": json.dumps(_information([FileCounts(name, topics, span)]))}
+
+
+def rosbag2_counts(record: Mapping[str, str]) -> dict[str, int]:
+    """Read how many messages of each topic a file has by its `rosbag2` metadata record.
+
+    Returns
+    -------
+    dict of str to int
+        By topic; empty if the record does not say so, or says two things.
+    """
+    text = record.get("serialized_metadata", "")
+    try:
+        total, counts = _from_json(text) if text.lstrip().startswith("{") else _from_yaml(text)
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return {}
+    return counts if sum(counts.values()) == total else {}
+
+
+def _from_json(text: str) -> tuple[int, dict[str, int]]:
+    record = json.loads(text)
+    topics = record["topics_with_message_count"]
+    counts = {topic["topic_metadata"]["name"]: int(topic["message_count"]) for topic in topics}
+    return int(record["message_count"]), counts
+
+
+def _from_yaml(text: str) -> tuple[int, dict[str, int]]:
+    before, _, topics = text.partition("topics_with_message_count:")
+    totals = [int(match["count"]) for match in _COUNTED.finditer(before) if match["count"]]
+    counts: dict[str, int] = {}
+    name = ""
+    for match in _COUNTED.finditer(topics):
+        if match["name"]:
+            name = match["name"]
+        elif name:  # those of files, further on, have none
+            counts[name], name = int(match["count"]), ""
+    return totals[0] if totals else -1, counts
+
+
+def rosbag2_yaml(files: Sequence[FileCounts]) -> str:
+    """Return the `metadata.yaml` of a bag of some files.
+
+    Parameters
+    ----------
+    files : sequence of FileCounts
+        In the order of time, at least one; a topic is of one type and quality in all of them.
+    """
+    information = json.dumps(_information(files), ensure_ascii=False)  # JSON, which is YAML too
+    return f"rosbag2_bagfile_information: {information}\n"
+
+
+def _information(files: Sequence[FileCounts]) -> dict[str, object]:
+    topics: dict[str, TopicCount] = {}
+    for file in files:
+        for name, topic in file.topics.items():
+            earlier = topics.get(name)
+            messages = topic.messages + (0 if earlier is None else earlier.messages)
+            topics[name] = replace(topic, messages=messages)
+    start, end = min(file.span[0] for file in files), max(file.span[1] for file in files)
+    return {
+        "version": 9,
+        "storage_identifier": "mcap",
+        **FileCounts("", topics, (start, end)).times,
+        "topics_with_message_count": [
+            {"topic_metadata": _topic_metadata(name, topic), "message_count": topic.messages}
+            for name, topic in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file.name for file in files],
+        "files": [{"path": file.name, **file.times} for file in files],
+        "custom_data": {},
+        "ros_distro": "",
+    }
+
+
+def _topic_metadata(name: str, topic: TopicCount) -> dict[str, object]:
+    return {
+        "name": name,
+        "type": topic.type,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": json.loads(topic.channel_metadata["offered_qos_profiles"]),
+        "type_description_hash": topic.channel_metadata["topic_type_hash"],
+    }
+
+
+FEATURE_SET = "feature_set"
+FEATURE_SET_VERSION = "feature_set_version"
+FEATURE_SET_DIGEST = "feature_set_sha256"
+FEATURE_SET_DISTRIBUTION = "feature_set_distribution"
+_DETAILS = (FEATURE_SET_VERSION, FEATURE_SET_DIGEST, FEATURE_SET_DISTRIBUTION)
+
+
+def feature_entries(name: str, version: int, digest: str, distribution: str) -> dict[str, str]:
+    """Return what the record says of a feature set.
+
+    Parameters
+    ----------
+    digest : str
+        SHA-256 of the network that computes it; empty for none.
+    distribution : str
+        Which brings it, and its version; empty for hearthlog itself.
+    """
+    entries = {FEATURE_SET: name, FEATURE_SET_VERSION: str(version)}
+    return entries | {
+        k: v
+        for k, v in ((FEATURE_SET_DIGEST, digest), (FEATURE_SET_DISTRIBUTION, distribution))
+        if v
+    }
+
+
+def other_features(
+    first: Mapping[str, str], other: Mapping[str, str], microphone: str
+) -> dict[str, str]:
+    """Return what the record says of the features of another microphone than the first."""
+    return {
+        f"/{microphone}/{key}": other.get(key, "")
+        for key in _DETAILS
+        if other.get(key, "") != first.get(key, "")
+    }
+
+
+def features_of_microphone(record: Mapping[str, str], microphone: str) -> dict[str, str]:
+    """Return a record with what it says of the features of one microphone."""
+    own = {key: record.get(f"/{microphone}/{key}", record.get(key, "")) for key in _DETAILS}
+    others = {key: text for key, text in record.items() if key not in own}
+    return others | {key: text for key, text in own.items() if text}
+
+
+_SCENARIO_KEY = re.compile(f"{SCENARIO}/([^/]+)/([^/]+)")
+
+
+class RecordedScenario(NamedTuple):
+    """A scenario that ran on what a microphone heard, and the model that labelled for it."""
+
+    microphone: str
+    name: str
+    model: str
+    sha256: str
+
+
+def scenario_entries(scenario: RecordedScenario) -> dict[str, str]:
+    """Return what the record says of a scenario."""
+    key = f"{SCENARIO}/{scenario.microphone}/{scenario.name}"
+    return {key: scenario.model, f"{key}/sha256": scenario.sha256}
+
+
+def recorded_scenarios(record: Mapping[str, str]) -> Iterator[RecordedScenario]:
+    """Yield the scenarios that a record names, in its order."""
+    for key, model in record.items():
+        names = _SCENARIO_KEY.fullmatch(key)
+        if names is None:
+            continue
+        try:
+            microphone, name = check_microphone_name(names[1]), check_scenario_name(names[2])
+        except LogError:
+            continue
+        yield RecordedScenario(microphone, name, model, record.get(f"{key}/sha256", ""))
+
+
+_TAIL = 1 << 16  # bytes
+
+
+def log_digest(log: Path) -> str:
+    """Identify a log: the SHA-256 of its size and its last 64 KiB.
+
+    The end of a log holds its index, or the end of that, and the index's checksum. So a log can be
+    recognised without reading all of it.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, or is not an MCAP file.
+    """
+    with LogFile(log, indexed=False) as file:
+        size = file.size
+        tail = file.read(max(size - _TAIL, 0), _TAIL)
+    return hashlib.sha256(str(size).encode() + b"\0" + tail).hexdigest()
+
+
+def earlier_digests(log: Path) -> list[str]:
+    """Return the digests that a log had before it was thinned.
+
+    Raise `LogError` if the log cannot be read or is damaged.
+    """
+    with LogFile(log) as file:
+        records = provenance_records(file)
+    return [digest for record in records for digest in record.get(THINNED_OF, "").split()]

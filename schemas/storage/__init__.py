@@ -1,1 +1,0 @@
-"""Bytes of files: on this machine or in a store, regular, within limits."""
