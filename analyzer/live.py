@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
-from hearthlog.models.modelfile.card import DESCRIPTION, attachment_of
+from hearthlog.models.modelfile.modelfile import DESCRIPTION, attachment_of
 from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
 from hearthlog.recorder.rest import paused_until
 from hearthlog.schemas.errors import LogError

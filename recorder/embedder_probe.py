@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.embedding.networks import (
     NETWORKS,
     YAMNET,
     Embedder,
     find_network,
     load_embedder,
+    missing_modules,
 )
-from hearthlog.models.embedding.runtimes import missing_modules
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.errors import ModelError
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import printable

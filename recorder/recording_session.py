@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
+from hearthlog.models.classifiers.names import is_by_names
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.models.modelfile.audioset import is_by_names
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk.keeper import DiskKeeper

@@ -28,7 +28,7 @@ from hearthlog.analyzer.training.transitions import (
     SHORTEST_SECONDS,
     default_transitions,
 )
-from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.sources.decoding import read_audio

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch

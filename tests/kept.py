@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.models.classifiers.description import Smoothing
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.model import Model, Smoothing
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.registry import insist
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from logreader import LogReader
 
-from hearthlog.models.classifiers.timing import LabelTiming
+from hearthlog.models.classifiers.classifier import LabelTiming
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds

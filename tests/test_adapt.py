@@ -34,14 +34,11 @@ from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.auros21.augmentation import augmented
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
-from hearthlog.models.features.auros21.inputs import bands_of
+from hearthlog.models.features.auros21 import FeatureExtractor, augmented, bands_of
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.window_inputs import of_segments
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

@@ -14,7 +14,7 @@ from hearthlog.analyzer.bridge.alerts.ring import RuleState
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.home import Home
-from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch

@@ -37,7 +37,7 @@ from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.state_folder import state_folder
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, log_path
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch

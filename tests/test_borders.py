@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hearthlog.models.classifiers.description import Smoothing
-from hearthlog.models.labels.borders import Borders
-from hearthlog.models.labels.segments import LabelledFrames, Segmenter
+from hearthlog.models.classifiers.model import Smoothing
+from hearthlog.models.labels.segments import Borders, Segmenter, SegmenterInput
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 pytestmark = pytest.mark.fast
@@ -196,7 +195,7 @@ def neighbours(rows):
 def segments_of(smoothing, probabilities, powers, classes=("silence", "coughing", "music")):
     segmenter = Segmenter(classes, smoothing, np.empty((0, 0)))
     stamps = np.arange(len(powers)) * FRAME_NANOSECONDS
-    frames = LabelledFrames(probabilities, powers, stamps, stamps)
+    frames = SegmenterInput(probabilities, powers, stamps, stamps)
     segments = segmenter.push(frames) + segmenter.close(len(powers) * FRAME_NANOSECONDS)
     rows = [
         (classes[s.label], s.start // FRAME_NANOSECONDS, s.end // FRAME_NANOSECONDS)

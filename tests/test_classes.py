@@ -25,7 +25,7 @@ from hearthlog.models.classes import (
     translation,
 )
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import MOST_CLASSES
+from hearthlog.models.classifiers.model import MOST_CLASSES
 from hearthlog.models.modelfile.modelfile import load_model
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"

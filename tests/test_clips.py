@@ -27,12 +27,12 @@ from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classifiers.description import Description
-from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
+from hearthlog.models.classifiers.model import Description
+from hearthlog.models.features.auros21 import WINDOW_FRAMES
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.registry import insist
 from hearthlog.recorder.clips.clip_choice import ClipFinder, KeptSound
 from hearthlog.recorder.clips.clip_layer import ClipWriter
 from hearthlog.recorder.clips.clip_retention import ClipRetention

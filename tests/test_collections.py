@@ -22,8 +22,7 @@ from hearthlog.analyzer.collections.spans import labelled_parts
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.main import make_app
 

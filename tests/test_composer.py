@@ -16,10 +16,10 @@ import pytest
 import soundfile
 from mcap.reader import make_reader
 
+from hearthlog.models.classifiers.model import may_be_shipped
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.licences import may_be_shipped
 from hearthlog.models.starter import starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record_files
@@ -27,13 +27,10 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary, frame_powers
-from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.plan import Plan, PlannedSound, SteadyNoise
-from hearthlog.tools.home.record import record_composition, write_sound
-from hearthlog.tools.home.rooms import PERIOD_FRAMES, Rooms
-from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
-from hearthlog.tools.home.short_day import plan_short_day
-from hearthlog.tools.home.truth import truth_of
+from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, Rooms
+from hearthlog.tools.home.plan import HomePlan, PlannedNoise, PlannedSound
+from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days, plan_short_day
+from hearthlog.tools.home.simulate import record_composition, truth_of, write_sound
 
 HOUR = DAY_FRAMES // 24
 START = 1_772_323_200_000_000_000
@@ -66,7 +63,7 @@ def part(plan, first, frames):
         if first <= sound.start and sound.end <= first + frames
     ]
     steady = [replace(one, start=one.start - first, end=one.end - first) for one in plan.steady]
-    return Plan(frames, sounds, steady)
+    return HomePlan(frames, sounds, steady)
 
 
 def full_scale(samples):
@@ -160,7 +157,7 @@ def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, heard):
         PlannedSound(100, 400, speech, "television", "living_room", -35.0, "television"),
         PlannedSound(200, 20, cough, "resident", "living_room", level, "day"),
     ]
-    truth = truth_of(Composition(Plan(600, sounds, ()), library, rooms))
+    truth = truth_of(Composition(HomePlan(600, sounds, ()), library, rooms))
     here = {name for start, end, name in truth.spans if start < 220 / 20 and end > 200 / 20}
     assert ("coughing" in here) is heard
     assert {name for *_, name in truth.spans} >= {"speech", "silence"}
@@ -174,7 +171,7 @@ def test_what_is_not_heard_through_a_wall_is_silence(library):
     for room, heard in (("bathroom", True), ("living_room", False)):
         rooms = Rooms(room, seed=0)
         rooms.floor *= 1e-2 ** (room == "bathroom")
-        truth = truth_of(Composition(Plan(200, [sound], ()), library, rooms))
+        truth = truth_of(Composition(HomePlan(200, [sound], ()), library, rooms))
         assert bool(truth.events[0].heard_frames) is heard
         assert (len(truth.spans) > 1) is heard
 
@@ -201,8 +198,8 @@ def test_features_without_most_of_the_sound_are_those_of_the_sound(evening, feat
 
 
 def test_steady_noise_repeats_itself_and_its_features_do_too(library, rooms):
-    steady = [SteadyNoise("fridge", 500, 3 * PERIOD_FRAMES + 100)]
-    quiet = Composition(Plan(4 * PERIOD_FRAMES, (), steady), library, rooms)
+    steady = [PlannedNoise("fridge", 500, 3 * PERIOD_FRAMES + 100)]
+    quiet = Composition(HomePlan(4 * PERIOD_FRAMES, (), steady), library, rooms)
     values = quiet.features(DEFAULT)(0, quiet.plan.frames)
     on = values[PERIOD_FRAMES : 2 * PERIOD_FRAMES]
     assert np.array_equal(on, values[2 * PERIOD_FRAMES : 3 * PERIOD_FRAMES])

@@ -25,7 +25,7 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.review.timeline.live import LiveTimeline
 from hearthlog.analyzer.review.timeline.plots import DIRECTION, Plot, timeline_plots
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings, load_settings
 from hearthlog.recorder.direction.channel_watch import ChannelWatch

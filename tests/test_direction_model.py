@@ -33,8 +33,7 @@ from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.analyzer.training.sightings import Sighting, evidence_of, with_directions
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import FORMAT_OF_DIRECTIONS
-from hearthlog.models.classifiers.directions import (
+from hearthlog.models.classifiers.evidence import (
     BLOCK_FRAMES,
     MEMORY_BLOCKS,
     SECTORS,
@@ -42,11 +41,11 @@ from hearthlog.models.classifiers.directions import (
     Directions,
     sectors_of,
 )
+from hearthlog.models.classifiers.model import FORMAT_OF_DIRECTIONS
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.floor import Floors, FloorTracker
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.events import Gap

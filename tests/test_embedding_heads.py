@@ -9,20 +9,19 @@ import pytest
 from safetensors.numpy import load
 
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import (
+from hearthlog.models.classifiers.evidence import (
+    UNTAUGHT,
+    EmbeddingHeads,
+    mix_weight,
+)
+from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_EMBEDDINGS,
     EmbeddingMix,
     NamesHead,
 )
-from hearthlog.models.classifiers.embedding_heads import (
-    UNTAUGHT,
-    EmbeddingHeads,
-    mix_weight,
-)
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import read_sealed, write_sealed
 

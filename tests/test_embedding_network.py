@@ -14,18 +14,18 @@ from networks import model
 from onnx import helper
 
 from hearthlog.models.embedding import session as sessions
-from hearthlog.models.embedding.embeddings import WINDOW_FRAMES
 from hearthlog.models.embedding.networks import (
     NETWORKS,
+    NOISE,
     YAMNET,
     Embedder,
     EmbeddingNetwork,
     KnownAnswer,
     NetworkFile,
     find_network,
+    synthetic_sounds,
 )
-from hearthlog.models.embedding.projection import Projection, write_projection
-from hearthlog.models.embedding.sounds import NOISE, synthetic_sounds
+from hearthlog.models.embedding.projection import WINDOW_FRAMES, Projection, write_projection
 from hearthlog.models.errors import ModelError
 from hearthlog.recorder import embedder_probe
 from hearthlog.recorder.embedder_probe import Probe, open_embedder, probe_network

@@ -41,8 +41,8 @@ from hearthlog.analyzer.training.mixture import (
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.training.train import group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import FORMAT, FORMAT_OF_EMBEDDINGS
-from hearthlog.models.classifiers.embedding_heads import UNTAUGHT, EmbeddingHeads
+from hearthlog.models.classifiers.evidence import UNTAUGHT, EmbeddingHeads
+from hearthlog.models.classifiers.model import FORMAT, FORMAT_OF_EMBEDDINGS
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.window_inputs import of_segments

@@ -11,13 +11,11 @@ import pytest
 from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
-from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
-from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
+from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary, EmbeddingEvidence
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
-from hearthlog.models.embedding.steady_noise import SteadyNoise
-from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.models.embedding.projection import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding.stream import EmbeddingStream, SteadyNoise
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file, with_network

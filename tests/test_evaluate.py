@@ -38,7 +38,7 @@ from hearthlog.analyzer.training.scores import (
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.transitions import default_transitions
-from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.scores import print_scores

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pyAudioAnalysis import ShortTermFeatures
 from scipy.fftpack import fft
 
-from hearthlog.models.features.auros21.extractor import FeatureExtractor, mel_bank
-from hearthlog.models.features.auros21.names import FEATURE_NAMES, MFCC_COUNT
+from hearthlog.models.features.auros21 import FEATURE_NAMES, MFCC_COUNT, FeatureExtractor, mel_bank
 from hearthlog.schemas.frames import FRAME_SAMPLES
 
 pytestmark = pytest.mark.fast

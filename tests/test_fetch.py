@@ -13,9 +13,9 @@ from fileserver import file_server
 from typer.testing import CliRunner
 
 from hearthlog.models.embedding.networks import NETWORKS, YAMNET, NetworkFile, find_network
+from hearthlog.tools import download as downloads
 from hearthlog.tools.cli.main import make_app
-from hearthlog.tools.download import download as downloads
-from hearthlog.tools.download.download import DownloadError, download
+from hearthlog.tools.download import DownloadError, download
 
 DATA = np.random.default_rng(5).bytes(300_000)
 SHA256 = hashlib.sha256(DATA).hexdigest()

@@ -43,16 +43,18 @@ from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list
 from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
-from hearthlog.models.classifiers.description import Amount, Description
-from hearthlog.models.modelfile.judgement import (
+from hearthlog.models.classifiers.model import Amount, Description
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.registry import (
     Judgement,
     insist,
     judgement_path,
+    promote,
     read_judgement,
+    rollback,
+    target,
     write_judgement,
 )
-from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.modelfile.registry import promote, rollback, target
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import record

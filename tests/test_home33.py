@@ -6,8 +6,7 @@ import pytest
 
 from hearthlog.analyzer.training.learned_segments import segment_digests
 from hearthlog.models.features.auros21 import AUROS21
-from hearthlog.models.features.home33 import HOME33
-from hearthlog.models.features.home33.extractor import rounded
+from hearthlog.models.features.home33 import HOME33, rounded
 
 pytestmark = pytest.mark.fast
 

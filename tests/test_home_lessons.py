@@ -30,7 +30,7 @@ from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.analyzer.training.scenario import scenario_of
 from hearthlog.analyzer.training.unreviewed import unreviewed_sounds
-from hearthlog.models.classifiers.description import Description
+from hearthlog.models.classifiers.model import Description
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model

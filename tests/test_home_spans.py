@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.training.home_spans import merged_spans
-from hearthlog.models.classifiers.description import MOST_SPANS
+from hearthlog.models.classifiers.model import MOST_SPANS
 
 pytestmark = pytest.mark.fast
 SECOND = 10**9

@@ -14,7 +14,7 @@ from rewriting import Log
 from spliced import run
 
 from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.models.classifiers.description import Collection
+from hearthlog.models.classifiers.model import PublicCollection
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
@@ -106,7 +106,7 @@ def test_an_error_is_one_line():
 
 def test_the_card_of_a_model_does_not_steer_the_terminal(hearthlog, model_file, tmp_path):
     model = load_model(model_file)
-    source = Collection(name="\x9b31m", licence="\x9b2J", clips=1)
+    source = PublicCollection(name="\x9b31m", licence="\x9b2J", clips=1)
     data = model.description.training_data.model_copy(update={"collections": [source]})
     about = model.description.model_copy(update={"training_data": data})
     save_model(replace(model, description=about), tmp_path / "a.safetensors")

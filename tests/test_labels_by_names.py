@@ -17,16 +17,15 @@ from test_scenarios_at_once import keep, renamed, replace_file
 from hearthlog.analyzer.bridge.alerts.rules import MoreThan, unknown_class
 from hearthlog.analyzer.training.adapt import base_classes
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Embeddings
+from hearthlog.models.classifiers.evidence import Auxiliary
+from hearthlog.models.classifiers.names import AUDIOSET, without_classes
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import read_projection
+from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings, read_projection
 from hearthlog.models.embedding.sound_names import audioset_names, named_sounds
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.names_labeller import NamesLabeller
-from hearthlog.models.modelfile.audioset import AUDIOSET, without_classes
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import load, promote
 from hearthlog.models.starter import GENERAL, starter_file

@@ -16,13 +16,11 @@ from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.svm_method import SVM
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import read_description
-from hearthlog.models.classifiers.timing import LabelTiming, label_timing
+from hearthlog.models.classifiers.classifier import Classifier, LabelTiming, label_timing
+from hearthlog.models.classifiers.model import read_description
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.schemas.errors import ignore_progress
 
 pytestmark = pytest.mark.fast

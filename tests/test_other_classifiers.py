@@ -37,8 +37,7 @@ from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.learned_inputs import balanced, in_whole_steps, rounded
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.installed import classifier_kind
+from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.svm_rbf import weakest_pairs
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import load_model, save_model

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.timing import label_timing
+from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.events import Frames, Gap, SourceHealth

@@ -40,10 +40,9 @@ from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, read_time
 from hearthlog.schemas.logs.files import active_path, find_logs, is_layer
 from hearthlog.tools.home.clips import ClipLibrary
-from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.record import record_composition
-from hearthlog.tools.home.rooms import Rooms
-from hearthlog.tools.home.short_day import plan_short_day
+from hearthlog.tools.home.composition import Composition, Rooms
+from hearthlog.tools.home.routine import plan_short_day
+from hearthlog.tools.home.simulate import record_composition
 
 START = 1_772_323_200 * NANOSECONDS
 LENGTH = 24  # minutes

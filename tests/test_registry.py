@@ -14,14 +14,13 @@ from kept import keep_models, put_by_hand
 from spliced import run
 
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.judgement import read_judgement
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.models.modelfile.registry import (
     first_starter,
     list_models,
     load,
     promote,
+    read_judgement,
     rollback,
     target,
 )

@@ -36,7 +36,7 @@ from hearthlog.analyzer.relabel.layer import read_layer_metadata
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.analyzer.workers.workers import InlineWorkers
-from hearthlog.models.classifiers.timing import label_timing
+from hearthlog.models.classifiers.classifier import label_timing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

@@ -30,12 +30,10 @@ from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.analyzer.replay.replay import find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.timing import label_timing
-from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.models.classifiers.classifier import Classifier, label_timing
+from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.log.recovery import recover_active

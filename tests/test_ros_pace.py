@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "ros" / "hearthlog_ros"))
-from hearthlog_ros.pace import Pace
+from hearthlog_ros.pace import PublicationDelay
 
 pytestmark = pytest.mark.fast
 
@@ -20,7 +20,7 @@ def published(delay, lateness):
 
     `lateness` is how long after its last message each block comes.
     """
-    pace = Pace(delay * MS)
+    pace = PublicationDelay(delay * MS)
     delays, now = [], 0
     for block, late in enumerate(lateness):
         times = START + (600 * block + 50 * np.arange(12)) * MS
@@ -60,5 +60,5 @@ def test_a_delay_that_was_needed_once_is_given_back_without_a_burst():
 
 
 def test_a_log_of_another_clock_is_not_waited_for():
-    assert Pace(1200 * MS).wait(START, START + 86_400_000 * MS) == 0
-    assert Pace(1200 * MS).wait(START + 86_400_000 * MS, START) == 0
+    assert PublicationDelay(1200 * MS).wait(START, START + 86_400_000 * MS) == 0
+    assert PublicationDelay(1200 * MS).wait(START + 86_400_000 * MS, START) == 0

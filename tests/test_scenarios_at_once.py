@@ -41,8 +41,7 @@ from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import Description
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder import recording

@@ -11,8 +11,7 @@ from logs import features, read
 from systemd import PREFIX, PROGRAM, booted
 
 from hearthlog.analyzer.doctor import examine
-from hearthlog.tools.service.needs import STATE, Needs
-from hearthlog.tools.service.unit import bridge_unit, system_unit, user_unit
+from hearthlog.tools.service.unit import STATE, Needs, bridge_unit, system_unit, user_unit
 
 UNIT = "/etc/systemd/system/hearthlog.service"
 USER_ID = "4321"

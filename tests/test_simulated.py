@@ -9,9 +9,9 @@ from time import sleep
 
 import pytest
 
-from hearthlog.models.classifiers.description import SIMULATED, Amount, Collection
-from hearthlog.models.modelfile.judgement import insist
+from hearthlog.models.classifiers.model import SIMULATED, Amount, PublicCollection
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.registry import insist
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 
 LINE = (
@@ -90,7 +90,7 @@ def test_one_real_sound_makes_a_model_another(model_file, tmp_path, names, segme
     model = other(
         model_file,
         tmp_path / "other.safetensors",
-        collections=[Collection(name=name, licence="CC0", clips=1) for name in names],
+        collections=[PublicCollection(name=name, licence="CC0", clips=1) for name in names],
         home={"speech": Amount(sources=segments, segments=segments, seconds=1.0)},
     )
     assert model.description.training_data.simulated is simulated

@@ -21,11 +21,11 @@ from hearthlog.analyzer.training.transitions import (
     default_transitions,
 )
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.labels.segments import LabelledFrames, Segmenter
+from hearthlog.models.labels.segments import Segmenter, SegmenterInput
 from hearthlog.models.labels.smoothing import (
     ClassesApart,
     FixedLagSmoother,
@@ -188,7 +188,7 @@ def test_a_single_cough_survives_and_a_flicker_does_not():
     smoothing = Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
     segmenter = Segmenter(CLASSES, smoothing, default_transitions(CLASSES))
     stamps = np.arange(400) * FRAME_NANOSECONDS
-    frames = LabelledFrames(probabilities, np.zeros(400), stamps, stamps)
+    frames = SegmenterInput(probabilities, np.zeros(400), stamps, stamps)
     segments = segmenter.push(frames) + segmenter.close(400 * FRAME_NANOSECONDS)
     assert [CLASSES[segment.label] for segment in segments] == ["silence", "coughing", "silence"]
     _, cough, last = segments
@@ -203,7 +203,7 @@ def made_up_frames(seed, count):
     probabilities = made_up(seed, count)
     levels = np.random.default_rng(seed).uniform(-60, -20, count // 10).repeat(10)
     stamps = START + np.arange(count) * FRAME_NANOSECONDS
-    return LabelledFrames(probabilities, 10 ** (levels / 10), stamps, stamps)
+    return SegmenterInput(probabilities, 10 ** (levels / 10), stamps, stamps)
 
 
 SMOOTHINGS = [

@@ -13,12 +13,10 @@ from conftest import HEARTHLOG
 
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
-from hearthlog.models.classifiers.description import Collection
+from hearthlog.models.classifiers.model import PublicCollection, may_be_shipped
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import read_projection
-from hearthlog.models.licences import may_be_shipped
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card
 from hearthlog.models.starter import (
     BY_FEATURES,
     GENERAL,
@@ -103,7 +101,7 @@ def test_a_starter_has_learned_only_from_what_may_be_shipped(name):
 @pytest.mark.fast
 def test_a_card_names_the_licences_that_forbid_passing_the_model_on():
     model = load_model(Path("general"))
-    learned = [Collection(name="esc50", licence="CC BY-NC 3.0", clips=3)]
+    learned = [PublicCollection(name="esc50", licence="CC BY-NC 3.0", clips=3)]
     data = model.description.training_data.model_copy(update={"collections": learned})
     described = model.description.model_copy(update={"training_data": data})
     card = model_card(replace(model, description=described))

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
-from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
+from hearthlog.models.features.auros21 import WINDOW_FRAMES, FeatureExtractor
 from hearthlog.recorder.stream.statistics import RollingStatistics
 
 pytestmark = pytest.mark.fast

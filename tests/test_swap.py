@@ -22,14 +22,11 @@ from logreader import LogReader
 from logs import features, labelled_frames, read
 from spliced import run
 
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.timing import label_timing
+from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.judgement import insist
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import promote
+from hearthlog.models.modelfile.modelfile import load_model, model_card
+from hearthlog.models.modelfile.registry import insist, promote
 from hearthlog.models.starter import SHA256, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap

@@ -22,8 +22,7 @@ from hearthlog.analyzer.training.train import calibration_error, group_folds, tr
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model, model_card
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.train import print_figures, train
 from hearthlog.tools.home.simulate import write_training_set

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import OTHER, OTHER_NEGATIVE, UNKNOWN, find_class
-from hearthlog.models.classifiers.description import TEXT
+from hearthlog.models.classifiers.model import TEXT
 from hearthlog.schemas.errors import listed
 from hearthlog.schemas.files import read_toml
 

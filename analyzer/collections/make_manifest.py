@@ -17,7 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import disarmed
 from hearthlog.analyzer.training.manifest import OPTIONAL, REQUIRED, SIZE_LIMIT
 from hearthlog.models.classes import OTHER_NEGATIVE
-from hearthlog.models.classifiers.description import TEXT
+from hearthlog.models.classifiers.model import TEXT
 from hearthlog.schemas.errors import Progress
 from hearthlog.schemas.new_files import new_file
 

@@ -22,7 +22,7 @@ from hearthlog.analyzer.discover.groups import (
 )
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models.classes import CLASS_NAME
-from hearthlog.models.classifiers.description import MOST_VALUES
+from hearthlog.models.classifiers.model import MOST_VALUES
 from hearthlog.schemas.arrays import read_sealed, write_sealed
 from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.logs.files import log_readers

@@ -16,7 +16,7 @@ from hearthlog.analyzer.doctor.topic_types import (
     SEGMENT,
 )
 from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

@@ -16,9 +16,9 @@ from hearthlog.analyzer.doctor.topic_types import (
     SEGMENT,
     STATISTICS,
 )
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES
-from hearthlog.models.classifiers.timing import LabelTiming
-from hearthlog.models.embedding.embeddings import WINDOW_FRAMES
+from hearthlog.models.classifiers.classifier import LabelTiming
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
+from hearthlog.models.embedding.projection import WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 

@@ -29,11 +29,11 @@ from hearthlog.analyzer.doctor.topic_types import (
     split_topic,
     topic_type,
 )
-from hearthlog.models.classifiers.description import read_description
-from hearthlog.models.classifiers.timing import LabelTiming, label_timing
+from hearthlog.models.classifiers.classifier import LabelTiming, label_timing
+from hearthlog.models.classifiers.model import read_description
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.card import DESCRIPTION, attachment_of
+from hearthlog.models.modelfile.modelfile import DESCRIPTION, attachment_of
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS

@@ -23,7 +23,7 @@ from hearthlog.analyzer.doctor.topic_types import (
 )
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.modelfile.card import CARD, DESCRIPTION
+from hearthlog.models.modelfile.modelfile import CARD, DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.metadata import (

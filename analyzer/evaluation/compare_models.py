@@ -25,8 +25,8 @@ from hearthlog.analyzer.training.scores import (
 from hearthlog.analyzer.training.sightings import evidence_of
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.names import insist_taught
 from hearthlog.models.features.window_inputs import of_segments
-from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Bool, Float32, Float64
 
 

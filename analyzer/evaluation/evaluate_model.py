@@ -21,10 +21,11 @@ from hearthlog.analyzer.training.rooms import captured, steady_noise
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.evidence import Auxiliary
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.embeddings import (
+from hearthlog.models.classifiers.names import insist_taught
+from hearthlog.models.embedding.projection import (
     HOP_FRAMES,
     NO_EMBEDDINGS,
     WINDOW_FRAMES,
@@ -34,7 +35,6 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.models.modelfile.audioset import insist_taught
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.errors import Progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE

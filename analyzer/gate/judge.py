@@ -12,9 +12,15 @@ from hearthlog.analyzer.gate.rules import damages, is_worse, less_right
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.judgement import Judgement, read_judgement, write_judgement
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import CHAMPION, find_model, load
+from hearthlog.models.modelfile.registry import (
+    CHAMPION,
+    Judgement,
+    find_model,
+    load,
+    read_judgement,
+    write_judgement,
+)
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 
 _LONGEST = 400  # characters of a reason

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES, Directions
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, Directions
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 

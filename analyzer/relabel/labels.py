@@ -36,7 +36,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.labels.labeller import FrameLabels, label_columns, segment_columns
-from hearthlog.models.labels.segments import Run, Segment
+from hearthlog.models.labels.segments import Segment, StateRun
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogError, LogError
@@ -59,12 +59,12 @@ class LabelledSound(NamedTuple):
 
     microphone: str
     segments: list[Segment]
-    open_at_start: Run | None
-    open_at_end: Run | None
+    open_at_start: StateRun | None
+    open_at_end: StateRun | None
     lacks_start: bool
     frames: int  # that are labelled
 
-    def with_start(self, open_at_start: Run | None) -> "LabelledSound":
+    def with_start(self, open_at_start: StateRun | None) -> "LabelledSound":
         """Add the open segment with which the layer before ends, if it is still lacking.
 
         Parameters
@@ -292,7 +292,7 @@ class _Begun(NamedTuple):
 
     info: RecorderInfo
     labeller: StreamLabeller
-    open_at_start: Run | None
+    open_at_start: StateRun | None
     lacks_start: bool
 
 

@@ -9,13 +9,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.models.labels.segments import Run
+from hearthlog.models.labels.segments import StateRun
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.metadata import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import Topic, label_topics, relabelling
 
-OpenRuns = Mapping[str, Run]  # open segments, by the names of their microphones
+OpenRuns = Mapping[str, StateRun]  # open segments, by the names of their microphones
 _RUN = ("label", "start", "frames", "confidence")
 
 
@@ -129,4 +129,4 @@ def _read_runs(text: str, microphones: Collection[str]) -> OpenRuns:
     if set(fields) == set(_RUN):
         (microphone,) = microphones
         fields = {microphone: fields}
-    return {name: Run(*(int(run[key]) for key in _RUN)) for name, run in fields.items()}
+    return {name: StateRun(*(int(run[key]) for key in _RUN)) for name, run in fields.items()}

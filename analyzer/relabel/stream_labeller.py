@@ -5,7 +5,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import Floors, FloorTracker
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.labels.names_labeller import labeller_of
-from hearthlog.models.labels.segments import Run, Segment
+from hearthlog.models.labels.segments import Segment, StateRun
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import EmbeddingSource
@@ -65,7 +65,7 @@ class StreamLabeller:
         return self._labeller.takes_auxiliary
 
     @property
-    def open_run(self) -> Run | None:
+    def open_run(self) -> StateRun | None:
         """The segment that has not ended; None if there is none."""
         return self._labeller.segmenter.open_run
 

@@ -12,9 +12,9 @@ from hearthlog.analyzer.replay.options import Replay, ReplayOptions
 from hearthlog.analyzer.replay.recorded import Features, RecordedBatch
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.names import is_by_names, without_classes
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
-from hearthlog.models.modelfile.audioset import is_by_names, without_classes
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.labelling.clashes import clash, shared_classes
 from hearthlog.recorder.log.description import LogDescription

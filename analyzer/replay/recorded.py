@@ -10,9 +10,8 @@ from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, LARGEST_FRAME, 
 from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
-from hearthlog.models.classifiers.directions import NOWHERE, Directions
-from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, Embeddings
+from hearthlog.models.classifiers.evidence import NO_AUXILIARY, NOWHERE, Auxiliary, Directions
+from hearthlog.models.embedding.projection import NO_EMBEDDINGS, Embeddings
 from hearthlog.recorder.events import Gap, SourceHealth
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError

@@ -18,17 +18,17 @@ from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.sightings import with_directions
 from hearthlog.analyzer.training.transitions import default_transitions
-from hearthlog.models.classifiers.description import (
+from hearthlog.models.classifiers.evidence import EmbeddingHeads, mixed, sounds_of
+from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_EMBEDDINGS,
     MOST_WEIGHT,
     Amount,
     ClassMetrics,
     Description,
+    Model,
 )
-from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed, sounds_of
-from hearthlog.models.classifiers.model import Model
-from hearthlog.models.modelfile.audioset import insist_taught
+from hearthlog.models.classifiers.names import insist_taught
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.errors import ignore_progress
 

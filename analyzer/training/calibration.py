@@ -10,7 +10,7 @@ from hearthlog.analyzer.training.cross_validation import Fold, softmax
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.scores import calibration_error, score
 from hearthlog.models.classes import UNKNOWN
-from hearthlog.models.classifiers.description import Elsewhere
+from hearthlog.models.classifiers.model import Elsewhere
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 
 KNOWN_LOST = 0.05  # share of known segments that may be labelled `unknown`

@@ -13,9 +13,9 @@ import numpy as np
 
 from hearthlog.analyzer.training.rooms import other_room, steady_noise
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Int8
 from hearthlog.models.embedding.networks import find_network, load_embedder
-from hearthlog.models.embedding.steady_noise import SteadyNoise
+from hearthlog.models.embedding.projection import WINDOW_FRAMES, Int8
+from hearthlog.models.embedding.stream import SteadyNoise
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 from hearthlog.schemas.errors import HearthlogWarning

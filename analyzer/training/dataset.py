@@ -23,8 +23,8 @@ from hearthlog.analyzer.training.rooms import RoomCopy, in_room
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.sightings import Sighting
 from hearthlog.models.classes import SILENCE, class_name
-from hearthlog.models.classifiers.description import Amount
-from hearthlog.models.embedding.embeddings import Int8
+from hearthlog.models.classifiers.model import Amount
+from hearthlog.models.embedding.projection import Int8
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT

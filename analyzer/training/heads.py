@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from hearthlog.analyzer.training.calibration import inverse_temperature
 from hearthlog.analyzer.training.dataset import EmbeddingWindows
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.embedding_heads import UNIT, UNTAUGHT
+from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
 _ALPHA = 30.0  # of inputs of one standard deviation, whatever their number
@@ -31,7 +31,7 @@ class LinearHeads(NamedTuple):
     Attributes
     ----------
     weights : np.ndarray [shape=(H, W, C)], int32
-        In units of `hearthlog.models.classifiers.embedding_heads.UNIT`.
+        In units of `hearthlog.models.classifiers.evidence.UNIT`.
     bias : np.ndarray [shape=(H, C)], int32
     """
 

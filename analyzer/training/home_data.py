@@ -14,7 +14,7 @@ from hearthlog.analyzer.training.dataset import Recording, spread
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.sightings import sighting_of
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
 from hearthlog.models.features.installed import DEFAULT

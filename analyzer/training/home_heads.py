@@ -13,14 +13,13 @@ import numpy as np
 from hearthlog.analyzer.training.dataset import EmbeddingWindows
 from hearthlog.analyzer.training.heads import in_units, regressed
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
-from hearthlog.models.classifiers.embedding_heads import (
+from hearthlog.models.classifiers.evidence import (
     UNIT,
     UNTAUGHT,
     EmbeddingHeads,
     sounds_of,
 )
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.model import EmbeddingMix, Model, NamesHead
 from hearthlog.schemas.arrays import Bool, Float64, Int32
 
 _PULL = 10.0  # to zero, of weights of inputs of one standard deviation

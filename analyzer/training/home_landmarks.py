@@ -23,14 +23,13 @@ from hearthlog.analyzer.training.learned_inputs import balanced, kept_inputs
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.training.window_method import LearnedMachine
 from hearthlog.analyzer.workers.parallel import single_thread
-from hearthlog.models.classifiers.description import MOST_WEIGHT
-from hearthlog.models.classifiers.installed import classifier_kind
+from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.landmarks import (
     RBF_LANDMARKS,
     LandmarkParameters,
     LandmarksMachine,
 )
-from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.models.classifiers.model import MOST_WEIGHT, Array, Model
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 

@@ -34,8 +34,7 @@ from hearthlog.models.classes import (
     class_name,
     meant_by,
 )
-from hearthlog.models.classifiers.description import MOST_CLASSES
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.model import MOST_CLASSES, Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.messages.topics import EmbeddingSpace

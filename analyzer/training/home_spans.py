@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hearthlog.models.classifiers.description import MOST_SPANS
+from hearthlog.models.classifiers.model import MOST_SPANS
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.text_files import csv_records, read_text, without_disarming
 from hearthlog.models.classes import meant_by
-from hearthlog.models.classifiers.description import TEXT
+from hearthlog.models.classifiers.model import TEXT
 
 REQUIRED = ("path", "label", "source_group")
 OPTIONAL = ("source", "licence", "start", "end")

@@ -14,8 +14,8 @@ from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
-from hearthlog.models.classifiers.directions import NOWHERE, Directions
-from hearthlog.models.embedding.embeddings import NO_EMBEDDINGS, Embeddings
+from hearthlog.models.classifiers.evidence import NOWHERE, Directions
+from hearthlog.models.embedding.projection import NO_EMBEDDINGS, Embeddings
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64

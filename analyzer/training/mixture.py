@@ -13,8 +13,8 @@ from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.heads import FEWEST_SOURCES, LinearHeads, learn_heads
 from hearthlog.analyzer.training.scenario import BUILTIN
 from hearthlog.models.classes import FLUSHING_WATER, OTHER, SILENCE, UNKNOWN
-from hearthlog.models.classifiers.description import EmbeddingMix, NamesHead
-from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed, sounds_of
+from hearthlog.models.classifiers.evidence import EmbeddingHeads, mixed, sounds_of
+from hearthlog.models.classifiers.model import EmbeddingMix, NamesHead
 from hearthlog.models.embedding.networks import NETWORKS
 from hearthlog.models.embedding.projection import read_projection
 from hearthlog.schemas.arrays import Bool, Float64, Indices

@@ -7,8 +7,7 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models import classes as sound
 from hearthlog.models.classes import CLASS_NAME
-from hearthlog.models.classifiers.description import MOST_CLASSES, TEXT
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.model import MOST_CLASSES, TEXT, Model
 from hearthlog.schemas.files import read_toml
 
 _GENERAL = (

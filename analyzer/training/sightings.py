@@ -8,13 +8,13 @@ import numpy as np
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import (
+from hearthlog.models.classifiers.evidence import SECTORS, Directions, sectors_of
+from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_DIRECTIONS,
     MOST_ARRAYS,
+    Model,
 )
-from hearthlog.models.classifiers.directions import SECTORS, Directions, sectors_of
-from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64, Indices, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 

@@ -43,18 +43,18 @@ from hearthlog.analyzer.training.transitions import (
     default_transitions,
 )
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.models.classifiers.description import (
+from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_EMBEDDINGS,
     MOST_WEIGHT,
     ClassMetrics,
-    Collection,
     Description,
     Metrics,
+    Model,
+    PublicCollection,
     Smoothing,
     TrainingData,
 )
-from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.errors import Progress
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -288,7 +288,7 @@ def _training_data(data: Dataset) -> TrainingData:
         classes=data.amounts,
         home_spans=merged_spans(data.spans),
         collections=[
-            Collection(name=name, licence=licence, clips=clips)
+            PublicCollection(name=name, licence=licence, clips=clips)
             for (name, licence), clips in sorted(data.collections.items())
         ],
     )

@@ -1,16 +1,85 @@
-"""Probabilities of a model's classes, for any kind of classifier."""
+"""Probabilities and timing of a model's labels, for all installed kinds of classifier."""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from hearthlog.models.classes import UNKNOWN
-from hearthlog.models.classifiers.embedding_heads import EmbeddingHeads, mixed
-from hearthlog.models.classifiers.installed import classifier_kind
-from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import BY_NAMES, NamesParameters, names_parameters
-from hearthlog.models.classifiers.timing import label_timing
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.evidence import EmbeddingHeads, mixed
+from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
+from hearthlog.models.classifiers.model import Description, Model
+from hearthlog.models.classifiers.names import BY_NAMES, NAMES, NamesParameters, names_parameters
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.embedding.projection import DELAY_FRAMES
+from hearthlog.models.extensions import Extensions
+from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.messages.topics import EmbeddingSource
+
+
+class LabelTiming(NamedTuple):
+    """Which frames a label takes, and which it speaks of.
+
+    Attributes
+    ----------
+    label_frame : int
+        Frame of the window, from 0 on, which the label speaks of.
+    needs_floor : bool
+        Whether the floor of the room must be known at every frame of the window.
+    ahead : int
+        Frames behind the window that must be known, too: those of embeddings that begin in it.
+    """
+
+    window_frames: int
+    label_frame: int
+    needs_floor: bool
+    ahead: int = 0
+
+    @property
+    def delay(self) -> int:
+        """Frames from the one that a label speaks of to the one with which it is known."""
+        return self.window_frames - 1 - self.label_frame + self.ahead
+
+    def first_window_end(self, start: int) -> int:
+        """Return the frame with which the first label of a sound is known."""
+        if self.needs_floor:  # it is known with the last frame of the first whole block
+            start += -start % BLOCK_FRAMES + BLOCK_FRAMES - 1
+        return start + self.window_frames - 1 + self.ahead
+
+
+def label_timing(description: Description) -> LabelTiming:
+    """Return the timing of a model's labels.
+
+    Raise `ModelError` if its feature set is not installed.
+    """
+    if description.kind == BY_NAMES:  # of each frame, by the windows around it
+        parameters = NamesParameters.model_validate(description.parameters)
+        return LabelTiming(1, 0, needs_floor=False, ahead=parameters.ahead)
+    inputs = feature_set(description.feature_set).inputs[description.inputs]
+    needs_floor = description.gate > 0.0 or inputs.needs_floor
+    timing = LabelTiming(inputs.window_frames, description.label_frame, needs_floor)
+    if description.embedding is None:
+        return timing
+    return timing._replace(ahead=max(DELAY_FRAMES - timing.delay, 0))
+
+
+CLASSIFIERS = Extensions(
+    "hearthlog.classifiers",
+    ClassifierKind,  # type: ignore[type-abstract]
+    "classifier kind",
+    [RBF_LANDMARKS, SVM_RBF, NAMES],
+)
+
+
+def classifier_kind(name: str) -> ClassifierKind:
+    """Return a kind of classifier by its name.
+
+    Raise `ModelError` if there is none of this name, or it cannot be imported.
+    """
+    return CLASSIFIERS.get(name)
+
 
 _ROWS_AT_ONCE = 256
 _TINY = 1e-38

@@ -1,42 +1,97 @@
-"""Networks of sounds that are known: which files they are, and what they give."""
+"""Pretrained networks of sounds: files, folders, runtimes, and answers to synthetic sounds."""
 
 import hashlib
 import os
 import time
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.embeddings import Int8
-from hearthlog.models.embedding.folders import network_folders
-from hearthlog.models.embedding.projection import Projection, read_projection
-from hearthlog.models.embedding.runtimes import session_type
-from hearthlog.models.embedding.session import NetworkOutput
-from hearthlog.models.embedding.sounds import BURSTS, NOISE, SILENCE, TONE, synthetic_sounds
+from hearthlog.models.embedding.onnx_session import OnnxSession
+from hearthlog.models.embedding.projection import Int8, Projection, read_projection
+from hearthlog.models.embedding.session import NetworkOutput, NetworkSession, TfliteSession
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import HearthlogWarning, printable
 from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
-__all__ = [
-    "NETWORKS",
-    "YAMNET",
-    "Embedder",
-    "EmbeddingNetwork",
-    "KnownAnswer",
-    "NetworkFile",
-    "find_network",
-    "load_embedder",
-    "network_folders",
-    "read_network_file",
-]
+
+def network_folders() -> list[Path]:
+    """Return the folders of networks: `hearthlog/networks` of the folders of data.
+
+    Those are `$XDG_DATA_HOME` (`~/.local/share`) and `$XDG_DATA_DIRS` (`/usr/local/share` and
+    `/usr/share`), as in the XDG Base Directory Specification.
+    """
+    of_user = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")  # noqa: PTH111  that of Path raises where there is no home
+    of_all = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    folders = [Path(text) for text in [of_user, *of_all.split(":")]]
+    return [folder / "hearthlog" / "networks" for folder in folders if folder.is_absolute()]
+
+
+def folder_for_new() -> Path:
+    """Return the folder that a network is put into: that of the user, for root that of all users.
+
+    A service sees no home, and what root fetches is for it.
+    """
+    own, *of_all = network_folders()
+    return of_all[0] if of_all and os.geteuid() == 0 else own
+
+
+_TYPES: dict[str, Callable[[bytes, int, int, int], NetworkSession]] = {
+    ".tflite": TfliteSession,
+    ".onnx": OnnxSession,
+}
+_MODULES = {".tflite": ("ai_edge_litert",), ".onnx": ("onnx", "onnxruntime")}
+
+
+def session_type(suffix: str) -> Callable[[bytes, int, int, int], NetworkSession]:
+    """Return what makes a session of a file's bytes, window, width and number of names.
+
+    Raise `ModelError` if there is no runtime for it.
+    """
+    if suffix not in _TYPES:
+        raise ModelError(f"is no network that can be used: it ends in none of {', '.join(_TYPES)}")
+    return _TYPES[suffix]
+
+
+def missing_modules(suffix: str) -> list[str]:
+    """Return the modules for files of a suffix that are not installed, without importing any."""
+    return [module for module in _MODULES.get(suffix, ()) if find_spec(module) is None]
+
+
+SILENCE, TONE, NOISE, BURSTS = "silence", "tone", "noise", "bursts"
+_SEED = 20_261_126
+
+
+@lru_cache(maxsize=2)
+def synthetic_sounds(samples: int) -> dict[str, Float32]:
+    """Return silence, a tone of 1 kHz, steady noise and four bursts of noise a second, by name.
+
+    Parameters
+    ----------
+    samples : int
+        So many at 16 kHz, from -1 to 1.
+    """
+    seconds = np.arange(samples) / SAMPLE_RATE
+    noise = 2.0 * np.random.default_rng(_SEED).random(samples) - 1.0
+    sounds = {
+        SILENCE: np.zeros(samples),
+        TONE: 0.3 * np.sin(2.0 * np.pi * 1000.0 * seconds),
+        NOISE: 0.1 * noise,
+        BURSTS: 0.5 * noise * np.exp(-(seconds % 0.25) / 0.02),
+    }
+    return {name: sound.astype(np.float32) for name, sound in sounds.items()}
+
 
 ANSWER_TOLERANCE = 1.5  # logits; conversions differ by a few tenths, other networks by many
 _PATIENCE_SECONDS = 5.0

@@ -1,26 +1,110 @@
-"""The projection of a network's output onto the integers that are logged.
-
-They are components of the embedding, whitened, and the highest logit of each group of names. A
-projection is fixed once for a network, as logs and models depend on it.
-"""
+"""Embeddings of windows, and their projection onto the integers that are logged."""
 
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import safetensors
 from numpy.typing import NDArray
 
-from hearthlog.models.embedding.embeddings import Int8
 from hearthlog.models.embedding.session import NetworkOutput
 from hearthlog.models.errors import ModelError
-from hearthlog.schemas.arrays import Float32, Float64, Indices, read_sealed, write_sealed
+from hearthlog.schemas.arrays import (
+    Bool,
+    Float32,
+    Float64,
+    Indices,
+    Int64,
+    read_sealed,
+    write_sealed,
+)
 from hearthlog.schemas.files import read_whole
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSpans:
+    """Spans of equal length, with a row for each in every field.
+
+    Attributes
+    ----------
+    frames : np.ndarray [shape=(m,)], int64
+        Number of the first frame of each; increasing.
+    stamps : np.ndarray [shape=(m,)], int64
+        Starts of these frames in nanoseconds of UTC.
+    """
+
+    LENGTH: ClassVar[int]  # frames
+
+    frames: Int64
+    stamps: Int64
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def last_frames(self) -> Int64:
+        """Numbers of the frames with which they are known."""
+        return self.frames + (self.LENGTH - 1)
+
+    def rows(self, chosen: slice | Indices | Bool) -> Self:
+        """Return some of them."""
+        return type(self)(*(getattr(self, each.name)[chosen] for each in fields(self)))
+
+    def known_at(self, first: int, count: int) -> Self:
+        """Return those that become known with some successive frames."""
+        begin, end = np.searchsorted(self.last_frames, [first, first + count])
+        return self.rows(slice(begin, end))
+
+    def begun_in(self, start: int, end: int) -> Self:
+        """Return those that begin in a span of time.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC: from `start` on, before `end`.
+        """
+        return self.rows(slice(*np.searchsorted(self.stamps, [start, end])))
+
+    def followed_by(self, later: Self) -> Self:
+        """Join these with those that follow; those of none take any width."""
+        if not len(self):
+            return later
+        if not len(later):
+            return self
+        names = [each.name for each in fields(self)]
+        pairs = ((getattr(self, name), getattr(later, name)) for name in names)
+        return type(self)(*map(np.concatenate, pairs))
+
+
+WINDOW_FRAMES = 20  # of a window: a second, in whose middle the network's input lies
+HOP_FRAMES = 10  # from one window to the next; windows begin at multiples of it
+DELAY_FRAMES = WINDOW_FRAMES - 1  # from a frame to the last one of the last window that says of it
+
+Int8 = NDArray[np.int8]
+
+
+@dataclass(frozen=True, eq=False)
+class Embeddings(FrameSpans):
+    """Embeddings of windows in which there was sound; windows begin at multiples of ten frames.
+
+    Attributes
+    ----------
+    values : np.ndarray [shape=(m, W)], int8
+        As `Projection.quantise` gives them.
+    """
+
+    LENGTH = WINDOW_FRAMES
+
+    values: Int8
+
+
+NO_EMBEDDINGS = Embeddings(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 0), np.int8))
+
 
 _KEY = "projection"
 _SIZE_LIMIT = 16 << 20

@@ -35,7 +35,7 @@ class NetworkOutput(NamedTuple):
     logits: Float32
 
 
-class Session(Protocol):
+class NetworkSession(Protocol):
     """A network in memory."""
 
     def __call__(self, window: Float32) -> NetworkOutput:
@@ -49,7 +49,7 @@ class Session(Protocol):
 
 
 class TfliteSession:
-    """A network of a TFLite file, as `Session`.
+    """A network of a TFLite file, as `NetworkSession`.
 
     Its embedding and logits need not be among its outputs.
 

@@ -1,9 +1,4 @@
-"""What AudioSet has names for: sounds that are named by the network alone, without training.
-
-A name is an *event* only where a threshold was measured on recordings; others are *hints*, said
-too often to be counted. `audioset_names.csv` has names, words and durations, and what
-`hearthlog.tools.lab.names` measured.
-"""
+"""Names of AudioSet: events, hints, and groups that are logged with an embedding."""
 
 import csv
 import math
@@ -14,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Embeddings
-from hearthlog.models.embedding.projection import Projection
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Embeddings, Projection
 from hearthlog.schemas.arrays import Float64, Int64
 
 _FILE = Path(__file__).with_name("audioset_names.csv")
@@ -26,6 +20,8 @@ _MARGIN = (WINDOW_FRAMES - HOP_FRAMES) // 2  # frames of a window before and beh
 
 class SoundName(NamedTuple):
     """A name of a sound, and how well it is heard.
+
+    The table `audioset_names.csv` has them, as `hearthlog.tools.lab.names` measured them.
 
     Attributes
     ----------
@@ -158,3 +154,194 @@ def _text(value: object) -> str:
 
 
 _VALUES: Mapping[object, Callable[[str], Any]] = {str: str, float: float, int: int, bool: _yes}
+
+
+# The first are for the classes of the scenarios; "outside" is what is none of those of a home.
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "silence": ("Silence",),
+    "speech": (
+        "Speech",
+        "Child speech, kid speaking",
+        "Conversation",
+        "Narration, monologue",
+        "Speech synthesizer",
+    ),
+    "music": ("Music", "Musical instrument", "Singing"),
+    "phone_ring": (
+        "Telephone",
+        "Telephone bell ringing",
+        "Ringtone",
+        "Telephone dialing, DTMF",
+        "Dial tone",
+    ),
+    "coughing": ("Cough", "Throat clearing"),
+    "crying": ("Crying, sobbing", "Baby cry, infant cry", "Whimper", "Wail, moan"),
+    "yelling": ("Shout", "Yell", "Screaming", "Children shouting", "Bellow", "Whoop"),
+    "laughing": (
+        "Laughter",
+        "Baby laughter",
+        "Giggle",
+        "Chuckle, chortle",
+        "Belly laugh",
+        "Snicker",
+    ),
+    "objects_activity": (
+        "Door",
+        "Slam",
+        "Knock",
+        "Cupboard open or close",
+        "Drawer open or close",
+        "Dishes, pots, and pans",
+        "Cutlery, silverware",
+        "Chopping (food)",
+        "Frying (food)",
+        "Microwave oven",
+        "Blender",
+        "Keys jangling",
+        "Typing",
+        "Writing",
+        "Chewing, mastication",
+        "Computer keyboard",
+        "Tick",
+        "Clock",
+        "Tick-tock",
+        "Walk, footsteps",
+        "Zipper (clothing)",
+        "Crumpling, crinkling",
+        "Vacuum cleaner",
+        "Rustle",
+        "Wood",
+        "Coin (dropping)",
+    ),
+    "flushing_water": ("Toilet flush",),
+    "shower": ("Bathtub (filling or washing)", "Spray", "Rain", "Water"),
+    "tap_water": (
+        "Water tap, faucet",
+        "Sink (filling or washing)",
+        "Liquid",
+        "Pour",
+        "Fill (with liquid)",
+        "Trickle, dribble",
+    ),
+    "outside": (
+        "Animal",
+        "Dog",
+        "Bark",
+        "Cat",
+        "Meow",
+        "Chicken, rooster",
+        "Bird",
+        "Vehicle",
+        "Car",
+        "Vehicle horn, car horn, honking",
+        "Siren",
+        "Helicopter",
+        "Aircraft",
+        "Chainsaw",
+        "Engine",
+        "Rain",
+        "Thunder",
+        "Wind",
+        "Ocean",
+        "Waves, surf",
+        "Fire",
+        "Crackle",
+        "Sneeze",
+        "Snoring",
+        "Alarm",
+        "Doorbell",
+        "Smoke detector, smoke alarm",
+        "Fire alarm",
+        "Throat clearing",
+        "Crowing, cock-a-doodle-doo",
+        "Water",
+        "Train",
+        "Fireworks",
+        "Gunshot, gunfire",
+    ),
+    # What the names say by themselves.
+    "conversation": ("Conversation",),
+    "shout": ("Shout", "Yell", "Bellow", "Whoop"),
+    "scream": ("Screaming",),
+    "baby_cry": ("Baby cry, infant cry",),
+    "sobbing": ("Crying, sobbing", "Whimper", "Wail, moan"),
+    "groan": ("Groan", "Grunt", "Sigh"),
+    "breathing": ("Breathing", "Wheeze", "Gasp", "Pant"),
+    "snoring": ("Snoring", "Snort"),
+    "cough": ("Cough",),
+    "throat_clearing": ("Throat clearing",),
+    "sneeze": ("Sneeze",),
+    "sniff": ("Sniff",),
+    "burp": ("Burping, eructation", "Hiccup"),
+    "whistling": ("Whistling", "Whistle"),
+    "chuckle": ("Chuckle, chortle", "Snicker"),
+    "singing": ("Singing", "Humming", "Choir"),
+    "clapping": ("Clapping", "Applause", "Finger snapping"),
+    "crowd": ("Crowd", "Chatter", "Hubbub, speech noise, speech babble", "Cheering"),
+    "footsteps": ("Walk, footsteps",),
+    "thump": ("Thump, thud", "Thunk", "Bang"),
+    "eating": ("Chewing, mastication", "Biting", "Crunch"),
+    "dishes": ("Dishes, pots, and pans", "Cutlery, silverware"),
+    "chopping": ("Chopping (food)", "Chop"),
+    "frying": ("Frying (food)", "Sizzle"),
+    "boiling": ("Boiling", "Steam"),
+    "microwave": ("Microwave oven",),
+    "blender": ("Blender",),
+    "vacuum_cleaner": ("Vacuum cleaner",),
+    "hair_dryer": ("Hair dryer",),
+    "shaver": ("Electric shaver, electric razor", "Electric toothbrush"),
+    "toothbrush": ("Toothbrush",),
+    "sewing_machine": ("Sewing machine",),
+    "power_tool": ("Power tool", "Drill", "Jackhammer", "Sawing"),
+    "hammer": ("Hammer",),
+    "fan": ("Mechanical fan", "Air conditioning"),
+    "printer": ("Printer",),
+    "keyboard": ("Computer keyboard", "Typing"),
+    "writing": ("Writing",),
+    "paper": ("Crumpling, crinkling", "Tearing"),
+    "zipper": ("Zipper (clothing)",),
+    "door": ("Door", "Slam", "Sliding door", "Creak"),
+    "slam": ("Slam",),
+    "knock": ("Knock",),
+    "doorbell": ("Doorbell", "Ding-dong"),
+    "bell": ("Bell", "Ding", "Chime", "Bicycle bell"),
+    "cupboard": ("Cupboard open or close", "Drawer open or close"),
+    "keys": ("Keys jangling", "Jingle, tinkle"),
+    "glass": ("Glass", "Chink, clink"),
+    "breaking": ("Shatter", "Breaking", "Smash, crash"),
+    "clock": ("Clock", "Tick", "Tick-tock"),
+    "alarm_clock": ("Alarm clock",),
+    "smoke_alarm": ("Smoke detector, smoke alarm", "Fire alarm"),
+    "alarm": ("Alarm",),
+    # Without "Siren", which telephones and screams are called, too.
+    "siren": (
+        "Police car (siren)",
+        "Ambulance (siren)",
+        "Emergency vehicle",
+        "Fire engine, fire truck (siren)",
+    ),
+    "civil_defense_siren": ("Civil defense siren",),
+    "beep": ("Beep, bleep", "Buzzer", "Busy signal"),
+    "television": ("Television",),
+    "radio": ("Radio",),
+    "dog": ("Dog", "Bark", "Bow-wow", "Yip", "Growling", "Howl"),
+    "cat": ("Cat", "Meow", "Purr", "Caterwaul"),
+    "bird": ("Bird", "Bird vocalization, bird call, bird song", "Chirp, tweet"),
+    "rooster": ("Crowing, cock-a-doodle-doo", "Chicken, rooster"),
+    "insect": ("Insect", "Cricket", "Fly, housefly"),
+    "rain": ("Rain", "Raindrop", "Rain on surface"),
+    "thunder": ("Thunder", "Thunderstorm"),
+    "wind": ("Wind", "Wind noise (microphone)"),
+    "waves": ("Ocean", "Waves, surf"),
+    "stream": ("Stream", "Waterfall"),
+    "drip": ("Drip",),
+    "sink": ("Water tap, faucet", "Sink (filling or washing)"),
+    "spray": ("Spray", "Gush"),
+    "fire": ("Fire", "Crackle"),
+    "vehicle": ("Vehicle", "Car", "Traffic noise, roadway noise", "Truck", "Motorcycle"),
+    "car_horn": ("Vehicle horn, car horn, honking", "Car alarm"),
+    "train": ("Train", "Rail transport"),
+    "aircraft": ("Aircraft", "Helicopter", "Fixed-wing aircraft, airplane"),
+    "chainsaw": ("Chainsaw", "Lawn mower"),
+    "fireworks": ("Fireworks", "Gunshot, gunfire", "Explosion"),
+}

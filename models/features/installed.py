@@ -1,5 +1,6 @@
 """The feature sets that are installed."""
 
+from hearthlog.models.embedding.networks import network_folders
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.auros21 import AUROS21
@@ -9,7 +10,6 @@ from hearthlog.models.features.network import (
     card_names,
     has_card,
     network_features,
-    network_folders,
 )
 from hearthlog.schemas.logs.metadata import feature_entries
 

@@ -8,13 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.directions import DirectionEvidence
-from hearthlog.models.classifiers.embedding_evidence import EmbeddingEvidence
-from hearthlog.models.embedding.embeddings import Int8
+from hearthlog.models.classifiers.evidence import (
+    NO_AUXILIARY,
+    Auxiliary,
+    DirectionEvidence,
+    EmbeddingEvidence,
+)
+from hearthlog.models.embedding.projection import Int8
 from hearthlog.models.features.floor import Floors, is_quiet
-from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
+from hearthlog.models.labels.segments import Segment, Segmenter, SegmenterInput
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.messages.topics import EmbeddingSource
@@ -125,7 +128,7 @@ class Labeller:
             self._embedded = EmbeddingEvidence(heads, len(self.classes))
             self._named = EmbeddingEvidence(logits, len(self.classes))
         self._window_evidence = [one for one in (self._embedded, self._named) if one is not None]
-        self._pending: LabelledFrames | None = None  # that embeddings to come say something of
+        self._pending: SegmenterInput | None = None  # that embeddings to come say something of
         self._pending_evidence: Float64 | None = None  # of directions, for them
         self._inputs_converged = (
             not self.timing.needs_floor and self._evidence is None and self._embedded is None
@@ -225,7 +228,7 @@ class Labeller:
         room = None if floors is None else floors.room
         probabilities, novelty = self._classify(window, count, room, None if ahead else evidence)
         spoken = self.timing.label_frame
-        by_features = LabelledFrames(
+        by_features = SegmenterInput(
             probabilities,
             window.powers[spoken:][:count],
             window.stamps[spoken:][:count],
@@ -288,8 +291,8 @@ class Labeller:
             self.segmenter.forget()
 
     def _complete(
-        self, frames: LabelledFrames, evidence: Float64 | None
-    ) -> tuple[LabelledFrames, Float64 | None]:
+        self, frames: SegmenterInput, evidence: Float64 | None
+    ) -> tuple[SegmenterInput, Float64 | None]:
         """Add frames labelled by their features; return those whose embeddings are all known."""
         ahead = self.timing.ahead
         pending = frames if self._pending is None else self._pending.followed_by(frames)
@@ -303,8 +306,8 @@ class Labeller:
         return complete, evidence
 
     def _mixed(
-        self, frames: LabelledFrames, first: int, evidence: Float64 | None
-    ) -> tuple[LabelledFrames, Float32]:
+        self, frames: SegmenterInput, first: int, evidence: Float64 | None
+    ) -> tuple[SegmenterInput, Float32]:
         """Let embeddings say what the sound of frames is; return also its novelty."""
         count = len(frames.stamps)
         by_heads = np.full((count, len(self.classes)), np.nan)

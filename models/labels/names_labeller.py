@@ -9,13 +9,13 @@ delay and one name for each frame.
 import numpy as np
 
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.names import MARGIN_FRAMES
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Embeddings
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import FrameLabels, Labeller
-from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
+from hearthlog.models.labels.segments import Segment, Segmenter, SegmenterInput
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
@@ -106,7 +106,7 @@ class NamesLabeller:
         known = np.append(self._stamps, stamps)
         count = max(len(known) - self.timing.ahead, 0)
         frames = np.arange(end - len(known), end - len(known) + count)
-        labelled = LabelledFrames(
+        labelled = SegmenterInput(
             self._probabilities(frames, window, named),
             np.zeros(count),
             known[:count],
@@ -140,7 +140,7 @@ class NamesLabeller:
             frames = np.arange(self._end - count, self._end)
             window = self._window - len(self._named)
             nothing = np.zeros((1, len(self._labels)), bool)  # said by a window that is not whole
-            labelled = LabelledFrames(
+            labelled = SegmenterInput(
                 self._probabilities(frames, window, np.concatenate([self._named, nothing])),
                 np.zeros(count),
                 self._stamps,
@@ -210,7 +210,7 @@ class NamesLabeller:
         result[:, self._silence] = 1.0 - sure
         return result
 
-    def _segments(self, labelled: LabelledFrames, first: int) -> list[Segment]:
+    def _segments(self, labelled: SegmenterInput, first: int) -> list[Segment]:
         """Return the segments whose end frames decide, of which the first has a number."""
         segments: list[Segment] = []
         if self._converged not in {None, _DONE}:

@@ -1,8 +1,4 @@
-"""Segments from the probabilities of classes: successive frames of one state, merged.
-
-The state of a frame is the likeliest class, which is the paper's first way (section 4), or that of
-the likeliest path through a hidden Markov model, which is decided some frames later.
-"""
+"""Segments from the probabilities of classes: runs of one state, with refined borders."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,16 +7,131 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.description import Smoothing
-from hearthlog.models.labels.borders import Borders
+from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.labels.smoothing import ClassesApart, FixedLagSmoother
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
+_QUIETEST = 1e-9  # power, -90 dBFS
+_LEAST_STEP = 1e-6  # dB; below it are errors of rounding
+
+
+class Borders:
+    """Refines the states of one stream of frames, which come in pieces of any size.
+
+    A border of silence is moved to the frame, within `reach` frames, that divides the level best
+    into two constants, by least squares. After that a state of fewer than `shortest` frames gives
+    way to the state before it.
+
+    Parameters
+    ----------
+    reach, shortest : int
+        Numbers of frames; 0 and 1 leave all as it is.
+    """
+
+    def __init__(self, silence: int, reach: int, shortest: int) -> None:
+        self.delay = 2 * reach + shortest - 1
+        self._silence = silence
+        self._reach = reach
+        self._shortest = shortest
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next state does not follow the last one."""
+        self._states = np.empty(0, np.intp)
+        self._levels = np.empty(0)  # in dB, from the first of `_states` on
+        self._examined = 1  # changes before this place in `_states` have been moved
+        self._moved: list[tuple[int, int]] = []  # places of moved borders, and the states behind
+        self._before: int | None = None  # refined state at the first place
+        self._held = np.empty(0, np.intp)  # moved states that may be too short
+        self._last: int | None = None  # last state that was given away
+
+    def push(self, states: Indices, powers: Float64) -> Indices:
+        """Add successive states and powers.
+
+        Parameters
+        ----------
+        states : np.ndarray [shape=(n,)], intp
+        powers : np.ndarray [shape=(m,)], float64
+            Mean squares of successive frames; there are never more states than powers so far.
+
+        Returns
+        -------
+        np.ndarray [shape=(k,)], intp
+            Refined states, up to `delay` frames before the last state.
+        """
+        self._states = np.concatenate([self._states, states])
+        self._levels = np.concatenate([self._levels, 10.0 * np.log10(powers + _QUIETEST)])
+        end = len(self._states) - self._reach
+        moved = self._move(end, max(end - self._reach, 0))
+        return self._without_short(moved, self._shortest - 1)
+
+    def close(self) -> Indices:
+        """Return the refined states of the remaining frames, and begin anew."""
+        end = len(self._states)
+        states = self._without_short(self._move(end, end), 0)
+        self.restart()
+        return states
+
+    def _move(self, end: int, final: int) -> Indices:
+        """Move the borders before `end`, and take away the states before `final`."""
+        states = self._states
+        if not self._reach or not len(states):
+            self._states, self._levels = states[:0], self._levels[len(states) :]
+            return states
+        changes = np.flatnonzero(np.diff(states)) + 1
+        behind = np.append(changes[1:], len(states))
+        new = (changes >= self._examined) & (changes < end)
+        for change, limit in zip(changes[new].tolist(), behind[new].tolist(), strict=True):
+            self._moved.append((self._place(change, limit), int(states[change])))
+        before = int(states[0]) if self._before is None else self._before
+        passed = [(0, before), *(border for border in self._moved if border[0] < final)]
+        places, values = zip(*passed, strict=True)
+        self._moved = [(place - final, state) for place, state in self._moved if place >= final]
+        self._states, self._levels = states[final:], self._levels[final:]
+        self._examined, self._before = max(end, 1) - final, values[-1]
+        return np.repeat(np.array(values, np.intp), np.diff([*places, final]))
+
+    def _place(self, change: int, limit: int) -> int:
+        """Return the place of a border whose states change at a place, and next at `limit`."""
+        if self._silence not in self._states[change - 1 : change + 1]:
+            return change
+        last = self._moved[-1][0] if self._moved else -1
+        first, limit = max(change - self._reach, last + 1), min(change + self._reach, limit)
+        if limit - first < 3:
+            return change
+        sums = np.cumsum(self._levels[first:limit])
+        count = np.arange(1, len(sums))
+        rest = len(sums) - count
+        gain = (sums[-1] - sums[:-1]) / rest - sums[:-1] / count
+        gain *= np.sqrt(count * rest)
+        if self._states[change] == self._silence:
+            gain = -gain
+        return first + 1 + int(gain.argmax()) if gain.max() > _LEAST_STEP else change
+
+    def _without_short(self, states: Indices, held: int) -> Indices:
+        """Add moved states; return all but the last `held`, too short ones replaced."""
+        states = np.concatenate([self._held, states])
+        count = max(len(states) - held, 0)
+        refined, self._held = states[:count].copy(), states[count:]
+        if not count:
+            return refined
+        starts = np.flatnonzero(np.diff(states, prepend=-1))
+        ends = np.append(starts[1:], len(states))
+        for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+            if start >= count:
+                break
+            if end - start >= self._shortest or self._last is None:
+                self._last = int(states[start])
+            else:
+                refined[start:end] = self._last
+        return refined
+
+
 _UNITS = 1 << 30  # to 1: finer than what a float32 below 1 can tell
 
 
-class Run(NamedTuple):
+class StateRun(NamedTuple):
     """Successive frames of one state, of which more may follow.
 
     Attributes
@@ -37,7 +148,7 @@ class Run(NamedTuple):
     frames: int
     confidence: int
 
-    def prepend(self, earlier: "Run | None") -> "Run":
+    def prepend(self, earlier: "StateRun | None") -> "StateRun":
         """Join an earlier run to the start of this one.
 
         Parameters
@@ -63,7 +174,7 @@ class Segment(NamedTuple):
         sound ends, the end of the sound.
     """
 
-    run: Run
+    run: StateRun
     end: int
     decided_at: int
 
@@ -83,7 +194,7 @@ class Segment(NamedTuple):
         return self.run.confidence / self.run.frames / _UNITS
 
 
-class LabelledFrames(NamedTuple):
+class SegmenterInput(NamedTuple):
     """Successive frames with the probabilities of classes.
 
     Attributes
@@ -102,18 +213,18 @@ class LabelledFrames(NamedTuple):
     stamps: Int64
     known_at: Int64
 
-    def followed_by(self, later: "LabelledFrames") -> "LabelledFrames":
+    def followed_by(self, later: "SegmenterInput") -> "SegmenterInput":
         """Join these frames with those that follow."""
-        return LabelledFrames(
+        return SegmenterInput(
             np.concatenate([self.probabilities, later.probabilities]),
             np.concatenate([self.powers, later.powers]),
             np.concatenate([self.stamps, later.stamps]),
             np.concatenate([self.known_at, later.known_at]),
         )
 
-    def part(self, frames: slice) -> "LabelledFrames":
+    def part(self, frames: slice) -> "SegmenterInput":
         """Return some of the frames."""
-        return LabelledFrames(
+        return SegmenterInput(
             self.probabilities[frames],
             self.powers[frames],
             self.stamps[frames],
@@ -152,11 +263,11 @@ class Segmenter:
         self._forgetting = 2 * self._reach + shortest  # equal states, after which borders converge
         self._delay = lag + self._borders.delay
         self.segments_converged = False
-        self.open_run: Run | None = None
+        self.open_run: StateRun | None = None
         self._restart()
 
     def _restart(self) -> None:
-        self._undecided: LabelledFrames | None = None
+        self._undecided: SegmenterInput | None = None
         self._decided = 0  # number of frames whose states are decided
         self._states = 0  # number of states so far, before their borders are moved
         self._doubtful = 0  # number of frames that may depend on those before the first one
@@ -184,7 +295,7 @@ class Segmenter:
         if self._smoother is not None:
             self._smoother.forget()
 
-    def push(self, frames: LabelledFrames) -> list[Segment]:
+    def push(self, frames: SegmenterInput) -> list[Segment]:
         """Add successive frames and return the segments whose end they decide.
 
         Parameters
@@ -254,7 +365,7 @@ class Segmenter:
             self._converged_at = int(stamps[frame - self._decided])
         self._same = int(states[-1]), int(lengths[-1])
 
-    def _merge(self, states: Indices, frames: LabelledFrames, decided_at: Int64) -> list[Segment]:
+    def _merge(self, states: Indices, frames: SegmenterInput, decided_at: Int64) -> list[Segment]:
         """Add the states of successive frames, decided at these times, to the open run."""
         segments: list[Segment] = []
         starts = np.flatnonzero(np.diff(states, prepend=-1))
@@ -268,7 +379,7 @@ class Segmenter:
             np.add.reduceat(np.rint(confidences * _UNITS).astype(np.int64), starts),
         )
         rows = zip(*(column.tolist() for column in columns), strict=True)
-        for run, time in zip(map(Run._make, rows), decided_at[starts].tolist(), strict=True):
+        for run, time in zip(map(StateRun._make, rows), decided_at[starts].tolist(), strict=True):
             last = self.open_run
             if last is not None and last.label == run.label:
                 self.open_run = run.prepend(last)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.schemas.arrays import Float32, Float64, Int64

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.names import is_by_names, without_classes
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.audioset import is_by_names, without_classes
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.labelling.candidate_watch import CandidateWatch

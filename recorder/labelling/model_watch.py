@@ -15,13 +15,14 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.judgement import (
+from hearthlog.models.modelfile.modelfile import load_model, name_and_digest, starter_for
+from hearthlog.models.modelfile.registry import (
+    DEFAULT_MODEL,
+    is_starter,
     judgement_path,
     judgements_of,
     read_judgement,
 )
-from hearthlog.models.modelfile.modelfile import load_model, name_and_digest, starter_for
-from hearthlog.models.modelfile.registry import DEFAULT_MODEL, is_starter
 from hearthlog.models.starter import GENERAL, STARTERS
 from hearthlog.recorder.journal import say
 from hearthlog.recorder.memory import give_back

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES, NOWHERE, Directions
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, NOWHERE, Directions
 from hearthlog.recorder.direction.channel_watch import ChannelWatch
 from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.recorder.direction.srp_phat import DirectionFinder

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hearthlog.models.embedding.embeddings import WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.networks import Embedder
+from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import Floors, is_quiet

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hearthlog.models.classifiers.auxiliary import Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.evidence import Auxiliary
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of

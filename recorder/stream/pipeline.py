@@ -7,12 +7,17 @@ from operator import attrgetter
 
 import numpy as np
 
-from hearthlog.models.classifiers.auxiliary import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.directions import MEMORY_BLOCKS, NOWHERE, Directions
+from hearthlog.models.classifiers.evidence import (
+    MEMORY_BLOCKS,
+    NO_AUXILIARY,
+    NOWHERE,
+    Auxiliary,
+    Directions,
+)
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.embeddings import DELAY_FRAMES, NO_EMBEDDINGS
 from hearthlog.models.embedding.networks import Embedder
+from hearthlog.models.embedding.projection import DELAY_FRAMES, NO_EMBEDDINGS
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter

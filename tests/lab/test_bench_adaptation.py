@@ -9,11 +9,9 @@ from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
-from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.record import record_composition
-from hearthlog.tools.home.rooms import Rooms
-from hearthlog.tools.home.short_day import plan_short_day
-from hearthlog.tools.home.truth import truth_of
+from hearthlog.tools.home.composition import Composition, Rooms
+from hearthlog.tools.home.routine import plan_short_day
+from hearthlog.tools.home.simulate import record_composition, truth_of
 from hearthlog.tools.lab.adaptation import Outcome, adaptation, line_of, wrong_sounds
 from hearthlog.tools.lab.home.person import true_labelling
 

@@ -11,7 +11,7 @@ import typer
 
 if TYPE_CHECKING:
     from hearthlog.models.classifiers.model import Model
-    from hearthlog.tools.home.truth import LabelledSpan, Truth
+    from hearthlog.tools.home.simulate import LabelledSpan, Truth
 
 _START = "2026-03-01T00:00:00"
 _SEED = 1

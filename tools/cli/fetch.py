@@ -26,8 +26,7 @@ def fetch(
     the file is the one that is known, and tries it. Exit status 3: it is there, and cannot be used.
     """
     from hearthlog.models.embedding.networks import NETWORKS, network_folders
-    from hearthlog.tools.service.unit import NAME
-    from hearthlog.tools.service.units import SYSTEM_UNITS
+    from hearthlog.tools.service.unit import NAME, SYSTEM_UNITS
 
     if name is None:
         if source is not None:
@@ -45,11 +44,10 @@ def fetch(
 
 def _put(network: "EmbeddingNetwork") -> Path:
     """Download a network, unless it is there; return where it is."""
-    from hearthlog.models.embedding.folders import folder_for_new
-    from hearthlog.models.embedding.networks import read_network_file
+    from hearthlog.models.embedding.networks import folder_for_new, read_network_file
     from hearthlog.models.errors import ModelError
     from hearthlog.tools.cli.progress import share_done
-    from hearthlog.tools.download.download import DownloadError, download
+    from hearthlog.tools.download import DownloadError, download
 
     path = folder_for_new() / network.filename
     try:
@@ -72,9 +70,8 @@ def _put(network: "EmbeddingNetwork") -> Path:
 
 
 def _put_from(network: "EmbeddingNetwork", source: Path) -> Path:
-    from hearthlog.models.embedding.folders import folder_for_new
-    from hearthlog.models.embedding.networks import read_network_file
-    from hearthlog.tools.download.download import put
+    from hearthlog.models.embedding.networks import folder_for_new, read_network_file
+    from hearthlog.tools.download import put
 
     data, _ = read_network_file(network, source)
     path = folder_for_new() / network.filename
@@ -85,7 +82,7 @@ def _put_from(network: "EmbeddingNetwork", source: Path) -> Path:
 def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
     """Try a network as a recorder will; return what is wrong with it."""
     from hearthlog.analyzer.extras import missing
-    from hearthlog.models.embedding.runtimes import missing_modules
+    from hearthlog.models.embedding.networks import missing_modules
     from hearthlog.models.errors import ModelError
     from hearthlog.recorder.embedder_probe import check_pace, probe_network
 

@@ -59,7 +59,7 @@ def install_service(
 
 
 def _install_bridge(config: Path | None, account: str | None) -> None:
-    from hearthlog.tools.service.bridge import install_bridge
+    from hearthlog.tools.service.install import install_bridge
 
     if config is None:
         wrong_use("--bridge wants --config, with a table such as [bridge.mqtt]")

@@ -78,7 +78,7 @@ def show(
     as_json: Json = False,
 ) -> None:
     """Print a model's card: what it tells apart, how well, and what it learned from."""
-    from hearthlog.models.modelfile.card import model_card
+    from hearthlog.models.modelfile.modelfile import model_card
 
     model = _named(models_folder(folder), name)
     if as_json:
@@ -212,8 +212,7 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     """End with a line if a model was judged to do harm; judge it first if it was not."""
     from hearthlog.analyzer.gate.judge import judge, judged_against
     from hearthlog.models.errors import ModelError
-    from hearthlog.models.modelfile.judgement import insist
-    from hearthlog.models.modelfile.registry import first_starter, is_starter, load
+    from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
     from hearthlog.tools.cli.progress import share_done
 

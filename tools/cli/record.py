@@ -223,8 +223,7 @@ def with_model(settings: "Settings") -> "Settings":
 def _tell_of_network(settings: "Settings") -> None:
     """Say what a network would gain, and how to get it, where nobody has decided on one."""
     from hearthlog.analyzer.extras import remedy
-    from hearthlog.models.embedding.networks import YAMNET, find_network
-    from hearthlog.models.embedding.runtimes import missing_modules
+    from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
     from hearthlog.models.starter import BY_FEATURES
 

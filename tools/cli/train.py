@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.manifest import LeftOut
     from hearthlog.analyzer.training.method import Method
-    from hearthlog.models.classifiers.description import Amount
-    from hearthlog.models.classifiers.model import Model
+    from hearthlog.models.classifiers.model import Amount, Model
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
@@ -408,7 +407,7 @@ def _print(model: "Model", segments: "Dataset") -> None:
 def print_figures(model: "Model") -> None:
     """Print what a model was learned from, and how good it is on sources it has not heard."""
     from hearthlog.models.classes import UNKNOWN
-    from hearthlog.models.classifiers.installed import classifier_kind
+    from hearthlog.models.classifiers.classifier import classifier_kind
 
     description, metrics = model.description, model.description.metrics
     data = description.training_data

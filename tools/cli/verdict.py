@@ -12,7 +12,7 @@ from hearthlog.tools.cli.text import tell
 if TYPE_CHECKING:
     from hearthlog.analyzer.gate.evidence import Evidence, Right
     from hearthlog.analyzer.gate.judge import Verdict
-    from hearthlog.models.modelfile.judgement import Judgement
+    from hearthlog.models.modelfile.registry import Judgement
 
 _WHOLE_DAY = 0.95 * 24 * 60  # minutes
 

@@ -56,7 +56,7 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True)
-class Clip:
+class HomeClip:
     """One sound that a home is composed of.
 
     Attributes
@@ -94,14 +94,14 @@ class ClipLibrary:
 
     def __init__(self, manifest: Path | None = SHIPPED) -> None:
         recorded = [] if manifest is None else _recorded(manifest)
-        self._clips: dict[str, list[Clip]] = {}
+        self._clips: dict[str, list[HomeClip]] = {}
         for clip in recorded:
             self._clips.setdefault(clip.label, []).append(clip)
         self.made_up = [label for label in _MADE_UP_SECONDS if label not in self._clips]
         self._clips |= {label: _made_up(label) for label in self.made_up}
         self._decoded = ArrayCache(_CACHE_BYTES)
 
-    def of(self, label: str) -> Sequence[Clip]:
+    def of(self, label: str) -> Sequence[HomeClip]:
         """Return the clips of a label.
 
         Returns
@@ -111,7 +111,7 @@ class ClipLibrary:
         """
         return self._clips.get(label, [])
 
-    def of_groups(self, label: str, count: int, rng: np.random.Generator) -> Sequence[Clip]:
+    def of_groups(self, label: str, count: int, rng: np.random.Generator) -> Sequence[HomeClip]:
         """Return the clips of some source groups of a label, drawn at random.
 
         Parameters
@@ -123,7 +123,7 @@ class ClipLibrary:
         chosen = {groups[place] for place in rng.permutation(len(groups))[:count]}
         return [clip for clip in self.of(label) if clip.source_group in chosen]
 
-    def sound(self, clip: Clip, frames: int) -> Float32:
+    def sound(self, clip: HomeClip, frames: int) -> Float32:
         """Return a clip as loud as every other, cut or repeated to a length.
 
         Parameters
@@ -189,7 +189,7 @@ class _AnyLabel(Collection[str]):
         return 1
 
 
-def _recorded(manifest: Path) -> list[Clip]:
+def _recorded(manifest: Path) -> list[HomeClip]:
     clips = []
     for row in read_manifest(manifest, _AnyLabel()):
         name = Path(os.path.relpath(row.path, manifest.parent)).as_posix()
@@ -201,19 +201,19 @@ def _recorded(manifest: Path) -> list[Clip]:
         frames = int(min(seconds, _LONGEST_SECONDS) / FRAME_SECONDS)
         if frames < 1:
             raise SimulationError(f"{row.path}: shorter than a frame; take it out of {manifest}")
-        clips.append(Clip(name, row.label, row.source_group, row.path, frames, row.start))
+        clips.append(HomeClip(name, row.label, row.source_group, row.path, frames, row.start))
     if not any(clip.label != SILENCE for clip in clips):
         raise DataError(f"{manifest}: lists no sound but silence")
     return clips
 
 
-def _made_up(label: str) -> list[Clip]:
+def _made_up(label: str) -> list[HomeClip]:
     frames = round(_MADE_UP_SECONDS[label] / FRAME_SECONDS)
     names = [f"made_up/{label}_{number}" for number in range(1, _MADE_UP + 1)]
-    return [Clip(name, label, name, None, frames, seed=seed) for seed, name in enumerate(names)]
+    return [HomeClip(name, label, name, None, frames, seed=seed) for seed, name in enumerate(names)]
 
 
-def _decode(clip: Clip) -> Float32:
+def _decode(clip: HomeClip) -> Float32:
     """Read or make a clip, with a mean square of 1 where it is loud."""
     if clip.path is None:
         place = list(_MADE_UP_SECONDS).index(clip.label)

@@ -1,9 +1,26 @@
-"""The plan of a simulated home: what sounds where and when. Pure data, without sound."""
+"""The plan of a simulated home: sounds with place and time, and the cast that makes them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hearthlog.tools.home.clips import Clip
+import numpy as np
+
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    FLUSHING_WATER,
+    LAUGHING,
+    MUSIC,
+    OBJECTS_ACTIVITY,
+    OTHER_NEGATIVE,
+    PHONE_RING,
+    SHOWER,
+    SPEECH,
+    TAP_WATER,
+    YELLING,
+)
+from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.tools.home.clips import ClipLibrary, HomeClip
 
 TELEVISION, RADIO, PHONE = "television", "radio", "phone"
 RESIDENT, VISITOR, OUTSIDE = "resident", "visitor", "outside"
@@ -28,7 +45,7 @@ class PlannedSound:
 
     start: int
     frames: int
-    clip: Clip
+    clip: HomeClip
     origin: str
     room: str
     level: float
@@ -41,7 +58,7 @@ class PlannedSound:
 
 
 @dataclass(frozen=True)
-class SteadyNoise:
+class PlannedNoise:
     """A steady noise that is on for some time.
 
     Attributes
@@ -57,9 +74,97 @@ class SteadyNoise:
 
 
 @dataclass(frozen=True)
-class Plan:
+class HomePlan:
     """What sounds in a home."""
 
     frames: int
     sounds: Sequence[PlannedSound]
-    steady: Sequence[SteadyNoise]
+    steady: Sequence[PlannedNoise]
+
+
+Range = tuple[float, float]
+
+# In dBFS, for a microphone in the same room.
+LEVELS: dict[str, Range] = {
+    SPEECH: (-34.0, -26.0),
+    MUSIC: (-36.0, -28.0),
+    PHONE_RING: (-30.0, -22.0),
+    COUGHING: (-30.0, -20.0),
+    CRYING: (-30.0, -22.0),
+    YELLING: (-22.0, -14.0),
+    LAUGHING: (-30.0, -22.0),
+    OBJECTS_ACTIVITY: (-38.0, -28.0),
+    FLUSHING_WATER: (-28.0, -20.0),
+    SHOWER: (-30.0, -24.0),
+    TAP_WATER: (-36.0, -28.0),
+    OTHER_NEGATIVE: (-26.0, -16.0),
+}
+_QUIETER_DB = {TELEVISION: 6.0, RADIO: 4.0}
+_SUSTAINED = {MUSIC, SHOWER, TAP_WATER, PHONE_RING}  # may go on for longer than their clips
+
+
+class Cast:
+    """Who sounds how: which clips are whose."""
+
+    def __init__(self, library: ClipLibrary, rng: np.random.Generator) -> None:
+        self._library = library
+        self._clips: dict[tuple[str, str], Sequence[HomeClip]] = {}
+        for label in (SPEECH, LAUGHING, YELLING, CRYING):
+            own = library.of_groups(label, 1, rng)
+            others = [clip for clip in library.of(label) if clip not in own]
+            self._clips[RESIDENT, label] = own
+            self._clips[VISITOR, label] = self._clips[TELEVISION, label] = others or own
+
+    def of(self, origin: str, label: str) -> Sequence[HomeClip]:
+        """Return the clips of a label that may sound from an origin.
+
+        Returns
+        -------
+        sequence of Clip
+            Empty if there are none.
+        """
+        return self._clips.get((origin, label)) or self._library.of(label)
+
+
+class SoundCourse:
+    """One course of sounds of which none overlaps another."""
+
+    def __init__(self, cast: Cast, rng: np.random.Generator, end: int) -> None:
+        self.now = 0
+        self.sounds: list[PlannedSound] = []
+        self._cast = cast
+        self._rng = rng
+        self._end = end
+
+    def wait(self, seconds: Range) -> None:
+        """Let a random time pass."""
+        self.now += round(self._rng.uniform(*seconds) / FRAME_SECONDS)
+
+    def wait_until(self, frame: int) -> None:
+        """Let time pass, if it is not that late already."""
+        self.now = max(self.now, frame)
+
+    def sound(
+        self,
+        label: str,
+        room: str,
+        activity: str,
+        seconds: float | None = None,
+        origin: str = RESIDENT,
+    ) -> None:
+        """Add a clip, or as many as last for some seconds."""
+        clips = self._cast.of(origin, label)
+        if not clips:
+            return
+        level = self._rng.uniform(*LEVELS[label]) - _QUIETER_DB.get(origin, 0.0)
+        until = self.now + 1 if seconds is None else self.now + round(seconds / FRAME_SECONDS)
+        while self.now < until and self.now < self._end:
+            clip = clips[int(self._rng.integers(len(clips)))]
+            frames = clip.frames
+            if seconds is not None and label in _SUSTAINED:
+                frames = until - self.now
+            frames = min(frames, LONGEST_FRAMES, self._end - self.now)
+            self.sounds.append(PlannedSound(self.now, frames, clip, origin, room, level, activity))
+            self.now += frames
+            if label not in _SUSTAINED:
+                self.wait((0.1, 0.8))

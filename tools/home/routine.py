@@ -1,4 +1,4 @@
-"""The days of a person who lives alone, as a plan of sounds: nights, meals, visits, television."""
+"""Days of a person who lives alone as plans of sounds: real days, and one in some minutes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,6 @@ from hearthlog.models.classes import (
     YELLING,
 )
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.tools.home.cast import Cast, Voices
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.plan import (
     BATHROOM,
@@ -37,9 +36,11 @@ from hearthlog.tools.home.plan import (
     STREET,
     TELEVISION,
     VISITOR,
-    Plan,
+    Cast,
+    HomePlan,
+    PlannedNoise,
     PlannedSound,
-    SteadyNoise,
+    SoundCourse,
 )
 from hearthlog.tools.home.sounds import SimulationError, generator
 
@@ -72,7 +73,7 @@ class Habits:
     coughs_from: int | None = None
 
 
-def plan_days(days: int, library: ClipLibrary, habits: Habits) -> Plan:
+def plan_days(days: int, library: ClipLibrary, habits: Habits) -> HomePlan:
     """Plan days from midnight to midnight.
 
     Parameters
@@ -89,14 +90,14 @@ def plan_days(days: int, library: ClipLibrary, habits: Habits) -> Plan:
         raise SimulationError(f"a home is simulated for 1 to {MOST_DAYS} days, not {days}")
     cast = Cast(library, generator(habits.seed, 0))
     sounds: list[PlannedSound] = []
-    steady: list[SteadyNoise] = []
+    steady: list[PlannedNoise] = []
     for number in range(days):
         day = _Day(number, cast, habits)
         day.live()
         sounds += day.sounds()
         steady += day.steady
     steady.sort(key=lambda noise: noise.start)
-    return Plan(days * DAY_FRAMES, sounds, steady)
+    return HomePlan(days * DAY_FRAMES, sounds, steady)
 
 
 class _Day:
@@ -107,7 +108,7 @@ class _Day:
         self._begin = number * DAY_FRAMES
         end = self._begin + DAY_FRAMES
         self._person, self._television, self._radio, self._outside = (
-            Voices(cast, self._rng, end) for _ in range(4)
+            SoundCourse(cast, self._rng, end) for _ in range(4)
         )
         self._end = end
         self._number = number
@@ -118,7 +119,7 @@ class _Day:
             worse = 1.0 + _WORSE * (number - habits.coughs_from + 1)
             self._worse = min(worse, _WORST)
         self._doings: list[tuple[float, Callable[[], None]]] = []
-        self.steady: list[SteadyNoise] = []
+        self.steady: list[PlannedNoise] = []
 
     def sounds(self) -> list[PlannedSound]:
         """Return all sounds of the day by their start."""
@@ -195,7 +196,7 @@ class _Day:
             seconds = self._rng.uniform(180.0, 420.0)
             self._person.sound(SHOWER, BATHROOM, "shower", seconds)
             after = round(self._rng.uniform(60.0, 300.0) / FRAME_SECONDS)
-            self.steady.append(SteadyNoise(FAN, begin, self._person.now + after))
+            self.steady.append(PlannedNoise(FAN, begin, self._person.now + after))
         for _ in range(self._rng.integers(1, 4)):
             self._person.wait((10.0, 60.0))
             self._person.sound(TAP_WATER, BATHROOM, "washing", self._rng.uniform(3.0, 12.0))
@@ -245,7 +246,7 @@ class _Day:
     def _listen(self) -> None:
         self._play(self._radio, RADIO, KITCHEN, self._rng.uniform(0.3, 0.9))
 
-    def _play(self, device: Voices, origin: str, room: str, hours: float) -> None:
+    def _play(self, device: SoundCourse, origin: str, room: str, hours: float) -> None:
         """Play programmes of some minutes: talk, music or a comedy."""
         device.wait_until(self._person.now)
         until = min(device.now + round(hours * _HOUR / FRAME_SECONDS), self._end)
@@ -280,12 +281,134 @@ class _Day:
         """Let the fridge come and go, and the street be heard by day."""
         rng = self._rng
         self.steady.append(
-            SteadyNoise(
+            PlannedNoise(
                 STREET, self._frame(rng.uniform(5.8, 6.8) * _HOUR), self._frame(22.9 * _HOUR)
             )
         )
         second = rng.uniform(60.0, 1500.0)
         while second < _DAY - 1200.0:
             on = rng.uniform(540.0, 1080.0)
-            self.steady.append(SteadyNoise(FRIDGE, self._frame(second), self._frame(second + on)))
+            self.steady.append(PlannedNoise(FRIDGE, self._frame(second), self._frame(second + on)))
             second += on + rng.uniform(1200.0, 2100.0)
+
+
+_MAX_MINUTES = 1440.0
+_MIN_SILENCE = 1.0  # before a sound, in seconds
+_FRIDGE_SECONDS = (60.0, 120.0), (150.0, 250.0)  # on and off
+_EVENT_SECONDS = {
+    SPEECH: (10.0, 40.0),
+    MUSIC: (30.0, 60.0),
+    PHONE_RING: (4.0, 12.0),
+    COUGHING: (0.5, 3.0),
+    CRYING: (6.0, 15.0),
+    YELLING: (2.0, 8.0),
+    LAUGHING: (2.0, 7.0),
+    OBJECTS_ACTIVITY: (4.0, 20.0),
+    FLUSHING_WATER: (8.0, 14.0),
+    SHOWER: (30.0, 60.0),
+    TAP_WATER: (4.0, 15.0),
+}
+# Parts of the day: their seconds in a day of 24 minutes, the room, and what is heard there.
+_DAY_PARTS = (
+    ("night", 110, BEDROOM, RESIDENT, "coughing"),
+    ("getting up", 110, BATHROOM, RESIDENT, "flushing_water tap_water shower"),
+    (
+        "breakfast",
+        100,
+        KITCHEN,
+        RESIDENT,
+        "objects_activity tap_water coughing objects_activity objects_activity",
+    ),
+    ("call", 80, LIVING_ROOM, RESIDENT, "phone_ring speech"),
+    ("radio", 150, KITCHEN, RADIO, "music objects_activity music"),
+    (
+        "tidying",
+        130,
+        LIVING_ROOM,
+        RESIDENT,
+        "objects_activity tap_water objects_activity coughing objects_activity tap_water",
+    ),
+    ("nap", 110, BEDROOM, RESIDENT, "coughing flushing_water"),
+    (
+        "television",
+        190,
+        LIVING_ROOM,
+        TELEVISION,
+        "speech laughing speech laughing music laughing speech",
+    ),
+    (
+        "supper",
+        130,
+        KITCHEN,
+        RESIDENT,
+        "objects_activity tap_water objects_activity coughing objects_activity",
+    ),
+    ("call", 80, LIVING_ROOM, RESIDENT, "phone_ring speech laughing"),
+    ("despair", 110, LIVING_ROOM, RESIDENT, "yelling crying yelling crying crying speech"),
+    ("going to bed", 70, BATHROOM, RESIDENT, "flushing_water tap_water coughing"),
+    ("night", 70, BEDROOM, RESIDENT, "coughing"),
+)
+_ROOMS = {FLUSHING_WATER: BATHROOM, SHOWER: BATHROOM}
+_DEVICES = {SPEECH, MUSIC, LAUGHING}  # what comes from a television
+
+
+def plan_short_day(minutes: float, library: ClipLibrary, seed: int) -> HomePlan:
+    """Plan a day in the life of a person living alone, compressed into some minutes.
+
+    A shorter day has less silence between the sounds, and then fewer of them (10 minutes hold about
+    three quarters of what 24 do).
+
+    Parameters
+    ----------
+    minutes : float
+        At least a frame, at most 1440.
+    seed : int
+        Not negative.
+
+    Raises
+    ------
+    SimulationError
+        If `minutes` or `seed` lies beyond its limits.
+    """
+    frames = round(minutes * 60.0 / FRAME_SECONDS) if 0 < minutes <= _MAX_MINUTES else 0
+    if frames < 1:
+        raise SimulationError(f"a day lasts more than 0 and at most 1440 minutes, not {minutes}")
+    rng = generator(seed)
+    voices = SoundCourse(Cast(library, rng), rng, frames)
+    share = frames * FRAME_SECONDS / sum(part[1] for part in _DAY_PARTS)
+    begin = 0.0
+    for activity, seconds, room, origin, sounds in _DAY_PARTS:
+        for start, length, label in _placed(rng, seconds * share, sounds.split()):
+            voices.wait_until(round((begin + start) / FRAME_SECONDS))
+            whose = PHONE if label == PHONE_RING else origin if label in _DEVICES else RESIDENT
+            voices.sound(label, _ROOMS.get(label, room), activity, length, whose)
+        begin += seconds * share
+    return HomePlan(frames, voices.sounds, _steady(rng, frames))
+
+
+def _placed(
+    rng: np.random.Generator, seconds: float, labels: list[str]
+) -> list[tuple[float, float, str]]:
+    """Place the sounds that fit, in their order, with random silences between them."""
+    chosen, left = [], seconds - _MIN_SILENCE
+    for label in labels:
+        length = rng.uniform(*_EVENT_SECONDS[label])
+        if length + _MIN_SILENCE <= left:
+            chosen.append((length, label))
+            left -= length + _MIN_SILENCE
+    silences = _MIN_SILENCE + max(left, 0.0) * rng.dirichlet(np.full(len(chosen) + 1, 2.0))
+    ends = np.cumsum(silences[:-1] + [length for length, _ in chosen])
+    return [
+        (end - length, length, label) for end, (length, label) in zip(ends, chosen, strict=True)
+    ]
+
+
+def _steady(rng: np.random.Generator, frames: int) -> list[PlannedNoise]:
+    """Let the street be heard by day, and the fridge come and go."""
+    steady = [PlannedNoise(STREET, round(0.08 * frames), round(0.9 * frames))]
+    begin = round(rng.uniform(10.0, 60.0) / FRAME_SECONDS)
+    while begin < frames:
+        on, off = (round(rng.uniform(*spread) / FRAME_SECONDS) for spread in _FRIDGE_SECONDS)
+        steady.append(PlannedNoise(FRIDGE, begin, begin + on))
+        begin += on + off
+    return sorted(steady, key=lambda noise: noise.start)

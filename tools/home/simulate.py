@@ -1,22 +1,269 @@
-"""A simulated home: made-up clips to train from, and a day to recognise."""
+"""A simulated home as files: training clips, a day of sound, logs without sound, and truth."""
 
 import csv
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import soundfile
 
-from hearthlog.models.classifiers.description import SIMULATED
-from hearthlog.schemas.frames import SAMPLE_RATE
+from hearthlog.models.classes import SILENCE
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import SIMULATED, Model
+from hearthlog.models.embedding.networks import Embedder, load_embedder
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.embedder_probe import network_path
+from hearthlog.recorder.events import OK, Frames, SourceHealth
+from hearthlog.recorder.log.description import describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
+from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.schemas.arrays import Float64, Int16, Int64
+from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
-from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.plan import LIVING_ROOM
-from hearthlog.tools.home.record import write_sound
-from hearthlog.tools.home.rooms import Rooms
-from hearthlog.tools.home.short_day import plan_short_day
+from hearthlog.tools.home.composition import Composition, HeardSound, Rooms, full_scale
+from hearthlog.tools.home.plan import LIVING_ROOM, PlannedSound
+from hearthlog.tools.home.routine import DAY_FRAMES, plan_short_day
 from hearthlog.tools.home.sounds import LABELS, SimulationError, generator, synthesize
-from hearthlog.tools.home.truth import Truth, truth_of, write_truth
+
+_PUSHED_FRAMES = 200  # as `FileSource` yields them, with a report of health before
+_COMPUTED_FRAMES = 12_000  # 10 minutes
+
+
+def record_composition(
+    composition: Composition,
+    settings: Settings,
+    start: int,
+    device: str = "simulated home",
+    progress: Progress = ignore_progress,
+) -> list[Path]:
+    """Write the logs that a recorder would leave of a home.
+
+    Only for a model that takes embeddings all of the sound is composed; for others, most of it is
+    not.
+
+    Parameters
+    ----------
+    settings : Settings
+        Its model labels the sound, by embeddings of its network if it takes any; clips are not
+        kept.
+    start : int
+        Time of the first sample, in nanoseconds of UTC.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be used, or the network of its embeddings is not there.
+    LogError
+        If a log exists, or cannot be written.
+    """
+    model = None if settings.model is None else load_model(settings.model)
+    classifier = None if model is None else Classifier(model)
+    features = DEFAULT if classifier is None else classifier.feature_set
+    microphone = settings.microphone[0].name
+    embedder = embedder_of(model)
+    pipeline = Pipeline(
+        microphone, features, classifier, settings.statistics_every, embedder=embedder
+    )
+    info = stream_info(microphone, device, features, model)
+    log = RollingLog(
+        describe_log(settings, info, features, model, embedding=pipeline.embedding),
+        settings.max_bag_duration,
+        settings.flush_seconds,
+        settings.sync_seconds,
+    )
+    for messages in _messages(composition, pipeline, start, device, progress):
+        log.write(messages)
+    log.finish(pipeline.finish())
+    return log.finished
+
+
+def embedder_of(model: Model | None) -> Embedder | None:
+    """Load the network of the embeddings that a model takes, if it takes any.
+
+    Raise `ModelError` if it is not there, or cannot be used.
+    """
+    space = None if model is None else model.description.embedding_space
+    return None if space is None else load_embedder(space.network, network_path(space.network))
+
+
+def write_sound(
+    composition: Composition,
+    path: Path,
+    first: int,
+    frames: int,
+    progress: Progress = ignore_progress,
+) -> None:
+    """Write some of a composition as a FLAC file, 16 kHz mono.
+
+    Raise `OSError` if the file exists or cannot be written. Raise `LibsndfileError` if it
+    cannot be encoded.
+    """
+    with (
+        path.open("xb") as file,
+        soundfile.SoundFile(file, "w", SAMPLE_RATE, 1, "PCM_16", format="FLAC") as audio,
+    ):
+        for number, samples in _blocks(composition, first, frames):
+            audio.write(samples.ravel())
+            progress((number - first + len(samples)) / frames)
+
+
+def _blocks(composition: Composition, first: int, frames: int) -> Iterator[tuple[int, Int16]]:
+    for number in range(first, first + frames, _PUSHED_FRAMES):
+        yield number, composition.samples(number, min(_PUSHED_FRAMES, first + frames - number))
+
+
+def _messages(
+    composition: Composition, pipeline: Pipeline, start: int, device: str, progress: Progress
+) -> Iterator[list[EncodedMessage]]:
+    """Yield what the pipeline makes of the sound, and of the health of its source."""
+    frames = composition.plan.frames
+    if pipeline.embedding is not None:
+        for first, samples in _blocks(composition, 0, frames):
+            stamps = start + np.arange(first, first + len(samples)) * FRAME_NANOSECONDS
+            yield pipeline.push(SourceHealth(int(stamps[0]), OK, "reading", {"device": device}))
+            yield pipeline.push(Frames(first, full_scale(samples), stamps))
+            progress((first + len(samples)) / frames)
+        return
+    stream = composition.features(pipeline.feature_set)
+    for block in range(0, frames, _COMPUTED_FRAMES):
+        values = stream(block, min(_COMPUTED_FRAMES, frames - block))
+        for offset in range(0, len(values), _PUSHED_FRAMES):
+            part, first = values[offset : offset + _PUSHED_FRAMES], block + offset
+            stamps = start + np.arange(first, first + len(part)) * FRAME_NANOSECONDS
+            yield pipeline.push(SourceHealth(int(stamps[0]), OK, "reading", {"device": device}))
+            yield pipeline.push_features(part, first, stamps)
+        progress((block + len(values)) / frames)
+
+
+LabelledSpan = tuple[float, float, str]  # seconds from the start, and the label
+
+_AUDIBLE_DB = 0.0  # over what is steady
+_PLANNED = ("start", "end", "label", "from", "room", "activity", "clip", "source_group", "made_up")
+_HEARD = ("level_dbfs", "heard_seconds")
+_TINY = 1e-30
+
+
+class TrueEvent(NamedTuple):
+    """A planned sound, and what the microphone hears of it.
+
+    Attributes
+    ----------
+    level : float
+        Of its loudest frame as it is heard, in dBFS.
+    """
+
+    plan: PlannedSound
+    level: float
+    heard_frames: int
+
+
+class Truth(NamedTuple):
+    """What is true of a composition.
+
+    Attributes
+    ----------
+    spans : list of LabelledSpan
+        Without gaps: a frame has the label of the loudest sound that is audible in it, which is
+        that as loud as all steady noise; silence where there is none.
+    """
+
+    spans: list[LabelledSpan]
+    events: list[TrueEvent]
+
+
+def truth_of(composition: Composition) -> Truth:
+    """Tell the truth of a composition, without composing its sound."""
+    events: list[TrueEvent] = []
+    runs: list[tuple[int, int, str]] = []
+    held: list[tuple[int, HeardSound]] = []  # that go on from one day to the next
+    for first in range(0, composition.plan.frames, DAY_FRAMES):
+        count = min(DAY_FRAMES, composition.plan.frames - first)
+        begun = enumerate(composition.heard(first, count), start=len(events))
+        here = [*held, *begun]
+        events += [_event(sound) for _, sound in here[len(held) :]]
+        loudest = _loudest(here, composition.floor_power(first, count), first)
+        for number, frames in zip(*np.unique(loudest, return_counts=True), strict=True):
+            if number >= 0:
+                event = events[number]
+                events[number] = event._replace(heard_frames=event.heard_frames + int(frames))
+        labels = [SILENCE, *(event.plan.clip.label for event in events)]
+        for begin, end, number in _runs(loudest):
+            runs.append((first + begin, first + end, labels[number + 1]))
+        held = [one for one in here if one[1].plan.start + len(one[1].power) > first + count]
+    return Truth(_spans(runs), events)
+
+
+def write_truth(truth: Truth, spans: Path, events: Path) -> None:
+    """Write a label track for Audacity, and a table of the sounds.
+
+    Raise `OSError` if one cannot be written.
+    """
+    with spans.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{start:.6f}\t{end:.6f}\t{label}\n" for start, end, label in truth.spans)
+    with events.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow((*_PLANNED, *_HEARD))
+        writer.writerows(_row(event) for event in truth.events)
+
+
+def _row(event: TrueEvent) -> tuple[object, ...]:
+    plan = event.plan
+    return (
+        f"{plan.start * FRAME_SECONDS:.2f}",
+        f"{plan.end * FRAME_SECONDS:.2f}",
+        plan.clip.label,
+        plan.origin,
+        plan.room,
+        plan.activity,
+        plan.clip.name,
+        plan.clip.source_group,
+        "yes" if plan.clip.path is None else "no",
+        f"{event.level:.1f}",
+        f"{event.heard_frames * FRAME_SECONDS:.2f}",
+    )
+
+
+def _event(sound: HeardSound) -> TrueEvent:
+    return TrueEvent(sound.plan, float(10.0 * np.log10(sound.power.max() + _TINY)), 0)
+
+
+def _loudest(sounds: list[tuple[int, HeardSound]], floor: Float64, first: int) -> Int64:
+    """Return the number of the loudest audible sound of each frame, -1 where there is none."""
+    power = floor * 10.0 ** (_AUDIBLE_DB / 10.0)
+    loudest = np.full(len(floor), -1)
+    for number, sound in sounds:
+        begin = sound.plan.start - first
+        here = slice(max(begin, 0), min(begin + len(sound.power), len(floor)))
+        its = sound.power[here.start - begin : here.stop - begin]
+        louder = its > power[here]
+        power[here][louder] = its[louder]
+        loudest[here][louder] = number
+    return loudest
+
+
+def _runs(values: Int64) -> Iterator[tuple[int, int, int]]:
+    edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
+    for begin, end in pairwise(edges):
+        yield begin, end, int(values[begin])
+
+
+def _spans(runs: list[tuple[int, int, str]]) -> list[LabelledSpan]:
+    """Join runs of one label."""
+    spans: list[LabelledSpan] = []
+    for begin, end, label in runs:
+        start = begin * FRAME_SECONDS
+        if spans and spans[-1][2] == label:
+            start = spans.pop()[0]
+        spans.append((start, end * FRAME_SECONDS, label))
+    return spans
+
 
 _CLIP_SECONDS = (3.0, 5.0)
 

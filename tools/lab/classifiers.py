@@ -39,10 +39,9 @@ from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scenario import load_scenario
 from hearthlog.analyzer.training.scores import Scores, calibration_error, difference, score
 from hearthlog.analyzer.training.train import MOST_FOLDS
+from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.classifier_kind import Machine
-from hearthlog.models.classifiers.description import Description
-from hearthlog.models.classifiers.installed import classifier_kind
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SECONDS

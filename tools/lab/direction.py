@@ -23,7 +23,7 @@ from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.directions import BLOCK_FRAMES
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.recorder.direction.geometry import array_geometry
 from hearthlog.recorder.direction.srp_phat import DirectionFinder
 from hearthlog.schemas.arrays import Float32, Float64

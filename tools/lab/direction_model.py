@@ -33,9 +33,8 @@ from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import COUGHING, MUSIC, SILENCE, SPEECH
-from hearthlog.models.classifiers.description import FORMAT
-from hearthlog.models.classifiers.directions import SECTORS
-from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.evidence import SECTORS
+from hearthlog.models.classifiers.model import FORMAT, Model
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings

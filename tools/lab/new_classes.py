@@ -32,13 +32,10 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
-from hearthlog.tools.home.cast import LEVELS
 from hearthlog.tools.home.clips import ClipLibrary
-from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.plan import LIVING_ROOM, RESIDENT, Plan, PlannedSound
-from hearthlog.tools.home.record import record_composition
-from hearthlog.tools.home.rooms import Rooms
-from hearthlog.tools.home.truth import truth_of
+from hearthlog.tools.home.composition import Composition, Rooms
+from hearthlog.tools.home.plan import LEVELS, LIVING_ROOM, RESIDENT, HomePlan, PlannedSound
+from hearthlog.tools.home.simulate import record_composition, truth_of
 from hearthlog.tools.lab.adaptation import wrong_sounds
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.person import true_labelling, write_review
@@ -190,7 +187,7 @@ def _halves(
 
 def _plan(
     library: ClipLibrary, labels: Sequence[str], room: str, rng: np.random.Generator, minutes: float
-) -> Plan:
+) -> HomePlan:
     """Lay sounds of all labels one after the other, with short pauses."""
     frames, now = round(60.0 * minutes / FRAME_SECONDS), round(10.0 / FRAME_SECONDS)
     sounds: list[PlannedSound] = []
@@ -202,7 +199,7 @@ def _plan(
         level = rng.uniform(*LEVELS[label])
         sounds.append(PlannedSound(now, length, clip, RESIDENT, room, level, ""))
         now += length + round(rng.choice(_PAUSES) / FRAME_SECONDS)
-    return Plan(frames, sounds, [])
+    return HomePlan(frames, sounds, [])
 
 
 def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:

@@ -23,11 +23,10 @@ from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SPEECH
-from hearthlog.models.embedding.embeddings import WINDOW_FRAMES
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
+from hearthlog.models.embedding.projection import WINDOW_FRAMES
 from hearthlog.models.embedding.stream import EmbeddingStream
-from hearthlog.models.features.auros21 import AUROS21
-from hearthlog.models.features.auros21.names import ENERGY, FLUX
+from hearthlog.models.features.auros21 import AUROS21, ENERGY, FLUX
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.schemas.arrays import Float64

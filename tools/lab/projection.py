@@ -16,11 +16,11 @@ from hearthlog.analyzer.training.clip_sound import clip_frames
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.embedding.audioset import GROUPS
+from hearthlog.models.classifiers.model import may_be_shipped
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import Projection, write_projection
 from hearthlog.models.embedding.session import TfliteSession
-from hearthlog.models.licences import may_be_shipped
+from hearthlog.models.embedding.sound_names import GROUPS
 from hearthlog.schemas.arrays import Float32
 
 _COMPONENTS = 64

@@ -26,13 +26,11 @@ from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
-from hearthlog.tools.home.composition import Composition
-from hearthlog.tools.home.plan import LIVING_ROOM, Plan
-from hearthlog.tools.home.record import record_composition
-from hearthlog.tools.home.rooms import Rooms
+from hearthlog.tools.home.composition import Composition, Rooms
+from hearthlog.tools.home.plan import LIVING_ROOM, HomePlan
 from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
+from hearthlog.tools.home.simulate import record_composition, truth_of
 from hearthlog.tools.home.sounds import SimulationError
-from hearthlog.tools.home.truth import truth_of
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.microphones import NarrowRooms
@@ -41,7 +39,7 @@ from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_picture import line_of, save_picture
 from hearthlog.tools.lab.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Week, scored
 
-Part = tuple[int, Plan]  # of a week: its first frame, and what sounds
+Part = tuple[int, HomePlan]  # of a week: its first frame, and what sounds
 _MINUTES = 10.0  # of review a week
 _DAY = DAY_FRAMES * FRAME_NANOSECONDS
 _STRETCH = DAY_FRAMES // 24
@@ -193,7 +191,7 @@ def plan_quarter(weeks: int, library: ClipLibrary, seed: int) -> list[list[Part]
     return quarter
 
 
-def _part(plan: Plan, first: int) -> Plan:
+def _part(plan: HomePlan, first: int) -> HomePlan:
     """Return a stretch of a plan, without the sounds that go on at its ends."""
     end = first + _STRETCH
     sounds = [
@@ -206,7 +204,7 @@ def _part(plan: Plan, first: int) -> Plan:
         for noise in plan.steady
         if noise.start < end and noise.end > first
     ]
-    return Plan(_STRETCH, sounds, steady)
+    return HomePlan(_STRETCH, sounds, steady)
 
 
 def quarter(

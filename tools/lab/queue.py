@@ -31,7 +31,7 @@ from hearthlog.analyzer.training.scenario import BUILTIN
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.embeddings import HOP_FRAMES, WINDOW_FRAMES, Int8
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Int8
 from hearthlog.models.features.floor import FloorTracker, is_quiet
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

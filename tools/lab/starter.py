@@ -31,12 +31,9 @@ from hearthlog.analyzer.training.mixture import head_inputs_of
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING, SILENCE
-from hearthlog.models.classifiers.description import SIMULATED
-from hearthlog.models.classifiers.embedding_heads import UNTAUGHT
-from hearthlog.models.classifiers.model import Model
-from hearthlog.models.licences import may_be_shipped
-from hearthlog.models.modelfile.card import model_card
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.classifiers.evidence import UNTAUGHT
+from hearthlog.models.classifiers.model import SIMULATED, Model, may_be_shipped
+from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import BY_FEATURES, starter_file
 from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.errors import HearthlogError, ignore_progress, listed

@@ -8,11 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.models.features.auros21.extractor import BINS, mel_bank, mel_centres
-from hearthlog.models.features.auros21.inputs import bands_of
-from hearthlog.models.features.auros21.names import CEPSTRA, FEATURE_NAMES
+from hearthlog.models.features.auros21 import (
+    BINS,
+    CEPSTRA,
+    FEATURE_NAMES,
+    bands_of,
+    mel_bank,
+    mel_centres,
+)
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.home33.extractor import SHAPE_NAMES
+from hearthlog.models.features.home33 import SHAPE_NAMES
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 

@@ -1,4 +1,4 @@
-"""The recorder made a service: checked as the user that runs it, written, enabled and started."""
+"""The recorder or the bridge made a service: checked, written, enabled and started."""
 
 import json
 import os
@@ -8,14 +8,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from hearthlog.analyzer.bridge.settings import BridgeSettings, load_bridge_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.modules import module_command
-from hearthlog.tools.service.errors import ServiceError
-from hearthlog.tools.service.needs import STATE, Needs
-from hearthlog.tools.service.unit import NAME, system_unit, user_unit
-from hearthlog.tools.service.units import (
+from hearthlog.tools.service.unit import (
+    BRIDGE_NAME,
+    NAME,
+    STATE,
     SYSTEM_UNITS,
     Installed,
+    Needs,
+    ServiceError,
+    bridge_unit,
     check_program_seen,
     check_root,
     check_seen,
@@ -23,6 +27,8 @@ from hearthlog.tools.service.units import (
     is_user_manager_running,
     place_of,
     start_unit,
+    system_unit,
+    user_unit,
     user_units,
     verb_command,
     write_unit,
@@ -110,3 +116,67 @@ def _cannot_run(person: pwd.struct_passwd | None, reason: str) -> str:
         f"{sys.prefix}: {name} cannot run hearthlog from there ({reason}); "
         "install it where everyone may read, as `sudo python3 -m venv /opt/hearthlog` does"
     )
+
+
+RECORDER = "hearthlog"  # the user of the recorder
+
+
+def install_bridge(config: Path, account: str | None) -> Installed:
+    """Make the bridge a service of this machine, and start it, or start it anew.
+
+    Parameters
+    ----------
+    account : str or None
+        The user that it is run by; by default one of its own, who may read logs that the group of
+        the recorder may read, and write none.
+
+    Raises
+    ------
+    ConfigurationError
+        If the configuration is wrong.
+    ServiceError
+        If it cannot be for another reason. Nothing was written then, unless it did not start.
+    """
+    check_root()
+    unit = place_of(SYSTEM_UNITS, BRIDGE_NAME)
+    config = config.absolute()
+    check_program_seen()
+    check_seen("the configuration", config)
+    for name in [name for name in os.environ if name.startswith("HEARTHLOG_")]:
+        del os.environ[name]  # the service will have none of them
+    settings, bridge = load_bridge_settings(config)
+    if not bridge.has_outputs():
+        raise ServiceError(
+            f"{config}: tells nobody anything; it has no table such as [bridge.mqtt]"
+        )
+    logs = STATE / settings.output
+    check_seen("the folder of logs", logs)
+    if account is None and settings.readable_by == "owner":
+        raise ServiceError(
+            f"{config}: the bridge has a user of its own, who may not read the logs; say there "
+            f'readable_by = "group", or give it the user of the recorder: --account {RECORDER}'
+        )
+    _check_files(bridge)
+    _check_person(account or RECORDER)
+    figures = None if bridge.prometheus is None else bridge.prometheus.text_file
+    written = [] if figures is None else [figures.absolute().parent]
+    written += [] if bridge.state is None else [bridge.state.absolute()]
+    text = bridge_unit(verb_command("bridge", config), account, RECORDER, logs, written)
+    write_unit(unit, text)
+    return Installed(unit, start_unit(BRIDGE_NAME, is_running=is_systemd_running()))
+
+
+def _check_files(bridge: BridgeSettings) -> None:
+    """Check that the service sees what it reads besides; a relative name is of a credential."""
+    tables = bridge.mqtt, bridge.page, bridge.delivery, bridge.prometheus, bridge.ping
+    for table in (each for each in tables if each is not None):
+        for key, path in table:
+            if isinstance(path, Path) and path.is_absolute() and key != "text_file":  # is written
+                check_seen(key, path)
+
+
+def _check_person(account: str) -> None:
+    try:
+        pwd.getpwnam(account)
+    except KeyError as error:
+        raise ServiceError(f"there is no user {account[:64]!r}") from error

@@ -18,7 +18,7 @@ from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.recording import check_recording
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.tools.service.needs import STATE, Needs
+from hearthlog.tools.service.unit import STATE, Needs
 
 
 def main() -> None:

@@ -11,8 +11,8 @@ from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_
 from hearthlog.analyzer.bridge.listeners import microphone_of_listener
 from hearthlog.analyzer.routine.compare import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
+from hearthlog.models.classifiers.names import AUDIOSET
 from hearthlog.models.embedding.sound_names import audioset_names
-from hearthlog.models.modelfile.audioset import AUDIOSET
 from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError, listed
 

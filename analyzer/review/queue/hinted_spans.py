@@ -18,11 +18,10 @@ from hearthlog.analyzer.review.queue.judgeable_spans import (
 from hearthlog.analyzer.review.queue.ranking import spread
 from hearthlog.analyzer.review.queue.review_list import HINT, ReviewSpan
 from hearthlog.models.classes import class_name
-from hearthlog.models.embedding.embeddings import Embeddings
+from hearthlog.models.classifiers.names import AUDIOSET
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import Projection, read_projection
+from hearthlog.models.embedding.projection import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.sound_names import SoundName, audioset_names, named_sounds
-from hearthlog.models.modelfile.audioset import AUDIOSET
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

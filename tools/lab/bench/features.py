@@ -5,7 +5,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.auros21 import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE

@@ -17,8 +17,7 @@ from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.scenario import BUILTIN
 from hearthlog.analyzer.training.svm_method import SVM
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.installed import classifier_kind
+from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker

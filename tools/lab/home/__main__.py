@@ -11,14 +11,18 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
-from hearthlog.tools.home.composition import Composition
+from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.plan import LIVING_ROOM, ROOMS
-from hearthlog.tools.home.record import embedder_of, record_composition, write_sound
-from hearthlog.tools.home.rooms import Rooms
 from hearthlog.tools.home.routine import Habits, plan_days
-from hearthlog.tools.home.simulate import reported
+from hearthlog.tools.home.simulate import (
+    embedder_of,
+    record_composition,
+    reported,
+    truth_of,
+    write_sound,
+    write_truth,
+)
 from hearthlog.tools.home.sounds import SimulationError
-from hearthlog.tools.home.truth import truth_of, write_truth
 from hearthlog.tools.lab.command import run
 
 _HOUR_FRAMES = round(3600 / FRAME_SECONDS)

@@ -5,7 +5,7 @@ from scipy.signal import butter, sosfilt
 
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.home.rooms import Rooms
+from hearthlog.tools.home.composition import Rooms
 
 _BAND_HERTZ = 200.0, 4000.0
 _GAIN = 0.1  # -20 dB

@@ -19,8 +19,8 @@ from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.tools.home.simulate import LabelledSpan
 from hearthlog.tools.home.sounds import generator
-from hearthlog.tools.home.truth import LabelledSpan
 
 _LOOK_SECONDS = 5.0  # to look at a span and press a key, besides the time to hear it
 _MARK_SECONDS = 10.0  # to set the borders of a mark in a minute

@@ -32,7 +32,7 @@ _CHECK_SECONDS = 2.0
 _SILENCE_SECONDS = 5.0  # without features, after which the sound has ended
 
 
-class Label(Node):
+class LabelNode(Node):
     """Labels the features of one microphone, as its recorder would.
 
     It subscribes to `/<microphone>/features`, and publishes `/<microphone>/label`, `…/segment` and,
@@ -181,4 +181,4 @@ class Label(Node):
 
 def main() -> None:
     """Run the node."""
-    run(Label)
+    run(LabelNode)

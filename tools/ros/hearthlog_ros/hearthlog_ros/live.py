@@ -24,7 +24,7 @@ from hearthlog_ros.graph import (
     run,
     wait_for_subscribers,
 )
-from hearthlog_ros.pace import Pace
+from hearthlog_ros.pace import PublicationDelay
 
 _DELAY_SECONDS = 1.5  # a block of sound, a new file, writing and reading, and a little more
 _LOOK_SECONDS = 0.5  # for a folder that is not there yet
@@ -51,7 +51,7 @@ class Live(Node):
         delay = self.declare_parameter("delay", _DELAY_SECONDS).value
         if not 0 <= delay <= 60:
             raise NodeError(f"delay: from 0 to 60 seconds, not {delay:g}")
-        self._pace = Pace(int(delay * _NANOSECONDS))
+        self._pace = PublicationDelay(int(delay * _NANOSECONDS))
         self._stop = Event()
         self._error = ""
         self._publishers_of: dict[str, Any] = {}

@@ -4,7 +4,7 @@ _MOST_LATE = 5_000_000_000  # ns; a log that is further behind is of another clo
 _STEP = 2_000_000  # ns by which a block tries whether a shorter delay will do
 
 
-class Pace:
+class PublicationDelay:
     """Delays messages by what the latest of their blocks takes, and at least by a given time.
 
     Parameters

@@ -1,0 +1,160 @@
+"""Feature set `home33`: the paper's 21 values for every frame, and the shape of its spectrum."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.models.features import auros21
+from hearthlog.models.features.auros21 import (
+    AUROS21,
+    BINS,
+    ENERGY,
+    FEATURE_NAMES,
+    FLUX,
+    FeatureExtractor,
+)
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.window_inputs import WindowStatistics
+from hearthlog.schemas.arrays import Float32, Float64
+
+SHAPE_NAMES = tuple(
+    f"{name}_{number}" for name in ("peakiness", "flatness") for number in range(1, 7)
+)
+_WIDTH = len(FEATURE_NAMES)
+_EDGES = np.array([3, 13, 25, 50, 100, 200, 400])  # bins of 20 Hz: 60, 260, 500 Hz, 1 … 8 kHz
+_FLOOR = 1e-9  # power; a full-scale sine has 1
+_DIGITS = 11  # binary, as of half precision, in which models know what they have learned from
+_LEAST_EXPONENTS = np.full(_WIDTH + len(SHAPE_NAMES), -13, np.int32)
+np.put(_LEAST_EXPONENTS, [ENERGY, FLUX], -40)
+
+
+class HomeExtractor(FeatureExtractor):
+    """Features of one stream of frames."""
+
+    width = _WIDTH + len(SHAPE_NAMES)
+
+    def _compute(self, frames: Float32, out: Float32) -> None:
+        power = self._paper_values(frames, out[:, :_WIDTH])
+        out[:, _WIDTH:] = shape(power / BINS**2)
+        out[:] = rounded(out)
+
+
+def shape(power: Float64) -> Float64:
+    """Compute how the power of each band is spread over its bins.
+
+    Peakiness is the highest bin over the mean, flatness the geometric mean over the mean. They tell
+    voices, music and rings from water, engines and noise.
+
+    Parameters
+    ----------
+    power : np.ndarray [shape=(n, 400)], float64
+        Of the bins of a frame's spectrum; a full-scale sine has 1.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 12)], float64
+        Peakiness of six bands, then their flatness, in dB.
+    """
+    power = power + _FLOOR
+    counts = np.diff(_EDGES)
+    highest = np.maximum.reduceat(power, _EDGES[:-1], axis=1)
+    mean = np.add.reduceat(power, _EDGES[:-1], axis=1) / counts
+    geometric = np.add.reduceat(np.log10(power), _EDGES[:-1], axis=1) / counts
+    level = np.log10(mean)
+    return 10.0 * np.concatenate([np.log10(highest) - level, geometric - level], axis=1)
+
+
+def rounded(values: Float32) -> Float32:
+    """Round features to 11 binary digits, as half precision does.
+
+    No classifier feels less, and noise in the last digits does not compress. Rounded values also
+    agree where processors compute the exact ones differently in the last place.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, 33)], float32
+        Finite.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 33)], float32
+        Like half precision they have no digits behind the 24th of the point, but for energy and
+        flux, which are small.
+    """
+    exponent = np.maximum(np.frexp(values)[1], _LEAST_EXPONENTS)
+    return np.ldexp(np.rint(np.ldexp(values, _DIGITS - exponent)), exponent - _DIGITS)
+
+
+# Means over quiet stretches of household recordings.
+_PEAKINESS = (4.6, 4.4, 5.1, 5.6, 5.4, 2.6)
+_FLATNESS = (-2.6, -1.8, -1.6, -1.4, -1.2, -0.2)
+_OF_SILENCE = np.array([*_PEAKINESS, *_FLATNESS])
+
+
+def band_powers(features: Float32) -> Float64:
+    """Compute the powers of the mel bands and of the frame, as those of `auros21`.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 33)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 33)], float64
+    """
+    return auros21.band_powers(features[:, :_WIDTH])
+
+
+def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
+    """Compute the values behind the inputs `above_floor` from the features of each frame.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 33)], float32
+    floors : np.ndarray [shape=(n, 33)], float64
+        In the order of `band_powers`.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 65)], float64
+        Those of `auros21`, then peakiness and flatness, which are the nearer to those of silence
+        the less of the energy is above the floor.
+
+    Raises
+    ------
+    TypeError
+        If there are no floors.
+    """
+    values, share = auros21.above_floor(features[:, :_WIDTH], floors)
+    shape = _OF_SILENCE + share * (features[:, _WIDTH:] - _OF_SILENCE)
+    return np.concatenate([values, shape], axis=1)
+
+
+INPUTS = {
+    "statistics": WindowStatistics(auros21.WINDOW_FRAMES, np.asarray, _WIDTH + len(_OF_SILENCE)),
+    "above_floor": WindowStatistics(
+        auros21.LABEL_FRAMES,
+        values_above_floor,
+        auros21.VALUES + len(_OF_SILENCE),
+        changes=True,
+        needs_floor=True,
+    ),
+}
+
+
+def _energy(features: NDArray[Any]) -> NDArray[Any]:
+    return AUROS21.power(features)
+
+
+HOME33 = FeatureSet(
+    name="home33",
+    version=1,
+    feature_names=(*AUROS21.feature_names, *SHAPE_NAMES),
+    units=(*AUROS21.units, *("dB" for _ in SHAPE_NAMES)),
+    window_frames=AUROS21.window_frames,
+    extractor=HomeExtractor,
+    inputs=INPUTS,
+    power=_energy,
+    band_powers=band_powers,
+)

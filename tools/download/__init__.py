@@ -1,1 +1,0 @@
-"""Downloads that a user asks for, of files whose digest is known."""
