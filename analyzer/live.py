@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
 from hearthlog.models.modelfile.modelfile import DESCRIPTION, attachment_of
 from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
-from hearthlog.recorder.rest import paused_until
+from hearthlog.recorder.pause_schedule import paused_until
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.columns import Columns, read_columns

@@ -18,15 +18,19 @@ from pydantic import (
 )
 
 from hearthlog.recorder.addresses import is_address, public_name
-from hearthlog.recorder.config_origins import ENVIRONMENT, Origins, key_lines
-from hearthlog.recorder.config_problems import configuration_error
-from hearthlog.recorder.direction.geometry import ArrayGeometry, array_geometry
-from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
-from hearthlog.recorder.disk.sizes import Size
+from hearthlog.recorder.config_problems import ENVIRONMENT, Origins, configuration_error, key_lines
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.rest import Rest, check_quiet_hours, quiet_hours
-from hearthlog.recorder.stream.statistics import LOGGED_EVERY
-from hearthlog.recorder.timezone import check_time_zone, machine_zone, time_zone
+from hearthlog.recorder.pause_schedule import (
+    PauseSchedule,
+    check_quiet_hours,
+    check_time_zone,
+    machine_zone,
+    quiet_hours,
+    time_zone,
+)
+from hearthlog.recorder.retention import KeepingRules, Limits, Size, ThinningDays
+from hearthlog.recorder.stream.directions import ArrayGeometry, array_geometry
+from hearthlog.recorder.stream.messages import LOGGED_EVERY
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import exposed_secret, read_toml
 from hearthlog.schemas.logs.files import check_node_name
@@ -282,10 +286,10 @@ class Settings(BaseModel):
         """Return the model files of the scenarios of a microphone, by their names."""
         return self.scenarios if microphone.scenarios is None else microphone.scenarios
 
-    def rest(self) -> Rest:
+    def rest(self) -> PauseSchedule:
         """Return when the microphones are closed."""
         hours = [quiet_hours(text) for text in self.quiet_hours]
-        return Rest(hours, time_zone(self.timezone), self.output)
+        return PauseSchedule(hours, time_zone(self.timezone), self.output)
 
     @field_validator("max_bag_size")
     @classmethod

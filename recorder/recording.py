@@ -10,30 +10,26 @@ from threading import Event as Flag
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.starter import BY_FEATURES, NETWORK
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.embedder_probe import (
+from hearthlog.recorder.events import Event, Frames, Gap, SoundSource, merged_events
+from hearthlog.recorder.host import ServiceManager, keep_freed_blocks, keep_one_heap, say
+from hearthlog.recorder.labelling.embedder_probe import (
     NO_NETWORK,
     check_network,
     likely_network,
     open_embedder,
 )
-from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
-from hearthlog.recorder.journal import say
-from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.labelling_models import LabellingModels, open_models
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
-from hearthlog.recorder.labelling.open_models import open_models
 from hearthlog.recorder.log.folder_lock import FolderLock, check_writable
 from hearthlog.recorder.log.recovery import end_of_sound, recover_active
-from hearthlog.recorder.memory import keep_freed_blocks, keep_one_heap
+from hearthlog.recorder.pause_schedule import PauseSchedule
 from hearthlog.recorder.recording_session import (
     NOT_RUNNING,
     RecorderState,
     RecordingSession,
     RecordingSummary,
 )
-from hearthlog.recorder.rest import Rest
-from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource, LongBlocks
-from hearthlog.recorder.sources.merged import merged_events
 from hearthlog.recorder.sources.microphone import MicrophoneSource, check_device
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -187,7 +183,7 @@ class _Unheard:
 class _Resumed:
     """A source with a gap before its first frame: from the end of the last log on."""
 
-    def __init__(self, source: SoundSource, end: int, rest: Rest) -> None:
+    def __init__(self, source: SoundSource, end: int, rest: PauseSchedule) -> None:
         self._source = source
         self._end = end
         resting = rest.reason()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hearthlog.recorder.direction.geometry import SPEED_OF_SOUND
+from hearthlog.recorder.stream.directions import SPEED_OF_SOUND
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 SQUARE = [[0.032, 0.0], [0.0, 0.032], [-0.032, 0.0], [0.0, -0.032]]

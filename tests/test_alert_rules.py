@@ -28,7 +28,7 @@ from hearthlog.analyzer.bridge.alerts.unusual_days import home_sound
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.rest import quiet_hours
+from hearthlog.recorder.pause_schedule import quiet_hours
 
 VIENNA = ZoneInfo("Europe/Vienna")
 SECOND = 1_000_000_000

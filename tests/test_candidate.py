@@ -26,9 +26,8 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote, target
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
-from hearthlog.recorder.labelling.model_watch import ModelWatch
+from hearthlog.recorder.labelling.model_watch import CandidateWatch, ModelWatch
 from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
@@ -152,7 +151,7 @@ class CountingWatch(CandidateWatch):
 
 
 def test_only_another_candidate_begins_a_log(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.labelling.candidate_watch.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("hearthlog.recorder.labelling.model_watch.LOOK_SECONDS", 0.01)
     promote(folder, "two", "candidate")
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
     candidates = CountingWatch(folder, DEFAULT)

@@ -18,8 +18,7 @@ from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import WARNING, Frames, Gap, SourceHealth
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.recorder.sources.channels import StreamMixer
-from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.decoding import StreamMixer, read_audio
 
 RATE = 16_000
 START = 1_772_348_400_000_000_000

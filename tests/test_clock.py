@@ -6,9 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.sources.frame_cutter import FrameCutter
-from hearthlog.recorder.sources.framing import Framer, SampleBlock
-from hearthlog.recorder.sources.sample_clock import SampleClock
+from hearthlog.recorder.sources.framing import FrameCutter, Framer, SampleBlock, SampleClock
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 RATE = 16_000

@@ -26,8 +26,8 @@ from hearthlog.analyzer.bridge.settings import (
 )
 from hearthlog.models.starter import BATHROOM, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
-from hearthlog.recorder.config_origins import key_lines
-from hearthlog.recorder.disk.keeping import keep_disk
+from hearthlog.recorder.config_problems import key_lines
+from hearthlog.recorder.disk_keeper import keep_disk
 from hearthlog.recorder.errors import ConfigurationError
 
 

@@ -5,9 +5,14 @@ import threading
 import pytest
 
 from hearthlog.recorder.errors import DeviceError
-from hearthlog.recorder.sources import sound_cards
-from hearthlog.recorder.sources.devices import Device, find_device, list_devices
-from hearthlog.recorder.sources.usb import UsbPlace, usb_place
+from hearthlog.recorder.sources import process
+from hearthlog.recorder.sources.capture import (
+    Device,
+    UsbPlace,
+    find_device,
+    list_devices,
+    usb_place,
+)
 
 pytestmark = pytest.mark.fast
 
@@ -59,7 +64,7 @@ def test_a_card_at_usb_has_a_port_and_perhaps_a_serial_number(cards):
 @pytest.fixture
 def devices(cards, monkeypatch):
     monkeypatch.setattr(
-        "hearthlog.recorder.sources.devices.usb_place", lambda card: usb_place(card, cards)
+        "hearthlog.recorder.sources.capture.usb_place", lambda card: usb_place(card, cards)
     )
     return list_devices(PortAudio)
 
@@ -108,8 +113,8 @@ def test_only_the_whole_name_will_do_where_it_must_be_the_same_device():
 
 
 def test_a_card_that_is_plugged_in_ends_the_wait_for_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(sound_cards, "_CARDS", tmp_path)
+    monkeypatch.setattr(process, "_CARDS", tmp_path)
     plug = threading.Timer(0.5, (tmp_path / "pcmC1D0c").touch)
     plug.start()
-    assert sound_cards.cards_change(threading.Event(), 60.0)
-    assert not sound_cards.cards_change(threading.Event(), 0.1)
+    assert process.cards_change(threading.Event(), 60.0)
+    assert not process.cards_change(threading.Event(), 0.1)

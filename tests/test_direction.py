@@ -28,15 +28,13 @@ from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings, load_settings
-from hearthlog.recorder.direction.channel_watch import ChannelWatch
-from hearthlog.recorder.direction.geometry import array_geometry
-from hearthlog.recorder.direction.srp_phat import DirectionFinder
 from hearthlog.recorder.errors import ConfigurationError, SourceError
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.capture import _some_channels
-from hearthlog.recorder.stream.direction_messages import ArrayDirections
+from hearthlog.recorder.stream.directions import ChannelWatch, DirectionFinder, array_geometry
+from hearthlog.recorder.stream.stages import ArrayDirections
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs

@@ -27,8 +27,8 @@ from hearthlog.models.embedding.networks import (
 )
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Projection, write_projection
 from hearthlog.models.errors import ModelError
-from hearthlog.recorder import embedder_probe
-from hearthlog.recorder.embedder_probe import Probe, open_embedder, probe_network
+from hearthlog.recorder.labelling import embedder_probe
+from hearthlog.recorder.labelling.embedder_probe import Probe, open_embedder, probe_network
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.cli import fetch as verb
@@ -159,7 +159,8 @@ def test_a_process_without_standard_error_loads_it():
 def test_a_recorder_without_a_network_imports_no_runtime():
     code = (
         "import sys; import hearthlog.recorder.recording; "
-        "from hearthlog.recorder.embedder_probe import open_embedder; open_embedder('none'); "
+        "from hearthlog.recorder.labelling.embedder_probe import open_embedder; "
+        "open_embedder('none'); "
         "assert not {'ai_edge_litert', 'onnx', 'onnxruntime'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

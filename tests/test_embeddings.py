@@ -21,8 +21,13 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file, with_network
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.recorder.stream.private_frames import NAMED_FRAMES, PRIVATE_LOGIT, PrivateFrames
-from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames
+from hearthlog.recorder.stream.privacy_filter import (
+    NAMED_FRAMES,
+    PRIVATE_LOGIT,
+    EmbeddingPrivacyFilter,
+    LoggedFrames,
+    PrivateFrames,
+)
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
@@ -263,7 +268,7 @@ def test_names_of_speech_count_for_two_seconds_in_blocks_of_any_size(step):
 
 
 def test_embeddings_are_dropped_whose_windows_reach_into_what_is_private():
-    veil = EmbeddingVeil()
+    veil = EmbeddingPrivacyFilter()
     veil.push(embeddings_at(*range(0, 100, 10)))
     private = np.zeros(100, bool)
     private[47] = True

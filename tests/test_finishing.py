@@ -23,10 +23,8 @@ from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
-from hearthlog.recorder.log.description import describe_log
-from hearthlog.recorder.log.finishing import LogFinisher, finish_log
-from hearthlog.recorder.log.recovery import recover_active
-from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.log.recovery import LogFinisher, finish_log, recover_active
+from hearthlog.recorder.log.rolling_log import RollingLog, describe_log
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
@@ -39,7 +37,7 @@ from hearthlog.schemas.messages.topics import Topic
 
 HOUR = 3600 * NANOSECONDS
 START = 490_000 * HOUR
-FINISH = [sys.executable, "-m", "hearthlog.recorder.log.finishing"]
+FINISH = [sys.executable, "-m", "hearthlog.recorder.log.recovery"]
 
 
 class Live:
@@ -160,7 +158,7 @@ def test_a_rewriting_ends_with_the_recorder_and_the_next_start_does_it(live_hour
     copy = shutil.copy(active, tmp_path / active.name)
     code = (
         "import os, sys; from pathlib import Path\n"
-        "from hearthlog.recorder.log.finishing import LogFinisher\n"
+        "from hearthlog.recorder.log.recovery import LogFinisher\n"
         "finisher = LogFinisher(); finisher.add([Path(sys.argv[1])])\n"
         "print(finisher._processes[0].pid, flush=True); os.kill(os.getpid(), 9)"
     )
@@ -196,7 +194,7 @@ def test_without_room_for_a_copy_a_log_gets_its_name_as_it_is(live_hour, tmp_pat
     copy = shutil.copy(active, tmp_path / active.name)
     code = (
         "import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
-        "runpy.run_module('hearthlog.recorder.log.finishing', run_name='__main__')"
+        "runpy.run_module('hearthlog.recorder.log.recovery', run_name='__main__')"
     )
     with subprocess.Popen([sys.executable, "-c", code, copy], stdin=subprocess.PIPE) as process:
         assert process.wait() == 0

@@ -17,7 +17,7 @@ from test_fuzz import BYTES, FEW, START, of_bytes
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings, load_settings
-from hearthlog.recorder.rest import Rest
+from hearthlog.recorder.pause_schedule import PauseSchedule
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogError
 
@@ -81,7 +81,7 @@ def heard(path, _folder):
 
 def paused(path, folder):
     path.replace(folder / ".pause")
-    rest = Rest([], UTC, folder)
+    rest = PauseSchedule([], UTC, folder)
     assert rest.reason() in {"", "paused"}
     rest.describe()
 

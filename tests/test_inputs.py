@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hearthlog.models.features.auros21 import AUROS21, bands_of, dct_weights
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.home33 import HOME33
-from hearthlog.recorder.stream.statistics import RollingStatistics
+from hearthlog.recorder.stream.stages import RollingStatistics
 
 pytestmark = pytest.mark.fast
 

@@ -7,7 +7,7 @@ from test_capture import wait_for_frames
 from test_rest import recording
 
 from hearthlog.recorder.events import OK, WARNING
-from hearthlog.recorder.machine import machine_health
+from hearthlog.recorder.host import machine_health
 
 THROTTLED = "devices/platform/soc/soc:firmware/get_throttled"
 ZONE = "class/thermal/thermal_zone{}/temp"

@@ -8,7 +8,7 @@ SCRIPT = """
 import ctypes
 from pathlib import Path
 
-from hearthlog.recorder.memory import give_back
+from hearthlog.recorder.host import give_back
 
 PIECES, BYTES = 400_000, 200  # such as the C library keeps
 

@@ -24,7 +24,7 @@ from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
-from hearthlog.recorder.rest import paused_until
+from hearthlog.recorder.pause_schedule import paused_until
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 

@@ -32,13 +32,13 @@ from hearthlog.recorder.addresses import check_address, public_name
 from hearthlog.recorder.config import MicrophoneSettings
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import SourceHealth
+from hearthlog.recorder.sources.capture import ArrivalPace
 from hearthlog.recorder.sources.microphone import MicrophoneSource
-from hearthlog.recorder.sources.pace import Pace
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 
-CAPTURE = "hearthlog.recorder.sources.network_capture"
+CAPTURE = "hearthlog.recorder.sources.ffmpeg"
 USER = "listener:pass%40word@"
 
 
@@ -292,7 +292,7 @@ def test_two_microphones_of_one_address_are_refused_without_its_password(hearthl
 
 
 def test_sound_that_a_server_had_kept_is_told_from_live_sound():
-    pace = Pace(100.0)
+    pace = ArrivalPace(100.0)
     pace.add(4 * RATE, 100.5)  # four seconds at once, half a second after the call
     for second in range(1, 4):
         pace.add(RATE, 100.5 + second)
@@ -301,7 +301,7 @@ def test_sound_that_a_server_had_kept_is_told_from_live_sound():
 
 
 def test_sound_that_is_delayed_is_not_lost_and_sound_that_is_lost_is_noticed():
-    pace = Pace(0.0)
+    pace = ArrivalPace(0.0)
     pace.add(RATE, 1.0)
     pace.settle()
     found = []

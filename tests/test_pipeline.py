@@ -8,8 +8,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.recorder.stream import rosout
-from hearthlog.recorder.stream.messages import opening_messages
+from hearthlog.recorder.stream.messages import gap_line, opening_messages
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.message_types import (
@@ -134,7 +133,7 @@ def test_the_first_line_names_the_device_and_the_model():
 
 def test_the_clock_that_was_set_back_is_a_gap_of_less_than_nothing():
     gap = Gap(START, START - 3 * 10**9, "the clock was set by -3.000 s", 0)
-    line = decode(rosout.gap_line("mic", gap), LOG)
+    line = decode(gap_line("mic", gap), LOG)
     assert line.msg == "gap of -3.00 s: the clock was set by -3.000 s"
 
 

@@ -34,9 +34,8 @@ from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
 from hearthlog.analyzer.review.timeline.model import no_spans
 from hearthlog.models.starter import GENERAL, starter_file
-from hearthlog.recorder.clips.clip_choice import KeptSound
-from hearthlog.recorder.clips.clip_layer import ClipWriter
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.log.clips import ClipWriter, KeptSound
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, read_time
 from hearthlog.schemas.logs.files import active_path, find_logs, is_layer
 from hearthlog.tools.home.clips import ClipLibrary

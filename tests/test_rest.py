@@ -20,7 +20,13 @@ from test_swap import wait_for
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.rest import Rest, pause, paused_until, quiet_hours, resume
+from hearthlog.recorder.pause_schedule import (
+    PauseSchedule,
+    pause,
+    paused_until,
+    quiet_hours,
+    resume,
+)
 from hearthlog.schemas.logs.files import find_logs
 
 
@@ -137,11 +143,11 @@ def test_a_pause_follows_no_link_and_belongs_to_whom_the_folder_belongs_to(tmp_p
     assert other.read_text() == "1"
     assert not (logs / ".pause").is_symlink()
     assert (logs / ".pause").stat().st_uid == logs.stat().st_uid
-    assert Rest([], UTC, logs).describe().startswith("paused by Anna until ")
+    assert PauseSchedule([], UTC, logs).describe().startswith("paused by Anna until ")
 
 
 def test_a_pause_ends_by_itself(tmp_path):
-    rest = Rest([], UTC, tmp_path)
+    rest = PauseSchedule([], UTC, tmp_path)
     pause(tmp_path, timedelta(seconds=5))
     assert rest.reason() == "paused"
     wait_for(lambda: rest.reason() == "")
@@ -150,8 +156,8 @@ def test_a_pause_ends_by_itself(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"tomorrow", b"\xff" * 100, b"9" * 64, b"-" * 64])
 def test_a_pause_file_that_cannot_be_read_pauses(tmp_path, content):
     (tmp_path / ".pause").write_bytes(content)
-    assert Rest([], UTC, tmp_path).reason() == "paused"
-    assert Rest([], UTC, tmp_path).describe().startswith("paused until ")
+    assert PauseSchedule([], UTC, tmp_path).reason() == "paused"
+    assert PauseSchedule([], UTC, tmp_path).describe().startswith("paused until ")
 
 
 def test_a_pause_whose_end_nobody_lives_to_see_has_none(tmp_path):
@@ -162,7 +168,7 @@ def test_a_pause_whose_end_nobody_lives_to_see_has_none(tmp_path):
 def test_a_pipe_in_place_of_the_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / ".pause")
     assert paused_until(tmp_path) is None
-    assert Rest([], UTC, tmp_path).reason() == "paused"
+    assert PauseSchedule([], UTC, tmp_path).reason() == "paused"
 
 
 @pytest.mark.parametrize(

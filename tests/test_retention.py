@@ -20,13 +20,17 @@ from spliced import small_disk
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.disk.keeper import DiskKeeper
-from hearthlog.recorder.disk.keeping import keep_disk
-from hearthlog.recorder.disk.limits import KeepingRules, Limits
-from hearthlog.recorder.disk.recorded import RecordedDays, recorded_logs
-from hearthlog.recorder.disk.retention import Disk, plan_retention
+from hearthlog.recorder.disk_keeper import DiskKeeper, keep_disk
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.host import Disk
 from hearthlog.recorder.recording import record
+from hearthlog.recorder.retention import (
+    KeepingRules,
+    Limits,
+    RecordedDays,
+    plan_retention,
+    recorded_logs,
+)
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.files import active_path, find_logs, log_path
 
@@ -308,7 +312,7 @@ def test_killed_in_the_middle_of_it_every_log_is_there_or_not(logs, seed):
         for name in ("audio", "relabel-x", "relabel-y"):
             shutil.copy(log, log.with_name(f"{log.stem}.{name}.mcap"))
     rules = KeepingRules(str(logs[0].parents[3]), "home", Limits(files=2))
-    command = [sys.executable, "-m", "hearthlog.recorder.disk.keeper", json.dumps(rules)]
+    command = [sys.executable, "-m", "hearthlog.recorder.disk_keeper", json.dumps(rules)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         kill_while_deleting(process, logs[0], random.Random(seed).uniform(0, 0.004))
     kept = recorded_logs(logs[0].parents[3], "home", [])

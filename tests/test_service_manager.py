@@ -16,7 +16,7 @@ from test_capture import recording
 from test_disk import small_disk
 
 from hearthlog.recorder.events import ERROR, OK, Frames, SourceHealth
-from hearthlog.recorder.service_manager import ServiceManager
+from hearthlog.recorder.host import ServiceManager
 
 __all__ = ["small_disk"]
 

@@ -17,9 +17,9 @@ from spliced import run
 from hearthlog.analyzer.live import _networks
 from hearthlog.models.embedding.networks import NETWORKS, YAMNET, NetworkFile
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder import embedder_probe
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
-from hearthlog.recorder.embedder_probe import Probe, likely_network
+from hearthlog.recorder.labelling import embedder_probe
+from hearthlog.recorder.labelling.embedder_probe import Probe, likely_network
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import NANOSECONDS

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.models.features.auros21 import WINDOW_FRAMES, FeatureExtractor
-from hearthlog.recorder.stream.statistics import RollingStatistics
+from hearthlog.recorder.stream.stages import RollingStatistics
 
 pytestmark = pytest.mark.fast
 

@@ -18,8 +18,8 @@ from spliced import run
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.recorder.disk.keeping import keep_disk
-from hearthlog.recorder.disk.limits import KeepingRules, Limits, ThinningDays
+from hearthlog.recorder.disk_keeper import keep_disk
+from hearthlog.recorder.retention import KeepingRules, Limits, ThinningDays
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, log_path
@@ -189,7 +189,7 @@ def test_commands_read_thinned_logs(logs, command, days, tmp_path, hearthlog):
 def test_killed_in_the_middle_of_it_a_log_is_the_old_or_the_new_one(logs, seed):
     originals = [messages(log) for log in logs]
     rules = KeepingRules(str(logs[0].parents[3]), "home", Limits(), ThinningDays(features=1))
-    command = [sys.executable, "-m", "hearthlog.recorder.disk.keeper", json.dumps([rules, True])]
+    command = [sys.executable, "-m", "hearthlog.recorder.disk_keeper", json.dumps([rules, True])]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         while not list(logs[0].parents[3].rglob("*.thinning")) and process.poll() is None:
             pass
@@ -220,7 +220,7 @@ def test_without_room_for_a_copy_a_log_stays_as_it_is_and_that_is_said(logs):
     rules = KeepingRules(str(logs[0].parents[3]), "home", Limits(), ThinningDays(statistics=1))
     code = (
         "import resource, runpy; resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, 9_000))\n"
-        "runpy.run_module('hearthlog.recorder.disk.keeper', run_name='__main__')"
+        "runpy.run_module('hearthlog.recorder.disk_keeper', run_name='__main__')"
     )
     result = subprocess.run(
         [sys.executable, "-c", code, json.dumps([rules, True])], capture_output=True, check=True

@@ -22,8 +22,11 @@ from hearthlog.recorder.events import ERROR, OK, Frames, SourceHealth
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.recorder.stream.private_frames import PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE
-from hearthlog.recorder.stream.veil import Veil
+from hearthlog.recorder.stream.privacy_filter import (
+    PRIVATE_LIMIT,
+    PRIVATE_LIMIT_ELSEWHERE,
+    PrivacyFilter,
+)
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -43,7 +46,7 @@ def labels_of(said):
 
 def veiled(first, said, features, blocks):
     """Push frames, one for each probability of speech; return what is logged of them."""
-    veil, sizes, parts, start = Veil(["speech"], 2, WINDOW), itertools.cycle(blocks), [], 0
+    veil, sizes, parts, start = PrivacyFilter(["speech"], 2, WINDOW), itertools.cycle(blocks), [], 0
     while start < len(said):
         end = min(start + next(sizes), len(said))
         stamps = START + np.arange(first + start, first + end) * FRAME_NANOSECONDS
@@ -90,7 +93,7 @@ def test_frames_near_speech_have_the_mean_of_their_second_and_all_others_their_o
 
 
 def test_of_a_model_that_does_not_know_it_everything_is_private():
-    veil = Veil(["crying"], 2, WINDOW)
+    veil = PrivacyFilter(["crying"], 2, WINDOW)
     assert veil.unknown(CLASSES) == ["crying"]
     features = np.arange(200, dtype=np.float32).reshape(100, 2)
     stamps = START + np.arange(100) * FRAME_NANOSECONDS

@@ -3,7 +3,7 @@
 import pytest
 from logreader import LogReader
 
-from hearthlog.recorder import timezone as zone
+from hearthlog.recorder import pause_schedule
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.errors import ConfigurationError
 
@@ -14,8 +14,8 @@ def machine(tmp_path, monkeypatch):
 
     def make(variable="", file="", link=""):
         monkeypatch.setenv("TZ", variable)
-        monkeypatch.setattr(zone, "_NAME_FILE", tmp_path / "timezone")
-        monkeypatch.setattr(zone, "_LINK", tmp_path / "localtime")
+        monkeypatch.setattr(pause_schedule, "_NAME_FILE", tmp_path / "timezone")
+        monkeypatch.setattr(pause_schedule, "_LINK", tmp_path / "localtime")
         if file:
             (tmp_path / "timezone").write_text(file)
         if link:

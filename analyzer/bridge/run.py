@@ -13,8 +13,7 @@ from hearthlog.analyzer.bridge.follow_home import follow_home
 from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import RECENT, News, Output
-from hearthlog.recorder.memory import give_back, keep_one_heap
-from hearthlog.recorder.service_manager import notify
+from hearthlog.recorder.host import give_back, keep_one_heap, notify
 from hearthlog.schemas.frames import NANOSECONDS
 
 _WATCHDOG_SECONDS = 10.0

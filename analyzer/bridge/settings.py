@@ -27,8 +27,7 @@ from hearthlog.recorder.config import (
     Settings,
     load_settings,
 )
-from hearthlog.recorder.config_origins import Origins, key_lines
-from hearthlog.recorder.config_problems import configuration_error
+from hearthlog.recorder.config_problems import Origins, configuration_error, key_lines
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.files import read_toml
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, date, datetime, timedelta, tzinfo
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.recorder.timezone import DEFAULT, time_zone
+from hearthlog.recorder.pause_schedule import DEFAULT, time_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 

@@ -24,13 +24,13 @@ from hearthlog.models.classes import CLASS_NAME, SILENCE, class_name
 from hearthlog.models.features.feature_set import SILENCE_POWER
 from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
+from hearthlog.recorder.pause_schedule import time_zone
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.file_times import GUESS, file_time
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.recorder.stream.sound_watch import ClipWatch, problem_of_file
-from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.sources.frame_cutter import FrameCutter
+from hearthlog.recorder.sources.framing import FrameCutter
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 

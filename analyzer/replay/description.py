@@ -9,7 +9,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile.modelfile import CARD, DESCRIPTION, model_attachments
-from hearthlog.recorder.log.description import LogDescription, with_scenarios
+from hearthlog.recorder.log.rolling_log import LogDescription, with_scenarios
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.schemas.logs.metadata import FEATURE_SET, provenance
 from hearthlog.schemas.messages.topics import (

@@ -16,12 +16,10 @@ from hearthlog.models.classifiers.names import is_by_names, without_classes
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.labelling.clashes import clash, shared_classes
-from hearthlog.recorder.log.description import LogDescription
-from hearthlog.recorder.log.rolling_log import RollingLog
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.labelling.labelling_models import class_conflict, shared_classes
+from hearthlog.recorder.log.rolling_log import LogDescription, RollingLog
+from hearthlog.recorder.stream.messages import LOGGED_EVERY, EncodedMessage
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, SCENARIO, scenario_labelling, topic
@@ -192,7 +190,7 @@ class Player:
                     f"{info.path}: is replayed with feature set {features.name}; model "
                     f"{model.name} of scenario {name} is for {theirs}: {models_for(features.name)}"
                 )
-            if reason := clash(model, known):
+            if reason := class_conflict(model, known):
                 where = f"model {model.name} of scenario {name}"
                 raise LogError(f"{info.path}: cannot be replayed so: {where} {reason}")
             known[scenario_labelling(name)] = beside[name] = model

@@ -9,7 +9,7 @@ from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.recorder.sources.frame_cutter import FrameCutter
+from hearthlog.recorder.sources.framing import FrameCutter
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 

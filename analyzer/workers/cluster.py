@@ -278,7 +278,7 @@ def _caller() -> Callable[..., Any]:
     def call(packed: bytes, *sent: Any) -> Any:
         import pickle  # noqa: PLC0415  runs elsewhere
 
-        from hearthlog.recorder.memory import keep_freed_blocks  # noqa: PLC0415
+        from hearthlog.recorder.host import keep_freed_blocks  # noqa: PLC0415
 
         keep_freed_blocks()
         function, args, places = pickle.loads(packed)  # noqa: S301  sent by our own client

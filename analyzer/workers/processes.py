@@ -20,8 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.workers.pickled_calls import attempt, pack_call, read_reply
-from hearthlog.recorder.memory import keep_freed_blocks
-from hearthlog.recorder.modules import module_command
+from hearthlog.recorder.host import keep_freed_blocks, module_command
 from hearthlog.schemas.blas import kernel_environment
 from hearthlog.schemas.errors import HearthlogWarning
 

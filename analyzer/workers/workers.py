@@ -7,7 +7,7 @@ from typing import ParamSpec, Protocol, TypeVar
 
 from hearthlog.analyzer.workers.cluster import connected
 from hearthlog.analyzer.workers.processes import Processes
-from hearthlog.recorder.memory import keep_freed_blocks
+from hearthlog.recorder.host import keep_freed_blocks
 
 P = ParamSpec("P")
 T = TypeVar("T")

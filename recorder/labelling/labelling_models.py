@@ -1,22 +1,66 @@
-"""The models that label the sound of microphones: one, a candidate, and those of scenarios."""
+"""Models of a microphone: live, candidate and scenarios, and conflicts between their classes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.models.classes import OF_EVERY_SCENARIO, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.names import is_by_names, without_classes
+from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.features.installed import DEFAULT, feature_set
+from hearthlog.models.modelfile.modelfile import SUFFIX
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.recorder.config import NO_MODEL, Settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.journal import say
-from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
-from hearthlog.recorder.labelling.clashes import clash, shared_classes
-from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch
-from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labelling
+from hearthlog.recorder.host import say
+from hearthlog.recorder.labelling.model_watch import (
+    CandidateWatch,
+    Loaded,
+    ModelWatch,
+    ReloadRequests,
+)
+from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labelling, spelt
 
 
-class Change(NamedTuple):
+def class_conflict(model: Model, others: Mapping[str, Model]) -> str:
+    """Say which class of a model another one labels as well.
+
+    Returns
+    -------
+    str
+        The rest of a sentence that begins with the model; empty if there is none. Two names of a
+        class are one class; `silence`, `unknown` and `other` may be of every model.
+    """
+    own = _classes(model)
+    for labelling, other in others.items():
+        for name, theirs in _classes(other).items():
+            if name in own:
+                alias = "" if own[name] == theirs else f" (there {theirs!r})"
+                what = "the live model" if labelling == LIVE else labelling.replace("/", " ")
+                return (
+                    f"labels {own[name]!r}, and so does {what}, {other.name}{alias}; each class "
+                    "can be of one only: leave one of them out, or train one without the class"
+                )
+    return ""
+
+
+def shared_classes(model: Model, others: Iterable[Model]) -> list[str]:
+    """Return the classes of a model that others label as well, by its names."""
+    theirs = {name for other in others for name in _classes(other)}
+    return [label for name, label in _classes(model).items() if name in theirs]
+
+
+def _classes(model: Model) -> dict[str, str]:
+    """Return the names of classes of a model, by those that two spellings share."""
+    names = {class_name(spelt(label)): label for label in model.classes}
+    return {name: label for name, label in names.items() if name not in OF_EVERY_SCENARIO}
+
+
+class ModelChange(NamedTuple):
     """A model takes over a labelling.
 
     Attributes
@@ -63,7 +107,7 @@ class LabellingModels:
         for labelling, each in list(self._watches.items()):
             if is_by_names(each.first.model):
                 continue
-            if reason := clash(each.first.model, self._others(labelling)):
+            if reason := class_conflict(each.first.model, self._others(labelling)):
                 self.leave_out(labelling, f"model {each.first.model.name} {reason}")
             else:
                 self.in_use[labelling] = each.first
@@ -87,7 +131,7 @@ class LabellingModels:
         """Of that model."""
         return self.in_use[LIVE].classifier if LIVE in self.in_use else None
 
-    def beside(self) -> dict[str, Loaded]:
+    def secondary(self) -> dict[str, Loaded]:
         """Return what labels beside that model, by labelling."""
         return {name: loaded for name, loaded in self.in_use.items() if name != LIVE}
 
@@ -129,7 +173,7 @@ class LabellingModels:
         for labelling, watch in self._watches.items():
             if watch.ready is None or is_by_names(watch.first.model):
                 continue
-            if reason := clash(watch.ready.model, self._others(labelling)):
+            if reason := class_conflict(watch.ready.model, self._others(labelling)):
                 refused.append(watch.refuse_ready(reason, self.in_use[labelling].model))
         return refused
 
@@ -138,19 +182,19 @@ class LabellingModels:
         is_ready = any(watch.ready is not None for watch in self._watches.values())
         return is_ready or self._trial_changes()
 
-    def change(self) -> list[Change]:
+    def change(self) -> list[ModelChange]:
         """Put the models in use that are ready."""
         changes = []
         for labelling, watch in self._watches.items():
             if watch.ready is not None:
                 self.in_use[labelling], watch.ready, watch.held = watch.ready, None, None
-                changes.append(Change(labelling, *self.in_use[labelling]))
+                changes.append(ModelChange(labelling, *self.in_use[labelling]))
         changes += self._change_names()
         if self._trial_changes():
             changes.append(self._change_trial())
         return changes
 
-    def _change_names(self) -> list[Change]:
+    def _change_names(self) -> list[ModelChange]:
         """Leave to other models the classes that they were taught, and names only what is left."""
         changes = []
         for labelling, watch in self._watches.items():
@@ -168,7 +212,7 @@ class LabellingModels:
                 self.in_use[labelling] = loaded
             if _identity(loaded) != _identity(before):
                 of_none = None, None
-                changes.append(Change(labelling, *(of_none if loaded is None else loaded)))
+                changes.append(ModelChange(labelling, *(of_none if loaded is None else loaded)))
         return changes
 
     def _others(self, labelling: str) -> dict[str, Model]:
@@ -181,13 +225,13 @@ class LabellingModels:
         loaded = {name: watch.ready or self.in_use.get(name) for name, watch in others.items()}
         return {name: each.model for name, each in loaded.items() if each is not None}
 
-    def _change_trial(self) -> Change:
+    def _change_trial(self) -> ModelChange:
         loaded = self._on_trial()
         self.in_use.pop(CANDIDATE, None)
         if loaded is None:
-            return Change(CANDIDATE, None, None)
+            return ModelChange(CANDIDATE, None, None)
         self.in_use[CANDIDATE] = loaded
-        return Change(CANDIDATE, *loaded)
+        return ModelChange(CANDIDATE, *loaded)
 
     def _trial_changes(self) -> bool:
         return _identity(self._on_trial()) != _identity(self.in_use.get(CANDIDATE))
@@ -202,3 +246,78 @@ class LabellingModels:
 
 def _identity(loaded: Loaded | None) -> tuple[str, str] | None:
     return None if loaded is None else (loaded.model.name, loaded.model.sha256)
+
+
+def open_models(  # noqa: PLR0913
+    settings: Settings,
+    microphones: Sequence[str],
+    reload_requests: ReloadRequests | None,
+    stack: ExitStack,
+    *,
+    leaves_out: bool = False,
+    network: str = "",
+) -> dict[str, LabellingModels]:
+    """Load the models of microphones, and watch their files; once for those that have the same.
+
+    Parameters
+    ----------
+    reload_requests : ReloadRequests or None
+        Make the recorder check at once whether a file has been replaced.
+    leaves_out : bool
+        Whether scenarios that cannot label are left out; else they are an error.
+
+    Raises
+    ------
+    ModelError
+        If a model cannot be used.
+    ConfigurationError
+        If models cannot label side by side.
+    """
+    reload_requests = reload_requests or ReloadRequests()
+    chosen = {
+        each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
+        for each in settings.microphone
+    }
+    models: dict[str, LabellingModels] = {}
+    for name in microphones:
+        same = next((other for other in models if chosen[other] == chosen[name]), None)
+        models[name] = (
+            _watched_models(
+                settings, *chosen[name], reload_requests, stack, network, leaves_out=leaves_out
+            )
+            if same is None
+            else models[same]
+        )
+    return models
+
+
+def _watched_models(  # noqa: PLR0913, PLR0917
+    settings: Settings,
+    path: Path,
+    scenarios: Mapping[str, Path],
+    reload_requests: ReloadRequests,
+    stack: ExitStack,
+    network: str,
+    *,
+    leaves_out: bool,
+) -> LabellingModels:
+    watches = {}
+    left_out: list[str] | None = [] if leaves_out else None
+    for name, file in scenarios.items():
+        try:
+            watch = ModelWatch(file, reload_requests.queue(), name, network)
+            watches[name] = stack.enter_context(closing(watch))
+        except ModelError as error:
+            if left_out is None:
+                raise
+            left_out.append(str(error))
+    if path == NO_MODEL:
+        features = feature_set(settings.feature_set or DEFAULT.name)
+        return LabellingModels(scenarios=watches, left_out=left_out, features=features)
+    watch = ModelWatch(path, reload_requests.queue(), network=network)
+    stack.enter_context(closing(watch))
+    is_file = path.suffix == SUFFIX  # else the name of a starter
+    folder = path.parent if is_file else DEFAULT_FOLDER
+    candidates = CandidateWatch(folder, watch.first.classifier.feature_set)
+    stack.enter_context(closing(candidates))
+    return LabellingModels(watch, candidates, watches, left_out)

@@ -1,6 +1,6 @@
-"""The model file in use, watched: a file that replaces it is loaded and checked in a thread.
+"""Watched model files: a replaced model or candidate is loaded and checked in a thread.
 
-A model that replaces another one labels only if there is a judgement that lets it; one of a
+A model that replaces another one labels only with a judgement that permits it; the model of a
 scenario needs none.
 """
 
@@ -15,8 +15,10 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import load_model, name_and_digest, starter_for
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.modelfile.modelfile import SUFFIX, load_model, name_and_digest, starter_for
 from hearthlog.models.modelfile.registry import (
+    CANDIDATE,
     DEFAULT_MODEL,
     is_starter,
     judgement_path,
@@ -24,8 +26,7 @@ from hearthlog.models.modelfile.registry import (
     read_judgement,
 )
 from hearthlog.models.starter import GENERAL, STARTERS
-from hearthlog.recorder.journal import say
-from hearthlog.recorder.memory import give_back
+from hearthlog.recorder.host import give_back, say
 
 LOOK_SECONDS = 1.0
 
@@ -267,3 +268,74 @@ def file_identity(path: Path) -> FileIdentity:
     except OSError:
         return None
     return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
+
+
+class CandidateWatch:
+    """Checks every second, in a thread of its own, whether there is another candidate.
+
+    The candidate is the link `candidate.safetensors` beside the model in use. It need not be there.
+    """
+
+    def __init__(self, folder: Path, features: FeatureSet) -> None:
+        self._path = folder / (CANDIDATE + SUFFIX)
+        self._features = features
+        self._results: SimpleQueue[Loaded | str | None] = SimpleQueue()
+        self._closed = Flag()
+        self._seen = file_identity(self._path)
+        self._look()
+        self._refusals: list[str] = []
+        self.first = next(self._news(), None)
+        self._thread = Thread(target=self._watch, name="candidate watch", daemon=True)
+        self._thread.start()
+
+    def refusals(self) -> list[str]:
+        """Return why candidates were refused since the last call."""
+        refusals, self._refusals = self._refusals, []
+        return refusals
+
+    def news(self) -> list[Loaded | None]:
+        """Return the candidates since the last call; None where there was none any more."""
+        return list(self._news())
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closed.set()
+        self._thread.join()
+
+    def _news(self) -> Iterator[Loaded | None]:
+        with suppress(Empty):
+            while True:
+                result = self._results.get_nowait()
+                if isinstance(result, str):
+                    self._refusals.append(result)
+                else:
+                    yield result
+
+    def _watch(self) -> None:
+        while not self._closed.wait(LOOK_SECONDS):
+            now = file_identity(self._path)
+            if now != self._seen:
+                self._seen = now
+                self._look()
+
+    def _look(self) -> None:
+        if self._seen is None:
+            self._results.put(None)
+            return
+        try:
+            loaded = load_checked(self._path)
+        except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on
+            if file_identity(self._path) == self._seen:  # else it is still being written
+                self._refuse(str(error) or repr(error))
+            return
+        theirs = loaded.classifier.feature_set
+        if theirs == self._features:
+            self._results.put(loaded)
+        else:
+            self._refuse(f"it is for feature set {theirs.name}, not {self._features.name}")
+
+    def _refuse(self, reason: str) -> None:
+        text = f"candidate refused: {reason}"
+        self._results.put(text)
+        self._results.put(None)
+        say(text)

@@ -1,21 +1,171 @@
-"""The log that is being recorded: one file after another, aligned to the clock."""
+"""The log of a recorder: files of a limited length and size, and their description."""
 
+import hashlib
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import entries_of
+from hearthlog.models.modelfile.modelfile import attachment_of, model_attachments
+from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Notice
-from hearthlog.recorder.log.description import LogDescription
-from hearthlog.recorder.log.finishing import LogFinisher
-from hearthlog.recorder.log.recovery import active_logs
+from hearthlog.recorder.log.recovery import LogFinisher, active_logs
 from hearthlog.recorder.stream.messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import free_log_path, log_path
-from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.logs.metadata import (
+    RecordedScenario,
+    other_features,
+    provenance,
+    scenario_entries,
+)
+from hearthlog.schemas.logs.writer import Attachment, LogWriter
 from hearthlog.schemas.messages.message_types import header
+from hearthlog.schemas.messages.topics import (
+    CANDIDATE,
+    SCENARIO,
+    EmbeddingSource,
+    Topic,
+    topics_of,
+)
+
+
+@dataclass(frozen=True)
+class LogDescription:
+    """What every file of a recording says of itself."""
+
+    root: Path  # folder of the logs
+    node: str  # name of the recorder
+    topics: Sequence[Topic]
+    infos: Sequence[Any]  # `AudioStreamInfo` of each microphone; each file sets their stamps
+    metadata: Mapping[str, str]  # the `hearthlog` record
+    attachments: Sequence[Attachment]
+    # By microphone, what the lines of `/rosout` at the start of a file say besides.
+    lines: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
+def describe_log(  # noqa: PLR0913, PLR0917
+    settings: Settings,
+    info: Any,
+    features: FeatureSet,
+    model: Model | None,
+    secondary: Mapping[str, Model] | None = None,
+    embedding: EmbeddingSource | None = None,
+) -> LogDescription:
+    """Return the description of the logs of one microphone.
+
+    Parameters
+    ----------
+    model : Model or None
+        The model that labels the sound; None for no labels.
+    embedding : EmbeddingSource, optional
+        Of the embeddings; None without a network.
+    """
+    secondary = secondary or {}
+    microphone = info.header.frame_id
+    models = {"model", "scenarios"}
+    # Paths of this machine.
+    elsewhere: Any = dict.fromkeys(["output", *models], True)
+    elsewhere["microphone"] = {"__all__": models}
+    configuration = settings.model_dump_json(indent=2, exclude=elsewhere).encode()
+    classes = None if model is None else list(model.classes)
+    attachments = [Attachment("configuration.json", "application/json", configuration)]
+    metadata = provenance(
+        settings.node,
+        configuration_sha256=hashlib.sha256(configuration).hexdigest(),
+        **entries_of(features),
+        model=info.model,
+        model_sha256=info.model_sha256,
+        timezone=settings.timezone,
+    )
+    if (candidate := secondary.get(CANDIDATE)) is not None:
+        metadata |= {"candidate": candidate.name, "candidate_sha256": candidate.sha256}
+    if model is not None:
+        attachments += model_attachments(model)
+    named = {labelling: list(one.classes) for labelling, one in secondary.items()}
+    description = LogDescription(
+        root=settings.output,
+        node=settings.node,
+        topics=topics_of(
+            microphone,
+            features.feature_names,
+            classes,
+            named,
+            directions=bool(settings.settings_of(microphone).array),
+            embedding=embedding,
+        ),
+        infos=[info],
+        metadata=metadata,
+        attachments=attachments,
+    )
+    parts = {labelling.partition("/"): one for labelling, one in secondary.items()}
+    scenarios = {name: one for (kind, _, name), one in parts.items() if kind == SCENARIO}
+    return with_scenarios(description, microphone, scenarios)
+
+
+def with_scenarios(
+    description: LogDescription, microphone: str, scenarios: Mapping[str, Model]
+) -> LogDescription:
+    """Add what logs say of the scenarios of a microphone, but their topics."""
+    entries = dict(description.metadata)
+    attachments = list(description.attachments)
+    for name, model in scenarios.items():
+        entries |= scenario_entries(RecordedScenario(microphone, name, model.name, model.sha256))
+        attachments += _scenario_attachments(name, model)
+    lines = [
+        f"scenario {name}: {len(model.classes)} labels by {model.name} ({model.sha256[:12]})"
+        for name, model in scenarios.items()
+    ]
+    return replace(
+        description,
+        metadata=entries,
+        attachments=attachments,
+        lines={**description.lines, microphone: lines},
+    )
+
+
+def _scenario_attachments(scenario: str, model: Model) -> list[Attachment]:
+    own = f"{SCENARIO}-{scenario}"  # no microphone is called so
+    return [replace(each, name=attachment_of(each.name, own)) for each in model_attachments(model)]
+
+
+def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
+    """Return the description of the logs of several microphones."""
+    first = descriptions[0]
+    attachments = {each.name: each for each in first.attachments}
+    for other in descriptions[1:]:
+        (info,) = other.infos
+        for each in other.attachments:
+            if each not in attachments.values():
+                name = attachment_of(each.name, info.header.frame_id)
+                attachments[name] = replace(each, name=name)
+    topics = {topic.name: topic for each in descriptions for topic in each.topics}
+    features: dict[str, str] = {}
+    for other in descriptions[1:]:
+        (info,) = other.infos
+        features |= other_features(first.metadata, other.metadata, info.header.frame_id)
+    scenarios = {
+        key: text
+        for each in descriptions
+        for key, text in each.metadata.items()
+        if key.startswith(SCENARIO)
+    }
+    return replace(
+        first,
+        metadata={**first.metadata, **features, **scenarios},
+        lines={name: lines for each in descriptions for name, lines in each.lines.items()},
+        topics=list(topics.values()),
+        infos=[info for each in descriptions for info in each.infos],
+        attachments=list(attachments.values()),
+    )
+
 
 # The longest time from a sound to its writing: a block of frames, and the delay of the capture.
 _DELAY_SECONDS = 0.9

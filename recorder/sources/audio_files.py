@@ -24,9 +24,8 @@ from hearthlog.recorder.events import (
 )
 from hearthlog.recorder.sources.decoding import check_channels, read_audio
 from hearthlog.recorder.sources.file_times import FileTime
-from hearthlog.recorder.sources.framing import frames_of
+from hearthlog.recorder.sources.framing import check_times, frames_of
 from hearthlog.recorder.sources.open_audio import audio_seconds, is_audio
-from hearthlog.recorder.sources.wall_clock import check_times
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE

@@ -1,4 +1,4 @@
-"""The capture process: reads one microphone and writes its sound to standard output.
+"""Sound devices, and the capture process: one microphone's sound on standard output.
 
 PortAudio hangs inside the process when a device vanishes, so this process can be killed at any
 moment. It imports no more than PortAudio needs and computes nothing.
@@ -10,17 +10,223 @@ the samples that it announces (int16, interleaved if there are several channels)
 import json
 import os
 import queue
+import re
 import signal
 import struct
 import sys
 import time
 from array import array
-from dataclasses import asdict, dataclass
+from collections import deque
+from dataclasses import asdict, dataclass, replace
+from math import ceil, inf
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from hearthlog.recorder.errors import DeviceError, SourceError
-from hearthlog.recorder.sources.devices import Device, find_device, list_devices, load_portaudio
+from hearthlog.schemas.frames import SAMPLE_RATE
+
+_WINDOW_SAMPLES = 30 * SAMPLE_RATE  # longer than a network that is heard again may stall
+_WINDOWS = 10  # five minutes, in which two clocks do not drift apart by so much
+_TOLERANCE_SECONDS = 1.0
+
+
+class ArrivalPace:
+    """Follows when sound arrives, by the time at which its first sample must have been taken.
+
+    That is the earliest one that any arrival allows: sound can be late, and cannot be early.
+
+    Parameters
+    ----------
+    began : float
+        Time at which the source was called, in seconds of CLOCK_MONOTONIC.
+    """
+
+    def __init__(self, began: float) -> None:
+        self.count = 0
+        self._began = began
+        self._window = inf
+        self._window_end = _WINDOW_SAMPLES
+        self._windows: deque[float] = deque(maxlen=_WINDOWS)
+
+    def add(self, count: int, arrival: float) -> None:
+        """Note that so many samples have come until now, in seconds of CLOCK_MONOTONIC."""
+        self.count += count
+        self._window = min(self._window, arrival - self.count / SAMPLE_RATE)
+
+    def settle(self) -> tuple[int, float]:
+        """Tell live sound from what a server had kept for its listeners, and sends at first.
+
+        Returns
+        -------
+        older : int
+            How many of the samples are from before the source was called.
+        now : float
+            When the last one was taken, in seconds of CLOCK_MONOTONIC.
+        """
+        start = self._window
+        self._windows.append(start)
+        older = ceil((self._began - start) * SAMPLE_RATE)
+        return min(max(older, 0), self.count), start + self.count / SAMPLE_RATE
+
+    def trouble(self) -> str:
+        """Say what is wrong with a source that has settled, if something is."""
+        if self._window < min(self._windows) - _TOLERANCE_SECONDS:
+            return "sends sound faster than it sounds; give the address of a live source"
+        if self.count < self._window_end:
+            return ""
+        late = self._window - min(self._windows)
+        self._windows.append(self._window)
+        self._window = inf
+        self._window_end = self.count + _WINDOW_SAMPLES
+        return f"lost {late:.1f} s of sound on the way" if late > _TOLERANCE_SECONDS else ""
+
+
+_CARDS = Path("/sys/class/sound")
+
+
+class UsbPlace(NamedTuple):
+    """Of a sound card at USB.
+
+    Attributes
+    ----------
+    port : str
+        `usb:` and the bus and ports that lead to it, such as "usb:1-1.2"; the same after a reboot,
+        as long as it stays in its socket. Empty for a card that is not at USB.
+    serial : str
+        `serial:` and its number; empty if it has none.
+    """
+
+    port: str = ""
+    serial: str = ""
+
+
+def usb_place(card: int, cards: Path = _CARDS) -> UsbPlace:
+    """Find where a sound card is plugged in."""
+    interface = (cards / f"card{card}" / "device").resolve()
+    device = interface.parent  # of the interface that is the sound card
+    try:
+        (device / "idVendor").read_text()
+    except OSError:
+        return UsbPlace()
+    try:
+        serial = (device / "serial").read_text(errors="replace").strip()
+    except OSError:
+        serial = ""
+    return UsbPlace(f"usb:{device.name}", f"serial:{serial}" if serial else "")
+
+
+_CARD_NUMBER = re.compile(r" ?\((?:hw|plughw):(\d+),\d+\)$")
+
+
+@dataclass(frozen=True)
+class Device:
+    """A microphone that PortAudio can open.
+
+    Attributes
+    ----------
+    name : str
+        Name without the number of the sound card, which changes from one start to the next.
+    default_rate : float
+        In Hz.
+    """
+
+    index: int
+    name: str
+    channels: int
+    default_rate: float
+    is_default: bool
+    port: str = ""
+    serial: str = ""
+
+    @property
+    def identity(self) -> str:
+        """What tells it from all others, now and when it is plugged in again."""
+        return self.port if re.search(r" #\d+$", self.name) and self.port else self.name
+
+
+def load_portaudio() -> ModuleType:
+    """Import sounddevice, which looks for PortAudio and starts it.
+
+    Raise `SourceError` if PortAudio is missing or cannot start.
+    """
+    try:
+        import sounddevice  # noqa: PLC0415  starting PortAudio may fail, and takes time
+    except OSError as error:
+        raise SourceError(
+            "PortAudio is missing: install it (Debian: apt install libportaudio2)"
+        ) from error
+    except Exception as error:  # its own error class is not importable when its import fails
+        raise SourceError(f"PortAudio cannot start ({error}): check ALSA's settings") from error
+    return sounddevice
+
+
+def list_devices(sounddevice: ModuleType) -> list[Device]:
+    """List the microphones.
+
+    Returns
+    -------
+    list of Device
+        In the order of PortAudio; several of one name are called `<name> #1`, `<name> #2`.
+    """
+    default = sounddevice.default.device[0]
+    devices = [
+        _device(info, is_default=info["index"] == default)
+        for info in sounddevice.query_devices()
+        if info["max_input_channels"] > 0
+    ]
+    names = [device.name for device in devices]
+    seen: dict[str, int] = {}
+    numbered = []
+    for device in devices:
+        count = seen[device.name] = seen.get(device.name, 0) + 1
+        name = device.name if names.count(device.name) == 1 else f"{device.name} #{count}"
+        numbered.append(replace(device, name=name))
+    return numbered
+
+
+def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Device:
+    """Choose a microphone by its name.
+
+    Parameters
+    ----------
+    name : str
+        A name or a part of one, in which capitals make no difference; or a port or serial number,
+        as `UsbPlace` has them; empty for the default microphone.
+
+    Raises
+    ------
+    DeviceError
+        If there is no microphone, or none or several match; then the message lists all of them.
+    """
+    if not devices:
+        raise DeviceError("no microphone found: connect one and check `hearthlog devices`")
+    if not name:
+        defaults = [device for device in devices if device.is_default]
+        return (defaults or devices)[0]
+    matching = [each for each in devices if name in {each.name, each.port, each.serial}]
+    if not matching and not exact:
+        matching = [device for device in devices if name.lower() in device.name.lower()]
+    if len(matching) == 1:
+        return matching[0]
+    listed = ", ".join(repr(device.name) for device in devices)
+    what = "no microphone" if not matching else "more than one microphone"
+    raise DeviceError(f"{what} is called {name!r}; there are {listed}")
+
+
+def _device(info: dict[str, Any], *, is_default: bool) -> Device:
+    card = _CARD_NUMBER.search(info["name"])
+    place = usb_place(int(card[1])) if card else UsbPlace()
+    return Device(
+        index=info["index"],
+        name=_CARD_NUMBER.sub("", info["name"]),
+        channels=info["max_input_channels"],
+        default_rate=info["default_samplerate"],
+        is_default=is_default,
+        port=place.port,
+        serial=place.serial,
+    )
+
 
 # index of the first sample, samples of each channel, flags of PortAudio, time of the first sample
 # by the ADC (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC (s)

@@ -1,19 +1,367 @@
-"""Audio files as one stream of samples at 16 kHz: mono, or those of an array of microphones."""
+"""Audio files as one stream of samples at 16 kHz: mono, or the channels of an array.
+
+One channel of several is their mean or the first one, or others where that would hide sound. It is
+chosen twice. Every ten seconds, by all of them: so steady noise is known from sound. And in every
+piece of 0.4 s, where another channel holds sound and those in use do not: so a channel that dies,
+or a talker near another microphone, costs less than a second of a live sound. A channel that
+sounds again within a minute is mixed with the others, so talkers in turn make no change every time.
+"""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import soxr
 from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.sources.channels import ChannelMixer, finite_or_nan, missing_channel
 from hearthlog.recorder.sources.open_audio import BLOCK_SECONDS, RATES, open_audio
-from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.arrays import Bool, Float32, Float64
 from hearthlog.schemas.frames import SAMPLE_RATE
+
+_BLOCK_SECONDS = 10
+_PIECES = 25  # of a block: as the blocks of a floor
+_FIRST_PIECES = 2  # before which noise cannot be told from sound
+_SAMPLES = 2000  # of a piece that are looked at
+_REMEMBERED = 150  # pieces: a minute
+_STEADY_DB = 0.42  # noise is below it, as in the floor of a room
+_FAINTER = 8.0  # times in power: 9 dB; one of two channels, or two that differ, lose 6 dB at most
+_COVERS = 6.0  # times at most, before what is usual is heard again
+_CANCELLED = 4.0  # times fainter than of unlike channels
+_STANDS_OUT = 2.0  # times the quietest tenth of ten seconds
+_MODULATED_DB = 1.5  # within a piece, in parts of 16 ms: noise is below it, speech and music above
+_AUDIBLE = 1e-8  # power
+_DEAD = 1e-9  # power: of the noise of a converter
+_LOST_SHARE = 0.5  # of the pieces of a block
+_TINY = 1e-12
+_INT16_FULL_SCALE = np.float32(32768.0)
+
+
+def missing_channel(there: int, wanted: int) -> str:
+    """Say that there is no such channel.
+
+    Parameters
+    ----------
+    wanted : int
+        From 1 on.
+    """
+    has = f"{there} channels" if there > 1 else "one channel"
+    return f"has {has}, and `channel` asks for number {wanted}: take one from 1 to {there}"
+
+
+_Samples = TypeVar("_Samples", Float32, Float64)
+
+
+class ChannelMixer:
+    """Makes one channel of several of a sound that is read in blocks of ten seconds.
+
+    Parameters
+    ----------
+    channel : int or None
+        The one to hear whatever they hold, from 1 on.
+    """
+
+    def __init__(self, channel: int | None = None, chosen: Callable[[str], object] = str) -> None:
+        self._fixed = None if channel is None else channel - 1
+        self._choice: _Choice | None = None
+        self._chosen = chosen
+
+    def __call__(self, block: Float32) -> Float32:
+        """Mix a block of all channels.
+
+        Parameters
+        ----------
+        block : np.ndarray [shape=(n, c)], float32
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], float32
+            Samples that are not finite are NaN.
+        """
+        block = finite_or_nan(block)
+        count = block.shape[1]
+        if count == 1 or self._fixed is not None:
+            return block[:, self._fixed or 0]
+        if self._choice is None:
+            self._choice = _Choice(count, self._chosen)
+        self._choice.look_at_block(block)
+        size = len(block) // _PIECES
+        if not size:
+            return self._choice.mix(block)
+        starts = [*range(0, size * _PIECES, size), len(block)]
+        pieces = [block[start:end] for start, end in pairwise(starts)]
+        mixed = []
+        for piece in pieces:
+            self._choice.look_at_piece(piece)
+            mixed.append(self._choice.mix(piece))
+        return np.concatenate(mixed)
+
+
+class StreamMixer:
+    """Makes one channel of several of a live sound, the same of blocks of any size.
+
+    What is heard of a piece was chosen before it, so that nothing waits.
+
+    Parameters
+    ----------
+    takes_first : bool
+        Whether the first channel is heard, and not the mean, where that hides no sound.
+
+    Attributes
+    ----------
+    news : str
+        What is heard now, and why, if that is not known yet; to be emptied by who reads it.
+    """
+
+    def __init__(self, *, takes_first: bool) -> None:
+        self.news = ""
+        self._takes_first = takes_first
+        self._choice: _Choice | None = None
+        self._piece: list[Float32] = []
+        self._missing = 0  # samples of that piece
+        self._recent: list[Float32] = []  # pieces
+        self._begins = True
+
+    def __call__(self, samples: NDArray[np.int16], rate: int) -> NDArray[np.int16]:
+        """Mix the next samples.
+
+        Parameters
+        ----------
+        samples : np.ndarray [shape=(n, c)], int16
+        rate : int
+            Samples per second.
+        """
+        block = samples.astype(np.float32) / _INT16_FULL_SCALE
+        if self._choice is None:
+            self._choice = _Choice(block.shape[1], self._choose, takes_first=self._takes_first)
+        mixed = [np.empty(0, np.float32)]
+        while len(block):
+            self._missing = self._missing or rate * _BLOCK_SECONDS // _PIECES
+            part, block = block[: self._missing], block[self._missing :]
+            mixed.append(self._choice.mix(part))
+            self._piece.append(part)
+            self._missing -= len(part)
+            if not self._missing:
+                self._look(self._choice, np.concatenate(self._piece))
+                self._piece = []
+        heard = np.rint(np.concatenate(mixed) * _INT16_FULL_SCALE)
+        return np.clip(heard, -32768, 32767).astype(np.int16)
+
+    def _look(self, choice: "_Choice", piece: Float32) -> None:
+        choice.look_at_piece(piece)
+        self._recent.append(piece)
+        is_full = len(self._recent) == _PIECES
+        if is_full or (self._begins and len(self._recent) >= _FIRST_PIECES):
+            choice.look_at_block(np.concatenate(self._recent), is_whole=is_full)
+        if is_full:
+            self._recent, self._begins = [], False
+
+    def _choose(self, sentence: str) -> None:
+        usual = "the first channel" if self._takes_first else "the mean of all channels"
+        self.news = sentence or f"{usual} is heard again: it hides no other one"
+
+
+class _Choice:
+    """Which of several channels are heard."""
+
+    def __init__(
+        self, count: int, chosen: Callable[[str], object], *, takes_first: bool = False
+    ) -> None:
+        self._count = count
+        self._usual = [0] if takes_first else [*range(count)]
+        self._heard = self._usual
+        self._instead: list[int] | None = None  # in this piece, for samples that are no numbers
+        self._chosen = chosen
+        self._usable = np.ones(count, bool)
+        self._powers = np.empty((0, count))  # of the last pieces
+        self._usual_covers = True  # all sound since the last block
+        self._piece = 0  # number
+        self._left = np.full(count, -np.inf)  # number of the piece in which it was heard last
+        self._sounded = np.zeros(count)  # in which it held as much as another one
+
+    def mix(self, samples: Float32) -> Float32:
+        """Mix samples as it was chosen.
+
+        Parameters
+        ----------
+        samples : np.ndarray [shape=(n, c)], float32
+        """
+        return self._mixed(samples, self._heard if self._instead is None else self._instead)
+
+    def _mixed(self, samples: _Samples, channels: list[int]) -> _Samples:
+        if len(channels) == 1:
+            return np.ascontiguousarray(samples[..., channels[0]])
+        if channels == self._usual:
+            return samples.mean(axis=-1)
+        if self._is_mean():  # one of them is no number
+            return samples[..., channels].mean(axis=-1)
+        # Of unlike channels as loud as noise of each of them.
+        return samples[..., channels].sum(axis=-1) / samples.dtype.type(math.sqrt(len(channels)))
+
+    def look_at_piece(self, piece: Float32) -> None:
+        """Follow the sound where those that are heard hold none of it.
+
+        Parameters
+        ----------
+        piece : np.ndarray [shape=(n, c)], float32
+        """
+        rows = piece[:: max(len(piece) // _SAMPLES, 1)].astype(np.float64)
+        is_lost = np.asarray(np.isnan(piece).any(axis=0))
+        finite = _without_holes(rows) if is_lost.any() else rows
+        powers = finite.var(axis=0)
+        self._piece += 1
+        self._powers = np.concatenate([self._powers[-_PIECES + 1 :], powers[np.newaxis]])
+        rises = powers > _STANDS_OUT * np.quantile(self._powers, 0.1, axis=0)
+        is_sound = (powers > _AUDIBLE) & (rises | (_level_spread(finite) > _MODULATED_DB))
+        self._sounded[is_sound & (powers * _FAINTER > powers.max())] = self._piece
+        candidates = is_sound & self._usable & ~is_lost
+        best = int(np.where(candidates, powers, -1.0).argmax())
+        if candidates[best]:
+            usual = self._mixed(finite, self._usual).var()
+            self._usual_covers &= bool(usual * _COVERS > powers[best])
+            if self._hides(best, powers[best], self._mixed(finite, self._heard).var()):
+                self._go_to(best, hides=False)
+        self._instead = self._without(is_lost, powers) if is_lost[self._heard].any() else None
+
+    def look_at_block(self, block: Float32, *, is_whole: bool = True) -> None:
+        """Choose by ten seconds, of which noise is known.
+
+        Parameters
+        ----------
+        block : np.ndarray [shape=(n, c)], float32
+        """
+        step = max(len(block) // (_PIECES * _SAMPLES), 1)
+        rows = block[::step].astype(np.float64)
+        count = len(rows) // _PIECES * _PIECES
+        if not count:
+            return
+        pieces = rows[:count].reshape(_PIECES, -1, self._count)
+        if np.isnan(pieces).any():
+            lost = np.isnan(pieces).any(axis=1).mean(axis=0) > _LOST_SHARE
+            pieces = np.stack([_without_holes(piece) for piece in pieces])
+        else:
+            lost = np.zeros(self._count, bool)
+        powers = pieces.var(axis=1)  # an offset is no sound
+        total = powers.mean(axis=0)
+        levels = 10.0 * np.log10(powers + _TINY)
+        steady = levels.std(axis=0) < _STEADY_DB
+        floors = np.quantile(powers, 0.1, axis=0)
+        sounding = ~steady & (total > _AUDIBLE)
+        # Steady noise in one channel, above the quiet of one that holds sound, hides that.
+        quietest = floors[sounding].min() if sounding.any() else np.inf
+        noisy = steady & (total > _FAINTER * quietest)
+        usable = ~noisy & ~(lost & ~lost.all())
+        covers = is_whole and self._usual_covers
+        self._usual_covers = is_whole or self._usual_covers
+        best = int(np.where(usable, total, -1.0).argmax())
+        if not total[best] > _AUDIBLE:
+            return
+        self._usable = usable
+        usual = self._mixed(pieces, self._usual).var(axis=1).mean()
+        is_usual_there = sounding.sum() > 1 or (self._usual == [best] and sounding[best])
+        covers = covers and usable[self._usual].all() and usual * _COVERS > total[best]
+        if self._heard != self._usual and covers and is_usual_there:
+            self._hear(self._usual, "")
+            return
+        power = self._mixed(pieces, self._heard).var(axis=1).mean()
+        # Steady noise of a socket in which nothing is plugged is louder than a quiet room.
+        hides = not usable[self._heard].all()
+        if (self._is_mean() or sounding[best] or power < _DEAD) and (
+            hides or self._hides(best, total[best], power)
+        ):
+            self._go_to(best, hides=hides)
+        elif is_whole and self._heard != self._usual:
+            self._leave_silent()
+
+    def _is_mean(self) -> bool:
+        """Whether the mean of all channels is heard, as usual."""
+        return self._heard == self._usual and len(self._usual) > 1
+
+    def _hides(self, best: int, most: float, power: float) -> bool:
+        """Whether the best channel is hidden in a mix of this power."""
+        count = len(self._heard)
+        if self._heard != self._usual and best in self._heard:
+            return power * max(_FAINTER, _CANCELLED * count) < most
+        return power * _FAINTER < most
+
+    def _go_to(self, best: int, *, hides: bool) -> None:
+        """Hear the best channel, with the others if it was left a short time ago."""
+        others = [i for i in self._heard if self._usable[i] and i != best]
+        is_back = best not in self._heard and self._piece - self._left[best] < _REMEMBERED
+        if is_back and others:
+            self._hear(sorted([*others, best]), "sound comes from one or the other")
+        elif self._is_mean():
+            self._hear([best], "the others hide it" if hides else "their mean is much fainter")
+        else:
+            before = "the first one" if self._heard == [0] else _names(self._heard)
+            verb = "is" if len(self._heard) == 1 else "are"
+            why = "hides it" if hides else f"{verb} much fainter"
+            self._hear([best], f"{before} {why}")
+
+    def _leave_silent(self) -> None:
+        """Leave those out of several channels that held no sound for a minute."""
+        there = [i for i in self._heard if self._piece - self._sounded[i] < _REMEMBERED]
+        if there and there != self._heard:
+            silent = _names(i for i in self._heard if i not in there)
+            self._hear(there, f"no more sound comes from {silent}")
+
+    def _hear(self, channels: list[int], why: str) -> None:
+        if channels == self._heard:
+            return
+        if not self._is_mean():
+            self._left[self._heard] = self._piece
+        self._heard = channels
+        if channels == self._usual:
+            self._chosen("")
+            return
+        is_heard = "is heard alone" if len(channels) == 1 else "are heard"
+        self._chosen(f"{_names(channels)} of {self._count} {is_heard}: {why}")
+
+    def _without(self, is_lost: Bool, powers: Float64) -> list[int] | None:
+        """Return whom to hear of a piece in which some of those that are heard are no numbers."""
+        most = powers[self._heard].max()
+        held = [i for i in self._heard if not is_lost[i]]
+        for others in (held, [int(np.where(is_lost, -1.0, powers).argmax())]):
+            if others and not is_lost[others].any() and powers[others].max() * _FAINTER >= most:
+                return others
+        return None
+
+
+def _names(channels: Iterable[int]) -> str:
+    """Name channels, from 1 on."""
+    *more, last = (str(i + 1) for i in channels)
+    return f"channels {', '.join(more)} and {last}" if more else f"channel {last}"
+
+
+def _level_spread(rows: Float64) -> Float64:
+    """Return by how many decibels the parts of a piece differ, in each channel."""
+    count = len(rows) // _PIECES * _PIECES
+    if not count:
+        return np.zeros(rows.shape[1])
+    powers = rows[:count].reshape(_PIECES, -1, rows.shape[1]).var(axis=1)
+    return (10.0 * np.log10(powers + _TINY)).std(axis=0)
+
+
+def _without_holes(rows: Float64) -> Float64:
+    """Replace samples that are no numbers by the mean of the others in their channel."""
+    is_hole = np.isnan(rows)
+    count = np.maximum((~is_hole).sum(axis=0), 1)
+    return np.where(is_hole, np.where(is_hole, 0.0, rows).sum(axis=0) / count, rows)
+
+
+def finite_or_nan(block: Float32) -> Float32:
+    """Replace infinity by NaN.
+
+    Parameters
+    ----------
+    block : np.ndarray, float32
+    """
+    if np.isinf(block).any():
+        block = np.where(np.isfinite(block), block, np.float32(np.nan))
+    return block
 
 
 def read_audio(  # noqa: PLR0913

@@ -1,16 +1,174 @@
-"""From blocks of captured samples to frames with stamps, and gaps where samples are missing."""
+"""Frames of 50 ms from blocks of samples, stamped by a sample clock and the wall clock."""
 
+import time
+from collections import deque
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
+import soxr
 from numpy.typing import NDArray
 
+from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.sources.frame_cutter import FrameCutter
-from hearthlog.recorder.sources.sample_clock import SampleClock
-from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.message_types import CLOCK_SET
+
+
+class FrameCutter:
+    """Resamples one sound to 16 kHz and cuts it into frames.
+
+    Parameters
+    ----------
+    rate : float
+        Samples per second of the sound.
+    channels : int or None
+        Of an array; None for samples without an axis of channels.
+    """
+
+    def __init__(self, rate: float = SAMPLE_RATE, channels: int | None = None) -> None:
+        self._shape = () if channels is None else (channels,)
+        self._held = np.empty((0, *self._shape), np.float32)
+        self._resampler = None
+        if rate != SAMPLE_RATE:
+            self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, channels or 1, dtype="float32")
+
+    def push(self, samples: Float32, *, last: bool = False) -> Float32:
+        """Add samples and return the frames that they complete.
+
+        Parameters
+        ----------
+        samples : np.ndarray [shape=(m,) or (m, c)], float32
+            At the rate of the sound.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, 800) or (n, 800, c)], float32
+            At 16 kHz.
+        """
+        if self._resampler is not None:
+            samples = self._resampler.resample_chunk(samples, last=last)
+        self._held = np.concatenate([self._held, samples])
+        whole = len(self._held) - len(self._held) % FRAME_SAMPLES
+        frames, self._held = np.split(self._held, [whole])
+        return frames.reshape(-1, FRAME_SAMPLES, *self._shape)
+
+
+_WINDOW_SECONDS = 2.0
+_WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow the temperature
+_PRIOR_PPM = 50.0  # expected error of a sound card's crystal, before it has been measured
+_STEEPEST = 0.1  # seconds of steering a second: frames stay in order, whatever arrives
+_PRIOR_NOISE = 100e-6  # seconds: expected lateness of the earliest observation of a window
+_LATE = _PRIOR_NOISE  # what is later pulls the line no further: the machine was busy
+_ROUNDS = 10  # of weighing the windows anew
+
+
+class SampleClock:
+    """Maps the index of a sample to the time at which it was taken.
+
+    Observations are late, never early, by the delays of the sound card and the scheduler. So each
+    window of two seconds counts by its earliest observation, and a line is fitted through these.
+    A busy machine can be late all through a window: what lies above the line counts linearly (as in
+    Huber's loss), what lies below it by its square. Behind a sound server the delays are a hundred
+    times as long, and no line can be fitted: there the earliest observation of all windows counts.
+    The time is steered towards each new line, never set to it: time does not jump.
+
+    Parameters
+    ----------
+    rate : float
+        Nominal samples per second.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._windows: deque[tuple[float, float]] = deque(maxlen=_WINDOWS)
+        self._window_end = 0.0
+        self._earliest: tuple[float, float] | None = None
+        self._earliest_steered = 0.0
+        # From `_anchor` (a nominal time) on, time = nominal + _late + _slope * (nominal - _anchor).
+        self._origin: float | None = None
+        self._anchor = 0.0
+        self._late = 0.0
+        self._slope = 0.0
+        self._fitted_slope = 0.0
+        self._is_exact = True
+
+    @property
+    def started(self) -> bool:
+        """Whether there has been an observation."""
+        return self._origin is not None
+
+    @property
+    def ppm(self) -> float:
+        """How much faster than nominal the samples come, in parts per million."""
+        return -self._fitted_slope * 1e6
+
+    def observe(self, index: int, time: float, *, is_exact: bool = True) -> None:
+        """Add an observation: a time by which a sample had been taken.
+
+        Parameters
+        ----------
+        time : float
+            Seconds of CLOCK_MONOTONIC.
+        is_exact : bool
+            Whether it is a time of the sound card, and not that of an arrival.
+        """
+        self._is_exact = is_exact
+        nominal = index / self._rate
+        if self._origin is None:
+            self._origin = time - nominal
+            self._anchor, self._window_end = nominal, nominal + _WINDOW_SECONDS
+        late = time - self._origin - nominal
+        if nominal >= self._window_end:
+            self._close_window(nominal)
+        steered = late - self._slope * (nominal - self._anchor)
+        if self._earliest is None or steered < self._earliest_steered:
+            self._earliest, self._earliest_steered = (nominal, late), steered
+
+    def time(self, index: Float64 | float) -> Float64:
+        """Compute the times at which samples were taken.
+
+        Parameters
+        ----------
+        index : float or np.ndarray [shape=(n,)], float64
+            Numbers of the samples, or places between them. There must have been an observation.
+
+        Returns
+        -------
+        np.ndarray [shape=() or (n,)], float64
+            Seconds of CLOCK_MONOTONIC.
+        """
+        assert self._origin is not None
+        nominal = np.asarray(index) / self._rate
+        return self._origin + nominal + self._late + self._slope * (nominal - self._anchor)
+
+    def _close_window(self, nominal: float) -> None:
+        if self._earliest is not None:
+            self._windows.append(self._earliest)
+        self._earliest = None
+        self._window_end = nominal + _WINDOW_SECONDS
+        now = self._late + self._slope * (nominal - self._anchor)
+        self._fitted_slope, ahead = self._fit(nominal + _WINDOW_SECONDS)
+        self._anchor, self._late = nominal, now
+        slope = (ahead - now) / _WINDOW_SECONDS
+        self._slope = min(max(slope, -_STEEPEST), _STEEPEST)
+
+    def _fit(self, nominal: float) -> tuple[float, float]:
+        """Return how fast the observations grow late, and how late they are at a nominal time."""
+        at, late = np.array(self._windows).T
+        if not self._is_exact:
+            return 0.0, float(late.min())
+        weight = np.ones(len(at))
+        for _ in range(_ROUNDS):
+            center, mean = np.average([at, late], axis=1, weights=weight)
+            spread = (weight * (at - center) ** 2).sum()
+            spread += (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
+            slope = float((weight * (at - center) * (late - mean)).sum() / spread)
+            above = late - mean - slope * (at - center)
+            weight = _LATE / np.maximum(above, _LATE)
+        return slope, float(mean + slope * (nominal - center))
+
 
 _ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on an unknown clock
 STEP_SECONDS = 0.25  # of the time of day: less is a clock that is steered
@@ -235,3 +393,58 @@ def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:
     if frames.ndim == 2:
         return Frames(first, frames, stamps)
     return Frames(first, np.ascontiguousarray(frames[:, :, 0]), stamps, frames)
+
+
+# ROS has 32 bits for seconds, and MCAP no times before 1970. A minute for frames that were taken
+# before the clock was looked at, a day for what a log says of the time to come.
+_FIRST = 60 * NANOSECONDS
+_LAST = ((1 << 31) - 86_400) * NANOSECONDS
+_LAST_OF_CALENDAR = 253_402_300_799  # seconds: the year 9999 ends
+
+
+class WallClock:
+    """CLOCK_REALTIME; while that cannot be in a log, the time goes on without it.
+
+    Without a right time before it goes on from 1970, as on a machine whose clock was never set.
+
+    Attributes
+    ----------
+    trouble : str
+        What is wrong with the clock; empty if nothing is.
+    """
+
+    def __init__(self) -> None:
+        self.trouble = ""
+        self._offset: int | None = None  # the last one that a log can have
+
+    def offset(self) -> int:
+        """Return CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds."""
+        before = time.monotonic_ns()
+        now = time.time_ns()
+        monotonic = (before + time.monotonic_ns()) // 2
+        is_right = _FIRST <= now < _LAST
+        if is_right:
+            self._offset = now - monotonic
+        elif self._offset is None or monotonic + self._offset >= _LAST:
+            self._offset = _FIRST - monotonic
+        self.trouble = "" if is_right else _trouble(now)
+        return self._offset
+
+
+def check_times(first: int, last: int) -> None:
+    """Check that a log can have the times of audio files, in nanoseconds of UTC.
+
+    Raise `SourceError` if it cannot.
+    """
+    if first < 0 or last >= _LAST:
+        day = _day(first if first < 0 else last)
+        raise SourceError(f"a log cannot have sound of {day}, only of 1970 to 2037; say --start")
+
+
+def _trouble(now: int) -> str:
+    return f"the clock says {_day(now)}, which a log cannot have; set it, for all stamps are wrong"
+
+
+def _day(nanoseconds: int) -> str:
+    seconds = min(nanoseconds // NANOSECONDS, _LAST_OF_CALENDAR)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d}"

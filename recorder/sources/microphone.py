@@ -23,15 +23,19 @@ from hearthlog.recorder.events import (
     Gap,
     SourceHealth,
 )
-from hearthlog.recorder.rest import Rest
+from hearthlog.recorder.pause_schedule import PauseSchedule
 from hearthlog.recorder.sources.capture import LATENCY_SECONDS, LONG_LATENCY_SECONDS
-from hearthlog.recorder.sources.channels import StreamMixer
+from hearthlog.recorder.sources.decoding import StreamMixer
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
-from hearthlog.recorder.sources.framing import STEP_SECONDS, Framer, SampleBlock
-from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkProcess, check_ros
-from hearthlog.recorder.sources.return_watch import ReturnWatch
-from hearthlog.recorder.sources.sound_cards import cards_change
-from hearthlog.recorder.sources.wall_clock import WallClock
+from hearthlog.recorder.sources.framing import STEP_SECONDS, Framer, SampleBlock, WallClock
+from hearthlog.recorder.sources.process import (
+    Capture,
+    CaptureProcess,
+    NetworkProcess,
+    ReturnWatch,
+    cards_change,
+    check_ros,
+)
 from hearthlog.recorder.stream.sound_watch import DEAD_STEPS
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import NANOSECONDS
@@ -99,7 +103,7 @@ class MicrophoneSource:
         *,
         fallback: str = "",
         waits: bool = True,
-        rest: Rest | None = None,
+        rest: PauseSchedule | None = None,
         channels: int | None = None,
         channel: int | None = None,
     ) -> None:

@@ -1,4 +1,4 @@
-"""The capture process as the recorder sees it: started, read, and killed even if it hangs."""
+"""Capture processes of microphones, and the watch for a device that returns."""
 
 import fcntl
 import json
@@ -7,20 +7,22 @@ import select
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from threading import Event as Flag
+from threading import Lock, Thread
 
 import numpy as np
 
 from hearthlog.recorder.addresses import is_topic
 from hearthlog.recorder.errors import DeviceError, SourceError
-from hearthlog.recorder.modules import module_command
-from hearthlog.recorder.sources.capture import BLOCK, LATENCY_SECONDS, CaptureFormat
-from hearthlog.recorder.sources.devices import Device
+from hearthlog.recorder.host import module_command
+from hearthlog.recorder.sources.capture import BLOCK, LATENCY_SECONDS, CaptureFormat, Device
 from hearthlog.recorder.sources.framing import SampleBlock
 
 _CAPTURE = module_command("hearthlog.recorder.sources.capture")
-_NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.network_capture")
+_NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.ffmpeg")
 _TOPIC_CAPTURE = module_command("hearthlog.recorder.sources.topic_capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
@@ -253,3 +255,69 @@ def _block(
     if channels is not None:
         samples = samples.reshape(-1, channels)
     return SampleBlock(index, samples, overflowed, adc_time, arrival)
+
+
+_CARDS = Path("/dev/snd")
+_CARDS_SECONDS = 0.25
+
+
+def cards_change(stop: Flag, seconds: float) -> bool:
+    """Wait, but no longer than until a sound card comes or goes; return whether one does."""
+    cards, end = _sound_cards(), time.monotonic() + seconds
+    while time.monotonic() < end and not stop.wait(min(_CARDS_SECONDS, seconds)):
+        if _sound_cards() != cards:
+            return True
+    return False
+
+
+def _sound_cards() -> int:
+    """Return what changes with the sound cards that Linux has; 0 elsewhere."""
+    try:
+        return _CARDS.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+_RETRY_SECONDS = 10.0
+
+
+class ReturnWatch:
+    """Opens a device as soon as it is there, in a thread: that may take as long as it likes."""
+
+    def __init__(self, open_device: Callable[[Flag], Capture]) -> None:
+        self._open = open_device
+        self._stop = Flag()
+        self._lock = Lock()
+        self._capture: Capture | None = None
+        Thread(target=self._run, name="return of a microphone", daemon=True).start()
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is a capture to take."""
+        return self._capture is not None
+
+    def take(self) -> Capture | None:
+        """Return the capture once there is one, and have no more to do with it."""
+        with self._lock:
+            capture, self._capture = self._capture, None
+        return capture
+
+    def close(self) -> None:
+        """Give up, and end what was opened and not taken."""
+        with self._lock:
+            self._stop.set()
+            if self._capture is not None:
+                self._capture.kill()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            cards_change(self._stop, _RETRY_SECONDS)
+            try:
+                capture = self._open(self._stop)
+            except SourceError:
+                continue
+            with self._lock:
+                if self._stop.is_set():
+                    capture.kill()
+                self._capture = capture
+            return

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.recorder.addresses import TopicAddress, read_topic
 from hearthlog.recorder.errors import DeviceError, SourceError
-from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, CaptureFormat
-from hearthlog.recorder.sources.pace import Pace
+from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, ArrivalPace, CaptureFormat
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _FIND_SECONDS = 15.0  # until which a topic must have a publisher, and sound
@@ -87,7 +86,7 @@ class _Blocks:
         self._stale = max(_STALE_SECONDS, 5 * self._seconds(first))
         self._index = 0
         self._last: _Sound | None = None
-        self._pace = Pace(time.monotonic())
+        self._pace = ArrivalPace(time.monotonic())
 
     def format(self, identity: str) -> CaptureFormat:
         """Describe them."""

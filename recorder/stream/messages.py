@@ -1,4 +1,4 @@
-"""Encoded messages, and those with which every file of a stream begins."""
+"""Encoded messages of a stream: its description, `/rosout` lines and `/diagnostics`."""
 
 from collections.abc import Sequence
 from itertools import repeat
@@ -6,13 +6,84 @@ from typing import Any, NamedTuple
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.recorder.events import OK, Notice
-from hearthlog.recorder.stream import rosout
+from hearthlog.models.labels.segments import Segment
+from hearthlog.recorder.events import OK, WARNING, Gap, Notice, SourceHealth
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.message_types import encode, header, message, nanoseconds
-from hearthlog.schemas.messages.topics import ROSOUT, topic
+from hearthlog.schemas.messages.message_types import (
+    encode,
+    header,
+    message,
+    nanoseconds,
+    time_message,
+)
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
+
+_INFO, _WARN, _ERROR = 20, 30, 40  # levels of rcl_interfaces/msg/Log
+_LEVELS = {OK: _INFO, WARNING: _WARN}
+
+
+def info_line(info: Any) -> bytes:
+    """Say in a line of `/rosout` what is recorded."""
+    labels = "no model, no labels"
+    if info.model:
+        labels = f"{len(info.labels)} labels by {info.model} ({info.model_sha256[:12]})"
+    stamp = nanoseconds(info.header.stamp)
+    return _line(
+        stamp, info.header.frame_id, _INFO, f"recording {info.device or 'no microphone'}: {labels}"
+    )
+
+
+def segment_line(microphone: str, segment: Segment, label: str) -> bytes:
+    """Say in a line of `/rosout` which sound was labelled, and for how long."""
+    duration = _seconds(segment.end - segment.start)
+    text = f"{label} for {duration} ({100 * segment.confidence:.0f} %)"
+    return _line(segment.decided_at, microphone, _INFO, text)
+
+
+def gap_line(microphone: str, gap: Gap) -> bytes:
+    """Say in a line of `/rosout`, at the end of a gap, that there was one."""
+    text = f"gap of {_seconds(gap.end - gap.start)}: {gap.reason}"
+    return _line(gap.end, microphone, _WARN, text)
+
+
+def health_line(microphone: str, health: SourceHealth) -> bytes:
+    """Say in a line of `/rosout` what state the source is in."""
+    return _line(health.stamp, microphone, _LEVELS.get(health.level, _ERROR), health.summary)
+
+
+def notice_line(microphone: str, stamp: int, notice: Notice) -> bytes:
+    """Repeat a notice in a line of `/rosout`.
+
+    Parameters
+    ----------
+    stamp : int
+        Time of the notice, in nanoseconds of UTC.
+    """
+    return _line(stamp, microphone, _LEVELS[notice.level], notice.text)
+
+
+def _line(stamp: int, microphone: str, level: int, text: str) -> bytes:
+    return encode(
+        message(
+            message_types.LOG,
+            stamp=time_message(stamp),
+            level=level,
+            name=f"hearthlog.{microphone}",
+            msg=text,
+            file="",
+            function="",
+            line=0,
+        )
+    )
+
+
+def _seconds(duration: int) -> str:
+    return f"{duration / NANOSECONDS:.2f} s"  # the shortest is a frame of 0.05 s
+
+
+LOGGED_EVERY = 20  # frames between two messages of statistics, each of a second of its own
 
 
 class EncodedMessage(NamedTuple):
@@ -58,8 +129,32 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
 def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessage]:
     """Return the first messages of every file: its `AudioStreamInfo`, and the same in words."""
     stamp, microphone = nanoseconds(info.header.stamp), info.header.frame_id
-    said = [rosout.notice_line(microphone, stamp, Notice(OK, line)) for line in lines]
+    said = [notice_line(microphone, stamp, Notice(OK, line)) for line in lines]
     return [
         EncodedMessage(stamp, topic(microphone, "info"), encode(info)),
-        *(EncodedMessage(stamp, ROSOUT, line) for line in (rosout.info_line(info), *said)),
+        *(EncodedMessage(stamp, ROSOUT, line) for line in (info_line(info), *said)),
     ]
+
+
+def diagnostics(subject: str, health: SourceHealth, microphone: str = "") -> EncodedMessage:
+    """Encode the health of one thing.
+
+    Parameters
+    ----------
+    subject : str
+        A microphone or recorder by its name, and behind a space what of it, if not all of it.
+    """
+    status = message(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=health.level,
+        name=f"hearthlog: {subject}",
+        message=health.summary,
+        hardware_id=subject.partition(" ")[0],
+        values=[
+            message("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+            for key, value in health.values.items()
+        ],
+    )
+    head = header(health.stamp, microphone)
+    array = message(message_types.DIAGNOSTICS, header=head, status=[status])
+    return EncodedMessage(health.stamp, DIAGNOSTICS, encode(array))

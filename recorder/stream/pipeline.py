@@ -22,21 +22,31 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.recorder.direction.geometry import ArrayGeometry
 from hearthlog.recorder.events import OK, READING, WARNING, Event, Frames, Gap, Notice, SourceHealth
-from hearthlog.recorder.stream import rosout
-from hearthlog.recorder.stream.diagnostics import diagnostics
-from hearthlog.recorder.stream.direction_messages import ArrayDirections, direction_messages
-from hearthlog.recorder.stream.embedding_messages import (
+from hearthlog.recorder.stream.directions import ArrayGeometry
+from hearthlog.recorder.stream.messages import (
+    LOGGED_EVERY,
+    EncodedMessage,
+    diagnostics,
+    gap_line,
+    health_line,
+    notice_line,
+)
+from hearthlog.recorder.stream.privacy_filter import (
+    EmbeddingPrivacyFilter,
+    LoggedFrames,
+    PrivacyFilter,
+)
+from hearthlog.recorder.stream.sound_watch import SoundWatch, problem_of_file
+from hearthlog.recorder.stream.stages import (
+    ArrayDirections,
+    FeatureMessages,
+    LabelStream,
     MicrophoneEmbeddings,
+    RollingStatistics,
+    direction_messages,
     embedding_messages,
 )
-from hearthlog.recorder.stream.feature_messages import FeatureMessages
-from hearthlog.recorder.stream.label_stream import LabelStream
-from hearthlog.recorder.stream.messages import EncodedMessage
-from hearthlog.recorder.stream.sound_watch import SoundWatch, problem_of_file
-from hearthlog.recorder.stream.statistics import LOGGED_EVERY, RollingStatistics
-from hearthlog.recorder.stream.veil import EmbeddingVeil, LoggedFrames, Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.message_types import encode_gap
@@ -51,8 +61,8 @@ class Pipeline:
     Parameters
     ----------
     private : sequence of str
-        Classes whose features are logged coarsely, as of `Veil`. With one, all messages come two
-        seconds later at most, so that log time never runs backwards.
+        Classes whose features are logged coarsely, as of `PrivacyFilter`. With one, all
+        messages come two seconds later at most, so that log time never runs backwards.
     array : ArrayGeometry or None
         Of an array of microphones; without one there are no directions.
 
@@ -68,7 +78,7 @@ class Pipeline:
         features: FeatureSet,
         classifier: Classifier | None = None,
         statistics_every: int = LOGGED_EVERY,
-        beside: Mapping[str, Classifier] | None = None,
+        secondary: Mapping[str, Classifier] | None = None,
         private: Sequence[str] = (),
         array: ArrayGeometry | None = None,
         embedder: Embedder | None = None,
@@ -84,7 +94,7 @@ class Pipeline:
         self._recent_embeddings = NO_EMBEDDINGS
         self._streams = {
             labelling: LabelStream(microphone, labelling, one, self._source)
-            for labelling, one in (live | dict(beside or {})).items()
+            for labelling, one in (live | dict(secondary or {})).items()
         }
         window, width = features.window_frames, features.width
         self._infrasound = InfrasoundFilter()
@@ -92,8 +102,10 @@ class Pipeline:
         statistics = RollingStatistics(window, width)
         self._feature_messages = FeatureMessages(microphone, statistics, statistics_every)
         self.most_ahead = 0 if self._source is None else DELAY_FRAMES
-        self._veil = Veil(private, width, window, self.most_ahead) if private else None
-        self._embedding_veil = EmbeddingVeil()
+        self._privacy_filter = (
+            PrivacyFilter(private, width, window, self.most_ahead) if private else None
+        )
+        self._embedding_filter = EmbeddingPrivacyFilter()
         self._held: list[EncodedMessage] = []
         self._recent: Float32 | None = None  # features of the last frames, one less than a window
         self._floor = None if features.band_powers is None else FloorTracker()
@@ -147,8 +159,8 @@ class Pipeline:
             known = Auxiliary(directions, embeddings)
             return self._push_frames(features, floors, event.first, event.stamps, known, health)
         if isinstance(event, Gap):
-            return self.hold(self._push_gap(event))
-        return self.hold(self._push_health(event))
+            return self.release(self._push_gap(event))
+        return self.release(self._push_health(event))
 
     def push_features(
         self,
@@ -213,13 +225,13 @@ class Pipeline:
         labels = [
             message
             for stream in self._streams.values()
-            if self._veil is None or not stream.by_names
+            if self._privacy_filter is None or not stream.by_names
             for message in stream.push(features, floors, first, stamps, auxiliary)
         ]
         logged = features, first, stamps
-        if self._veil is not None:
-            self._embedding_veil.push(auxiliary.embeddings)
-            messages = self._veiled(self._veil.push(*logged, self.last_labels))
+        if self._privacy_filter is not None:
+            self._embedding_filter.push(auxiliary.embeddings)
+            messages = self._filtered(self._privacy_filter.push(*logged, self.last_labels))
         else:
             known = stamps[auxiliary.embeddings.last_frames - first]
             messages = self._feature_messages(*logged)
@@ -227,14 +239,14 @@ class Pipeline:
         messages = [*health, *messages, *self._located(auxiliary, first, stamps), *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
-        return self.hold(messages)
+        return self.release(messages)
 
-    def _veiled(self, frames: LoggedFrames) -> list[EncodedMessage]:
+    def _filtered(self, frames: LoggedFrames) -> list[EncodedMessage]:
         """Encode frames that may be logged, and the embeddings that end with them.
 
         Names go by these embeddings alone: what is left out for somebody may be speaking has none.
         """
-        embeddings = self._embedding_veil.release(frames)
+        embeddings = self._embedding_filter.release(frames)
         known = frames.stamps[embeddings.last_frames - frames.first]
         messages = self._feature_messages(frames.features, frames.first, frames.stamps)
         messages += embedding_messages(self.microphone, embeddings, known)
@@ -264,7 +276,7 @@ class Pipeline:
         self._recent_stamps = recent[-self.feature_set.window_frames :]
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
 
-    def hold(self, messages: Sequence[EncodedMessage]) -> list[EncodedMessage]:
+    def release(self, messages: Sequence[EncodedMessage]) -> list[EncodedMessage]:
         """Return what may be logged: all, or what is not later than features that are held.
 
         Parameters
@@ -277,24 +289,24 @@ class Pipeline:
         list of EncodedMessage
             In the order of their log times; of what was held before, too.
         """
-        if self._veil is None:
+        if self._privacy_filter is None:
             return list(messages)
         self._held = sorted([*self._held, *messages], key=attrgetter("log_time"))
-        ready = bisect_left(self._held, self._veil.start, key=attrgetter("log_time"))
+        ready = bisect_left(self._held, self._privacy_filter.start, key=attrgetter("log_time"))
         messages, self._held = self._held[:ready], self._held[ready:]
         return messages
 
     def flush(self) -> list[EncodedMessage]:
         """Return what is held, before the log ends."""
-        return self.hold(self._unveil())
+        return self.release(self._close_filter())
 
-    def _unveil(self) -> list[EncodedMessage]:
+    def _close_filter(self) -> list[EncodedMessage]:
         """Return the features that are held."""
-        return [] if self._veil is None else self._veiled(self._veil.close())
+        return [] if self._privacy_filter is None else self._filtered(self._privacy_filter.close())
 
     def finish(self) -> list[EncodedMessage]:
         """End the open segment where the sound ends."""
-        return self.hold([*self._unveil(), *self._close(self._end)])
+        return self.release([*self._close_filter(), *self._close(self._end)])
 
     def change_model(
         self,
@@ -320,15 +332,15 @@ class Pipeline:
             stream = LabelStream(self.microphone, labelling, classifier, self._source)
             self._streams[labelling] = stream
             self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
-        opening = self.report("model", stamp, _from_frame(labelling, model, frame))
+        opening = self.notice_messages("model", stamp, _from_frame(labelling, model, frame))
         if classifier is not None and (lacking := self.lacking_embeddings(classifier)):
-            opening += self.report("model", stamp, Notice(WARNING, lacking))
+            opening += self.notice_messages("model", stamp, Notice(WARNING, lacking))
         if unknown := self.unknown_private():
             names = ", ".join(map(repr, unknown))
             text = (
                 f"features are logged coarsely: the model does not know {names}, which is private"
             )
-            opening += self.report("model", stamp, Notice(WARNING, text))
+            opening += self.notice_messages("model", stamp, Notice(WARNING, text))
         return [*held, *closing], opening
 
     def lacking_embeddings(self, classifier: Classifier) -> str:
@@ -337,7 +349,7 @@ class Pipeline:
 
     def unknown_private(self) -> list[str]:
         """Return the private classes that the model in use does not know."""
-        return [] if self._veil is None else self._veil.unknown(self.classes)
+        return [] if self._privacy_filter is None else self._privacy_filter.unknown(self.classes)
 
     def _follow(self, stream: LabelStream, frame: int, unlabelled: int) -> None:
         """Let a stream begin at a frame, with what is remembered of the frames before."""
@@ -350,7 +362,7 @@ class Pipeline:
         known = Auxiliary(self._recent_directions, self._recent_embeddings)
         stream.follow(recent, floors, stamps, frame, unlabelled, known)
 
-    def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
+    def notice_messages(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
         """Turn a notice into messages.
 
         Parameters
@@ -359,10 +371,10 @@ class Pipeline:
             Time of the notice, in nanoseconds of UTC.
         """
         subject = f"{self.microphone} {subject}"
-        return self.hold(
+        return self.release(
             [
                 diagnostics(subject, SourceHealth(stamp, *notice), self.microphone),
-                EncodedMessage(stamp, ROSOUT, rosout.notice_line(self.microphone, stamp, notice)),
+                EncodedMessage(stamp, ROSOUT, notice_line(self.microphone, stamp, notice)),
             ]
         )
 
@@ -377,14 +389,14 @@ class Pipeline:
         return health
 
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
-        held = self._unveil()
+        held = self._close_filter()
         self._infrasound.restart()
         self._features.restart()
         if self._directions is not None:
             self._directions.restart()
         if self._embeddings is not None:
             self._embeddings.restart()
-        self._embedding_veil.restart()
+        self._embedding_filter.restart()
         self._feature_messages.restart()
         self._recent = None
         self._recent_floors = None
@@ -398,7 +410,7 @@ class Pipeline:
             *held,
             *self._close(self._end),
             EncodedMessage(gap.end, topic(self.microphone, "gap"), data),
-            EncodedMessage(gap.end, ROSOUT, rosout.gap_line(self.microphone, gap)),
+            EncodedMessage(gap.end, ROSOUT, gap_line(self.microphone, gap)),
         ]
 
     def _track_floor(self, features: Float32, first: int) -> Floors | None:
@@ -422,7 +434,7 @@ class Pipeline:
         # A report of a later time than the sound says that there is none: what is still to be said
         # of the sound is older, and comes first.
         ended = health.stamp > self._end
-        closing = [*self._unveil(), *self._close(self._end)] if ended else []
+        closing = [*self._close_filter(), *self._close(self._end)] if ended else []
         return [*closing, *self._health_messages(health)]
 
     def _health_messages(self, health: SourceHealth) -> list[EncodedMessage]:
@@ -433,7 +445,7 @@ class Pipeline:
         messages = [diagnostics(self.microphone, with_floor, self.microphone)]
         if health.level != self._level:
             self._level = health.level
-            line = rosout.health_line(self.microphone, health)
+            line = health_line(self.microphone, health)
             messages.append(EncodedMessage(health.stamp, ROSOUT, line))
         return messages
 

@@ -38,7 +38,7 @@ def bridge(
     from hearthlog.analyzer.bridge.state_folder import state_folder
     from hearthlog.analyzer.extras import require
     from hearthlog.recorder.config import exposed_passwords
-    from hearthlog.recorder.timezone import time_zone
+    from hearthlog.recorder.pause_schedule import time_zone
 
     settings, own = load_bridge_settings(config)
     if not own.has_outputs():

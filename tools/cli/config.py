@@ -12,7 +12,7 @@ from hearthlog.tools.cli.text import print_lines, tell
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from hearthlog.recorder.config_origins import Key, Origins
+    from hearthlog.recorder.config_problems import Key, Origins
 
 config = typer.Typer(help="Show the configuration of the recorder, and check it.")
 

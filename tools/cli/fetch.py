@@ -84,7 +84,7 @@ def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
     from hearthlog.analyzer.extras import missing
     from hearthlog.models.embedding.networks import missing_modules
     from hearthlog.models.errors import ModelError
-    from hearthlog.recorder.embedder_probe import check_pace, probe_network
+    from hearthlog.recorder.labelling.embedder_probe import check_pace, probe_network
 
     if absent := missing_modules(network.suffix):
         return [missing(*absent)]

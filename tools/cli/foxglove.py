@@ -58,7 +58,7 @@ def show_in_foxglove(
 @contextmanager
 def _address_said(admission: "Admission", port: int) -> Iterator[None]:
     """Say where viewers connect; in a journal the name of a file that has the token for now."""
-    from hearthlog.recorder.journal import writes_to_journal
+    from hearthlog.recorder.host import writes_to_journal
 
     host = f"[{admission.bind}]" if ":" in admission.bind else admission.bind
     place = f"{host}:{port}"

@@ -15,8 +15,8 @@ import numpy as np
 from rich.cells import cell_len, set_cell_size
 
 from hearthlog.models.classes import in_words
-from hearthlog.recorder.journal import lines_to
-from hearthlog.recorder.timezone import time_zone
+from hearthlog.recorder.host import lines_to
+from hearthlog.recorder.pause_schedule import time_zone
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SECONDS
 

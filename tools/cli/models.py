@@ -420,7 +420,7 @@ def _network(model: "Model") -> str:
 
 
 def _is_here(network: str) -> bool:
-    from hearthlog.recorder.embedder_probe import likely_network
+    from hearthlog.recorder.labelling.embedder_probe import likely_network
 
     return likely_network(network) == network
 

@@ -193,7 +193,7 @@ def starter_here(model: Path) -> Path:
     """Return the model that a name means here: of a starter, that for the network that is there."""
     from hearthlog.models.modelfile.modelfile import starter_for
     from hearthlog.recorder.config import load_settings
-    from hearthlog.recorder.embedder_probe import likely_network
+    from hearthlog.recorder.labelling.embedder_probe import likely_network
 
     return starter_for(model, likely_network(load_settings(None, {}, {}).embedding))
 
@@ -289,7 +289,7 @@ def _best_method() -> "Method":
     """Return the default way to learn; a home whose recorder wants no network needs none."""
     from hearthlog.analyzer.training.installed import DEFAULT, default_method
     from hearthlog.recorder.config import load_settings
-    from hearthlog.recorder.embedder_probe import NO_NETWORK
+    from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
 
     if load_settings(None, {}, {}).embedding == NO_NETWORK:
         return DEFAULT

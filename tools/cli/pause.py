@@ -22,20 +22,20 @@ def pause(
     ] = None,
 ) -> None:
     """Have the recorders of a folder close their microphones; the log says when, and why."""
-    from hearthlog.recorder import rest
+    from hearthlog.recorder import pause_schedule
 
     _check_folder(logs)
-    rest.pause(logs, None if duration is None else _read_duration(duration))
+    pause_schedule.pause(logs, None if duration is None else _read_duration(duration))
     until = "until `hearthlog resume`" if duration is None else f"for {duration}, or until resume"
     print(f"{logs}: paused {until}; its recorders close their microphones within a second")
 
 
 def resume(logs: LogsFolder) -> None:
     """End a pause."""
-    from hearthlog.recorder import rest
+    from hearthlog.recorder import pause_schedule
 
     _check_folder(logs)
-    was_paused = rest.resume(logs)
+    was_paused = pause_schedule.resume(logs)
     print(f"{logs}: {'is recorded again' if was_paused else 'was not paused'}")
 
 

@@ -299,9 +299,9 @@ def _open_files(
     progress: "Progress",
 ) -> tuple["FileSource", list[str], list[str]]:
     """Open audio files in the order of time; return doubts about it, and what was left out."""
+    from hearthlog.recorder.pause_schedule import time_zone
     from hearthlog.recorder.sources.audio_files import FileSource, find_audio
     from hearthlog.recorder.sources.file_times import arrange, check_pattern, doubts, file_time
-    from hearthlog.recorder.timezone import time_zone
 
     if pattern is not None:
         check_pattern(pattern)

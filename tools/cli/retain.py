@@ -15,9 +15,8 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.text import end_with_warnings, number, print_json, print_lines, tell
 
 if TYPE_CHECKING:
-    from hearthlog.recorder.disk.limits import KeepingRules
-    from hearthlog.recorder.disk.retention import Deletion
-    from hearthlog.recorder.disk.thinning import Thinned
+    from hearthlog.recorder.disk_keeper import Thinned
+    from hearthlog.recorder.retention import Deletion, KeepingRules
 
 
 def retain(
@@ -77,9 +76,9 @@ class _Done(NamedTuple):
 
 
 def _retain(rules: "KeepingRules", *, dry_run: bool) -> _Done:
-    from hearthlog.recorder.disk.recorded import recorded_days, recorded_logs
-    from hearthlog.recorder.disk.retention import carry_out, disk_of, plan_retention
-    from hearthlog.recorder.disk.thinning import plan_thinning, thin
+    from hearthlog.recorder.disk_keeper import plan_thinning, thin
+    from hearthlog.recorder.host import disk_of
+    from hearthlog.recorder.retention import carry_out, plan_retention, recorded_days, recorded_logs
     from hearthlog.schemas.errors import LogError
 
     root, failures = Path(rules.root), list[OSError]()
@@ -103,7 +102,7 @@ def _retain(rules: "KeepingRules", *, dry_run: bool) -> _Done:
 
 
 def _print(done: _Done, *, dry_run: bool) -> None:
-    from hearthlog.recorder.disk.sizes import size_text
+    from hearthlog.recorder.retention import size_text
     from hearthlog.schemas.salvage.recover import STEPS
 
     would = "would be " if dry_run else ""

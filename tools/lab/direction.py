@@ -24,8 +24,7 @@ from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
-from hearthlog.recorder.direction.geometry import array_geometry
-from hearthlog.recorder.direction.srp_phat import DirectionFinder
+from hearthlog.recorder.stream.directions import DirectionFinder, array_geometry
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED

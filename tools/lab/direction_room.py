@@ -7,7 +7,7 @@ import numpy as np
 import pyroomacoustics as pra
 from scipy.signal import fftconvolve
 
-from hearthlog.recorder.direction.geometry import SPEED_OF_SOUND
+from hearthlog.recorder.stream.directions import SPEED_OF_SOUND
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import SAMPLE_RATE
 

@@ -25,8 +25,8 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
-from hearthlog.recorder.clips.clip_choice import ClipFinder
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.log.clips import ClipFinder
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE

@@ -35,7 +35,7 @@ from hearthlog.models.embedding.sound_names import (
 )
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.recorder.stream.embedding_messages import MicrophoneEmbeddings
+from hearthlog.recorder.stream.stages import MicrophoneEmbeddings
 from hearthlog.schemas.arrays import Bool, Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 from hearthlog.tools.lab.command import run

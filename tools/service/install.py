@@ -10,7 +10,7 @@ from typing import Any
 
 from hearthlog.analyzer.bridge.settings import BridgeSettings, load_bridge_settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.modules import module_command
+from hearthlog.recorder.host import module_command
 from hearthlog.tools.service.unit import (
     BRIDGE_NAME,
     NAME,

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import hearthlog.recorder
-from hearthlog.recorder.modules import module_command
+from hearthlog.recorder.host import module_command
 from hearthlog.schemas.errors import HearthlogError
 
 

@@ -3,7 +3,7 @@
 from datetime import UTC, date, datetime, timedelta, tzinfo
 
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.recorder.rest import QuietHours
+from hearthlog.recorder.pause_schedule import QuietHours
 from hearthlog.schemas.frames import NANOSECONDS
 
 

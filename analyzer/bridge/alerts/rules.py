@@ -13,7 +13,7 @@ from hearthlog.analyzer.routine.compare import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.models.classifiers.names import AUDIOSET
 from hearthlog.models.embedding.sound_names import audioset_names
-from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
+from hearthlog.recorder.pause_schedule import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError, listed
 
 ANY_SOUND = ""  # in place of a class: whatever is not silence

@@ -11,7 +11,7 @@ from hearthlog.models.modelfile.modelfile import SUFFIX, load_model, starter_for
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, DEFAULT_MODEL, list_models
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.config import NO_MODEL, Settings
-from hearthlog.recorder.embedder_probe import likely_network
+from hearthlog.recorder.labelling.embedder_probe import likely_network
 
 
 def unheard_classes(

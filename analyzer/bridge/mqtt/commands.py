@@ -14,7 +14,7 @@ from hearthlog.analyzer.bridge.corrections import correct_event
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.models.classes import CLASS_NAME
-from hearthlog.recorder import rest
+from hearthlog.recorder import pause_schedule
 from hearthlog.schemas.messages.topics import spelt
 
 _WAITING = 20  # commands; more are refused
@@ -96,10 +96,10 @@ class Commands:
         command = _parse(payload)
         by = command.by or "mqtt"
         if command.resume:
-            was_paused = rest.resume(self._folder)
+            was_paused = pause_schedule.resume(self._folder)
             return "it listens again" if was_paused else "it was not paused"
         if command.pause_minutes is not None:
-            rest.pause(self._folder, timedelta(minutes=command.pause_minutes), by)
+            pause_schedule.pause(self._folder, timedelta(minutes=command.pause_minutes), by)
             return f"paused for {command.pause_minutes:g} minutes by {by}"
         label = spelt(command.label or "")
         if not CLASS_NAME.fullmatch(label):

@@ -10,7 +10,7 @@ from typing import IO, cast
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.page.said import READ_ONLY, REVIEWER
 from hearthlog.analyzer.bridge.page.words import class_words, told
-from hearthlog.recorder.modules import module_command
+from hearthlog.recorder.host import module_command
 
 _LONGEST_SECONDS = 6 * 3600.0
 _NICE = 10

@@ -26,7 +26,7 @@ from hearthlog.analyzer.bridge.page.server import PageServer
 from hearthlog.analyzer.bridge.page.words import clock, room
 from hearthlog.analyzer.bridge.settings import PageSettings
 from hearthlog.analyzer.ports import ip_of
-from hearthlog.recorder.journal import writes_to_journal
+from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
 
 _EVERY_SECONDS = 1.0

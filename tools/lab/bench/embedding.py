@@ -8,8 +8,8 @@ from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, 
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.embedding.session import TfliteSession
 from hearthlog.models.embedding.stream import EmbeddingStream
-from hearthlog.recorder.embedder_probe import probe_network
-from hearthlog.recorder.stream.embedding_messages import embedding_messages
+from hearthlog.recorder.labelling.embedder_probe import probe_network
+from hearthlog.recorder.stream.stages import embedding_messages
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.mcap.chunk_writer import GATHERED_SPAN, ChunkWriter
 from hearthlog.tools.lab.bench.table import Row, Table, Target

@@ -17,7 +17,7 @@ from hearthlog.models.embedding.networks import YAMNET, find_network
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import CANDIDATE
 from hearthlog.models.starter import GENERAL, starter_file, with_network
-from hearthlog.recorder.embedder_probe import NO_NETWORK
+from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
 from hearthlog.recorder.sources import capture
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.lab.bench.labmic import DEVICE, make_microphone

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.recorder.modules import module_command
+from hearthlog.recorder.host import module_command
 from hearthlog.schemas.errors import HearthlogError
 
 _TURN_SECONDS = 0.5

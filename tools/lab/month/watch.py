@@ -10,8 +10,8 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hearthlog.recorder.host import module_command
 from hearthlog.recorder.log.recovery import recover_active
-from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, stem
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX

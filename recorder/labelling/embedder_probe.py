@@ -26,7 +26,7 @@ from hearthlog.models.embedding.networks import (
 )
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.errors import ModelError
-from hearthlog.recorder.modules import module_command
+from hearthlog.recorder.host import module_command
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
@@ -37,7 +37,7 @@ _MOST_SHARE = 0.5  # of the hop
 _MOST_MEGABYTES = 300  # of the 600 that the service may take
 _PATIENCE_SECONDS = 30.0
 _WINDOWS = 5
-_MODULE = "hearthlog.recorder.embedder_probe"
+_MODULE = "hearthlog.recorder.labelling.embedder_probe"
 _GOES_ON = "it is recorded without a network"
 _SIGNALS: dict[int, str] = {
     signal.SIGILL: "this processor lacks instructions that its runtime needs",

@@ -1,1 +1,0 @@
-"""Clips: choosing, writing and deleting sound that is kept."""

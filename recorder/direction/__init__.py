@@ -1,1 +1,0 @@
-"""Where sound comes from: an array of microphones, and directions in their channels."""

@@ -1,1 +1,0 @@
-"""The disk: how long logs are kept, and how much of them."""

@@ -1,0 +1,319 @@
+"""Disk keeper: deletion and thinning of old logs every hour, in a process of low priority."""
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.recorder.events import OK, WARNING, Notice, SourceHealth
+from hearthlog.recorder.host import disk_of, module_command
+from hearthlog.recorder.retention import (
+    REVIEWED,
+    THINNING_SUFFIX,
+    KeepingRules,
+    Limits,
+    RecordedDays,
+    RecordedLog,
+    RetentionPlan,
+    ThinningDays,
+    carry_out,
+    is_reviewed,
+    kept_because,
+    plan_retention,
+    recorded_days,
+    recorded_logs,
+    size_text,
+)
+from hearthlog.recorder.stream.messages import EncodedMessage, diagnostics, notice_line
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import ROSOUT
+from hearthlog.schemas.new_files import (
+    hand_over,
+    locked_folder,
+    sync_file,
+    sync_folder,
+)
+from hearthlog.schemas.salvage.recover import lock_abandoned, thin_log, thinned_step
+
+_STATISTICS = 1  # the step that lessons do not miss
+_RIGHTS = 0o666  # of a file that nobody runs
+
+
+class Thinned(NamedTuple):
+    """A log that is to be thinned, and the step."""
+
+    log: RecordedLog
+    step: int
+
+
+def plan_thinning(
+    logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays
+) -> Iterator[Thinned]:
+    """Choose the logs to thin; one that is reviewed only of statistics, for it is learned from."""
+    for log in logs[:-1]:
+        due = limits.step(days.since(log.start))
+        if not due or (kept := kept_because(log)) not in {"", REVIEWED}:
+            continue
+        step = min(due, _STATISTICS) if kept else due
+        try:
+            if thinned_step(log.path) < step:
+                yield Thinned(log, step)
+        except LogError:  # of a newer version
+            continue
+
+
+def thin(log: Path, step: int) -> bool:
+    """Put a thinner log in the place of one, in one step that nothing can halve.
+
+    Returns
+    -------
+    bool
+        False if somebody else is at it, or it was reviewed meanwhile.
+
+    Raises
+    ------
+    LogError
+        If it is damaged.
+    OSError
+        If the copy cannot be written.
+    """
+    copy = log.with_name(log.name + THINNING_SUFFIX)
+    with lock_abandoned(log) as is_ours:
+        if not is_ours:
+            return False
+        try:
+            thin_log(log, copy, step)
+            hand_over(copy, stat.S_IMODE(log.stat().st_mode) & _RIGHTS)
+            sync_file(copy)
+            with locked_folder(log.parent):  # a reviewer that writes a layer holds it
+                if step > _STATISTICS and is_reviewed(log):
+                    copy.unlink(missing_ok=True)
+                    return False
+                copy.replace(log)
+        except BaseException:
+            copy.unlink(missing_ok=True)
+            raise
+        sync_folder(log.parent)  # where it fails, a copy of this name is another process's
+    return True
+
+
+_SHOWN = 300  # characters
+_AT_ONCE = 100  # logs that are thinned, so that nothing else waits for an hour
+
+
+class DiskReport(NamedTuple):
+    """What was found on the disk, and what was done.
+
+    Attributes
+    ----------
+    done : str
+        What was deleted and thinned; empty for nothing.
+    problem : str
+        What cannot be done; empty for nothing.
+    """
+
+    done: str
+    problem: str
+    values: Mapping[str, str]
+    more: bool = False
+
+    def notices(self) -> list[Notice]:
+        """Say what people should know: at most what was done, and the problem."""
+        done = [Notice(OK, self.done)] if self.done else []
+        return [*done, *([Notice(WARNING, self.problem)] if self.problem else [])]
+
+
+def keep_disk(rules: KeepingRules, *, may_thin: bool = True) -> DiskReport:
+    """Delete what the rules say, unless that would leave only the newest of several logs, and thin.
+
+    Raise `OSError` if the disk cannot be measured.
+    """
+    root, failures = Path(rules.root), list[OSError]()
+    logs = recorded_logs(root, rules.node, failures)
+    days = recorded_days(root, rules.node)
+    plan = plan_retention(logs, days, rules.limits, disk_of(root))
+    problems = list(plan.problems)
+    deleted = []
+    if plan.wipes:
+        problems.insert(0, _wipes(plan, len(logs)))
+    else:
+        deleted = carry_out(plan, failures)
+    left = [log for log in logs if log not in set(deleted)]
+    thinned = _thin(left if may_thin else [], days, rules.thinning, problems)
+    freed = sum(log.size for log in deleted)
+    done = []
+    if deleted:
+        why = plan.deletions[0].why
+        done.append(f"{len(deleted)} logs deleted, {size_text(freed)}: {why}")
+    if thinned.logs:
+        done.append(f"{thinned.logs} logs thinned, {size_text(thinned.freed)}")
+    disk = disk_of(root)
+    values = {
+        "free_bytes": disk.free,
+        "disk_bytes": disk.size,
+        "logs": len(left),
+        "log_bytes": sum(log.size for log in left) - thinned.freed,
+        "deleted_logs": len(deleted),
+        "deleted_bytes": freed,
+        "kept_logs": len(plan.kept),
+        "thinned_logs": thinned.logs,
+        "thinned_bytes": thinned.freed,
+    }
+    problem = "; ".join([*problems, *_failed(failures)])[:_SHOWN]
+    texts = {name: str(value) for name, value in values.items()}
+    return DiskReport("; ".join(done), problem, texts, more=thinned.more)
+
+
+def _wipes(plan: RetentionPlan, logs: int) -> str:
+    return (
+        f"the limits would delete all but the newest of {logs} logs ({plan.deletions[-1].why}): "
+        "nothing is deleted; `hearthlog retain` does it, if that is meant"
+    )
+
+
+class _Thinnings(NamedTuple):
+    logs: int = 0
+    freed: int = 0
+    more: bool = False
+
+
+def _thin(
+    logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays, problems: list[str]
+) -> _Thinnings:
+    """Thin some logs, and add to the problems the first of those that cannot be."""
+    count = freed = 0
+    failed: list[str] = []
+    for log, step in plan_thinning(logs, days, limits):
+        if count == _AT_ONCE:
+            return _Thinnings(count, freed, more=True)
+        try:
+            before = log.path.stat().st_size
+            if thin(log.path, step):
+                count, freed = count + 1, freed + before - log.path.stat().st_size
+        except LogError as error:
+            failed.append(str(error))
+        except OSError as error:  # no room for a copy: there is none for the others
+            failed.append(f"{log.path}: cannot be thinned ({error.strerror or error})")
+            break
+    problems += failed[:1]
+    return _Thinnings(count, freed)
+
+
+def _failed(failures: list[OSError]) -> list[str]:
+    if not failures:
+        return []
+    more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
+    first = failures[0]
+    return [f"{first.filename}: cannot be looked through or deleted ({first.strerror}){more}"]
+
+
+_COMMAND = module_command("hearthlog.recorder.disk_keeper")
+_EVERY = 3600 * NANOSECONDS
+_THIN = 24 * _EVERY  # for that all old logs are opened
+_LOOK = 60 * NANOSECONDS  # at how much is free
+_NICENESS = 19
+
+
+class DiskKeeper:
+    """Keeps the disk as configured while a recorder goes on, which never waits for it."""
+
+    def __init__(self, rules: KeepingRules) -> None:
+        self._rules = rules
+        self._process: subprocess.Popen[bytes] | None = None
+        self._began: int | None = None
+        self._looked = 0
+        self._thinned: int | None = None
+        self._said: set[str] = set()
+        self._helpless = False
+
+    def tick(self, now: int) -> tuple[list[EncodedMessage], list[str]]:
+        """Look after the disk if it is time, and tell what came of the last time."""
+        if self._process is not None:
+            if self._process.poll() is None:
+                return [], []
+            report = self._read(self._process)
+            self._process = None
+            self._helpless = bool(report.problem)
+            if report.more:
+                self._thinned = None
+            news = {report.problem} - self._said - {""}
+            self._said |= news
+            return report_messages(self._rules.node, now, report), sorted(news)
+        if self._is_due(now):
+            self._began = now
+            may_thin = self._thinned is None or abs(now - self._thinned) >= _THIN
+            self._thinned = now if may_thin else self._thinned
+            with suppress(OSError):  # no memory for a process: in an hour again
+                self._process = subprocess.Popen(  # noqa: S603  our own module
+                    [*_COMMAND, json.dumps([self._rules, may_thin])],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                )
+        return [], []
+
+    def close(self) -> None:
+        """End what is going on, at any moment of it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._read(self._process)
+            self._process = None
+
+    def _is_due(self, now: int) -> bool:
+        if self._began is None or abs(now - self._began) >= _EVERY:
+            return True
+        if self._helpless or min(abs(now - self._looked), abs(now - self._began)) < _LOOK:
+            return False
+        self._looked = now
+        with suppress(OSError):
+            return disk_of(Path(self._rules.root)).free < self._rules.limits.free
+        return False
+
+    def _read(self, process: subprocess.Popen[bytes]) -> DiskReport:
+        assert process.stdout is not None
+        with process.stdout:
+            text = process.stdout.read()
+        try:
+            return DiskReport(*json.loads(text))
+        except (ValueError, TypeError):
+            return DiskReport(
+                "", f"the disk was not looked after (status {process.returncode})", {}
+            )
+
+
+def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMessage]:
+    """Tell what came of a look at the disk."""
+    level = WARNING if report.problem else OK
+    text = report.problem or report.done or "nothing to delete"
+    health = SourceHealth(stamp, level, text, report.values)
+    lines = [notice_line("disk", stamp, notice) for notice in report.notices()]
+    return [
+        diagnostics(f"{node} disk", health),
+        *(EncodedMessage(stamp, ROSOUT, line) for line in lines),
+    ]
+
+
+def main() -> None:
+    """Look after the disk once by the rules in the argument, and print the report."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the recorder decides when this ends
+    os.nice(_NICENESS)
+    (root, node, limits, thinning), may_thin = json.loads(sys.argv[1])
+    rules = KeepingRules(root, node, Limits(*limits), ThinningDays(*thinning))
+    try:
+        report = keep_disk(rules, may_thin=may_thin)
+    except OSError as error:
+        report = DiskReport("", f"{root}: cannot be looked after ({error.strerror or error})", {})
+    with suppress(BrokenPipeError):  # the recorder was killed
+        os.write(sys.stdout.fileno(), json.dumps(report).encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,373 @@
+"""Stages of the pipeline: statistics, embeddings, directions and labels, and their messages."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, NOWHERE, Auxiliary, Directions
+from hearthlog.models.embedding.networks import Embedder
+from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
+from hearthlog.models.features.floor import Floors, is_quiet
+from hearthlog.models.features.window_inputs import mean_and_std
+from hearthlog.models.labels.labeller import FrameLabels, segment_columns
+from hearthlog.models.labels.names_labeller import labeller_of
+from hearthlog.models.labels.segments import Segment
+from hearthlog.recorder.events import Frames
+from hearthlog.recorder.stream.directions import ArrayGeometry, ChannelWatch, DirectionFinder
+from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages, segment_line
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    ROSOUT,
+    EmbeddingSource,
+    labelling_topic,
+    topic,
+)
+
+
+class RollingStatistics:
+    """Statistics of one stream of frames over its last frames.
+
+    Every window is summed anew from its own frames, since running sums would drift over months.
+    """
+
+    def __init__(self, window_frames: int, width: int) -> None:
+        self._length, self._width = window_frames, width
+        self.restart()
+
+    def restart(self) -> None:
+        """Empty the window: the next frame does not follow the last one."""
+        self._recent: Float32 = np.empty((0, self._width), np.float32)
+
+    def __call__(self, features: Float32, places: Indices | None = None) -> tuple[Float32, Float32]:
+        """Compute the statistics at some of successive frames.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        places : np.ndarray [shape=(m,)], intp, optional
+            Of the frames, from 0 on, ascending; all by default.
+
+        Returns
+        -------
+        mean, std : np.ndarray [shape=(m, d)], float32
+            Over the last window, or over all frames since the start or the last restart where
+            these are fewer; the standard deviation divides by their number.
+        """
+        frames = np.concatenate([self._recent, features])
+        places = np.arange(len(features)) if places is None else places
+        begins = places + len(self._recent) + 1 - self._length
+        filling = int(np.count_nonzero(begins < 0))
+        mean, std = np.empty((2, len(places), self._width), np.float32)
+        for row, begin in enumerate(begins[:filling].tolist()):
+            first = [*frames[: begin + self._length, np.newaxis]]
+            (mean[row],), (std[row],) = mean_and_std(first)
+        windows = [frames[begins[filling:] + place] for place in range(self._length)]
+        mean[filling:], std[filling:] = mean_and_std(windows)
+        self._recent = frames[max(len(frames) - self._length + 1, 0) :].copy()
+        return mean, std
+
+
+class FeatureMessages:
+    """Encodes the features of one stream of frames, and their statistics."""
+
+    def __init__(
+        self, microphone: str, statistics: RollingStatistics, statistics_every: int
+    ) -> None:
+        self._microphone = microphone
+        self._statistics = statistics
+        self._every = statistics_every
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._statistics.restart()
+
+    def __call__(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
+        """Encode the features of successive frames.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        """
+        if not len(features):
+            return []
+        frames = np.arange(first, first + len(features))
+        logged = np.flatnonzero(frames % self._every == 0)
+        mean, std = self._statistics(features, logged)
+        statistics = {"mean": mean, "std": std}
+        return [
+            *self._encode("features", frames, stamps, {"values": features}),
+            *self._encode("statistics", frames[logged], stamps[logged], statistics),
+        ]
+
+    def _encode(
+        self, kind: str, frames: Int64, stamps: Int64, arrays: Mapping[str, Float32]
+    ) -> list[EncodedMessage]:
+        columns: dict[str, Column] = {
+            "header.stamp": stamps,
+            "header.frame_id": self._microphone,
+            "frame": frames,
+            **arrays,
+        }
+        typename = message_types.FEATURES if kind == "features" else message_types.STATISTICS
+        name, rows = topic(self._microphone, kind), encode_rows(typename, columns, len(stamps))
+        return encoded_messages(name, stamps, rows)
+
+
+_GATE, _GATE_FRAMES = 2.0, 8  # dB above the floor, and the window, as of the models
+
+
+class MicrophoneEmbeddings:
+    """Embeds what a microphone hears above the floor of the room."""
+
+    def __init__(self, embedder: Embedder, features: FeatureSet) -> None:
+        self._feature_set = features
+        self._stream = EmbeddingStream(embedder)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._stream.restart()
+        self._features = np.empty((0, self._feature_set.width), np.float32)
+
+    def push(
+        self, frames: Float32, features: Float32, floors: Floors | None, first: int, stamps: Int64
+    ) -> Embeddings:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        features : np.ndarray [shape=(n, d)], float32
+        floors : Floors or None
+            At the last of these frames; None if the feature set has no bands.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        """
+        recent = np.concatenate([self._features, features])
+        sound = np.zeros(len(frames), bool)
+        count = min(len(recent) - _GATE_FRAMES + 1, len(frames))  # that end a whole window
+        if count > 0:
+            sound[-count:] = self._is_sound(recent[-count - _GATE_FRAMES + 1 :], floors)
+        self._features = recent[1 - _GATE_FRAMES :].copy()
+        return self._stream.push(frames, sound, first, stamps)
+
+    def _is_sound(self, features: Float32, floors: Floors | None) -> Bool:
+        """Return which windows are above the floor, or where there is none, above -60 dBFS."""
+        count = len(features) - _GATE_FRAMES + 1
+        powers_of = self._feature_set.band_powers
+        if floors is None or powers_of is None:
+            powers = self._feature_set.power(features).astype(np.float64)
+            loud: Bool = np.convolve(powers > SILENCE_POWER, np.ones(_GATE_FRAMES), "valid") > 0
+            return loud
+        sound = np.zeros(count, bool)
+        known = min(len(floors.room), count)
+        if known:
+            powers = powers_of(features[-known - _GATE_FRAMES + 1 :])
+            sound[-known:] = ~is_quiet(powers, floors.room[-known:], _GATE_FRAMES, _GATE)
+        return sound
+
+
+def embedding_messages(
+    microphone: str, embeddings: Embeddings, known: Int64
+) -> list[EncodedMessage]:
+    """Encode embeddings.
+
+    Parameters
+    ----------
+    known : np.ndarray [shape=(m,)], int64
+        Starts of the last frames of their windows, in nanoseconds of UTC.
+    """
+    if not len(known):
+        return []
+    columns: dict[str, Column] = {
+        "header.stamp": embeddings.stamps,
+        "header.frame_id": microphone,
+        "frame": embeddings.frames,
+        "frames": np.full(len(known), WINDOW_FRAMES, np.uint32),
+        "values": embeddings.values,
+    }
+    rows = encode_rows(message_types.EMBEDDING, columns, len(known))
+    name = topic(microphone, "embedding")
+    return encoded_messages(name, known, rows)
+
+
+class ArrayDirections:
+    """Finds whence the sound of an array comes, and watches its channels."""
+
+    def __init__(self, geometry: ArrayGeometry) -> None:
+        self._finder = DirectionFinder(geometry)
+        self._watch = ChannelWatch(len(geometry.positions))
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._finder.restart()
+        self._stamps = np.empty(0, np.int64)  # of the frames of a block that is not complete
+
+    def problem(self) -> str:
+        """Return what is wrong with the channels and what to do; empty if nothing is."""
+        return self._watch.problem()
+
+    def __call__(self, frames: Frames) -> Directions:
+        """Find the directions of the blocks that these frames complete.
+
+        Parameters
+        ----------
+        frames : Frames
+            The next ones. Without channels, as of a microphone that is heard in place of the array,
+            they have no direction.
+        """
+        if frames.channels is None:
+            self.restart()
+            return NOWHERE
+        self._watch.add(frames.channels)
+        places, azimuths, confidences = self._finder(frames.channels, frames.first)
+        held = len(self._stamps)
+        stamps = np.concatenate([self._stamps, frames.stamps])
+        self._stamps = stamps[1 - BLOCK_FRAMES :]
+        return Directions(frames.first + places, stamps[held + places], azimuths, confidences)
+
+
+def direction_messages(
+    microphone: str, directions: Directions, known: Int64
+) -> list[EncodedMessage]:
+    """Encode directions.
+
+    Parameters
+    ----------
+    known : np.ndarray [shape=(m,)], int64
+        Starts of the last frames of their blocks, in nanoseconds of UTC.
+    """
+    columns: dict[str, Column] = {
+        "header.stamp": directions.stamps,
+        "header.frame_id": microphone,
+        "frame": directions.frames,
+        "azimuth": directions.azimuths,
+        "confidence": directions.confidences,
+    }
+    rows = encode_rows(message_types.DIRECTION, columns, len(known))
+    name = topic(microphone, "direction")
+    return encoded_messages(name, known, rows)
+
+
+class LabelStream:
+    """What one model says of a stream of frames.
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Names behind the columns of the probabilities.
+    segments_converged : bool
+        Whether sound before the first frame would leave no trace in the segments to come.
+    last : FrameLabels or None
+        Labels of the frames that were pushed last; None if they have none.
+    """
+
+    def __init__(
+        self,
+        microphone: str,
+        labelling: str,
+        classifier: Classifier,
+        embedding: EmbeddingSource | None = None,
+    ) -> None:
+        self.classes = classifier.classes
+        self.by_names = classifier.names is not None
+        self.segments_converged = False
+        self.last: FrameLabels | None = None
+        self._microphone = microphone
+        self._labelling = labelling
+        self._labeller = labeller_of(classifier, microphone, embedding)
+
+    @property
+    def delay(self) -> int:
+        """Frames from one to that at which its label is known."""
+        return self._labeller.timing.delay
+
+    def follow(  # noqa: PLR0913, PLR0917
+        self,
+        features: Float32,
+        floors: Float64 | None,
+        stamps: Int64,
+        frame: int,
+        unlabelled: int,
+        auxiliary: Auxiliary,
+    ) -> None:
+        """Take the place of another stream before a frame; as `Labeller.follow`.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+            Of the last frames before it.
+        floors : np.ndarray [shape=(m, b)], float64, or None
+        stamps : np.ndarray [shape=(n,)], int64
+        auxiliary : Auxiliary
+            Of the last second before it, or more.
+        """
+        self._labeller.follow(features, floors, stamps, frame, unlabelled, auxiliary)
+
+    def push(
+        self,
+        features: Float32,
+        floors: Floors | None,
+        first: int,
+        stamps: Int64,
+        auxiliary: Auxiliary,
+    ) -> list[EncodedMessage]:
+        """Turn successive frames into messages.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        """
+        self.last = None
+        labels, segments = self._labeller.push(features, floors, first, stamps, auxiliary)
+        if not len(labels.frames):
+            return []
+        self.last = labels
+        self.segments_converged |= self._labeller.segments_converged
+        columns = labels.columns(self._microphone)
+        return [
+            *self._segment_messages(segments),
+            *self._messages("label", message_types.LABEL, labels.known_at, columns),
+        ]
+
+    def close(self, end: int) -> list[EncodedMessage]:
+        """End the segments of a sound; the next frame begins anew.
+
+        Parameters
+        ----------
+        end : int
+            End of the sound, in nanoseconds of UTC.
+        """
+        segments = self._labeller.close(end)
+        self.segments_converged |= bool(segments)
+        return self._segment_messages(segments)
+
+    def _segment_messages(self, segments: list[Segment]) -> list[EncodedMessage]:
+        times = np.array([segment.decided_at for segment in segments], np.int64)
+        columns = segment_columns(segments, self.classes, self._microphone)
+        encoded = self._messages("segment", message_types.SEGMENT, times, columns)
+        if self._labelling != LIVE:
+            return encoded
+        messages = []
+        for one, segment in zip(encoded, segments, strict=True):
+            line = segment_line(self._microphone, segment, self.classes[segment.label])
+            messages += [one, EncodedMessage(segment.decided_at, ROSOUT, line)]
+        return messages
+
+    def _messages(
+        self, kind: str, typename: str, log_times: Int64, columns: Mapping[str, Column]
+    ) -> list[EncodedMessage]:
+        name = labelling_topic(self._microphone, self._labelling, kind)
+        rows = encode_rows(typename, columns, len(log_times)) if len(log_times) else []
+        return encoded_messages(name, log_times, rows)
