@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hearthlog._version import __version__
-from hearthlog.analyzer.doctor import examine_file
+from hearthlog.analyzer.doctor.examination import examine_file
 from hearthlog.analyzer.live import examine_live
 from hearthlog.analyzer.logs.recorder_info import CONFIGURATION, attachments_of
 from hearthlog.schemas.errors import LogError

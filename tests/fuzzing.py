@@ -96,13 +96,13 @@ def as_columns_between(path: Path, _folder: Path) -> None:
 
 
 def summarised(path: Path, _folder: Path) -> None:
-    from hearthlog.analyzer.logs.summarise import summarise  # noqa: PLC0415
+    from hearthlog.analyzer.logs.summary import summarise  # noqa: PLC0415
 
     summarise([path])
 
 
 def examined(path: Path, _folder: Path) -> None:
-    from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
+    from hearthlog.analyzer.doctor.examination import examine  # noqa: PLC0415
 
     for findings in examine(path):
         assert all(str(finding).isprintable() for finding in findings.shown)
@@ -112,7 +112,7 @@ def recovered(path: Path, folder: Path) -> None:
     """What is recovered can be read, and breaks no rule of MCAP."""
     from logreader import LogReader  # noqa: PLC0415
 
-    from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
+    from hearthlog.analyzer.doctor.examination import examine  # noqa: PLC0415
     from hearthlog.schemas.errors import HearthlogError  # noqa: PLC0415
     from hearthlog.schemas.salvage.recover import recover_log  # noqa: PLC0415
 

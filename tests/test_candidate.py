@@ -20,7 +20,7 @@ from test_swap import block, count, labels_by, recording, said, wait_for
 from hearthlog.analyzer.gate.evidence import gather_evidence
 from hearthlog.analyzer.gate.on_trial import compare_on_trial
 from hearthlog.analyzer.gate.recent_time import recent_logs
-from hearthlog.analyzer.logs.coverage import find_coverage
+from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model

@@ -12,7 +12,7 @@ from conftest import HEARTHLOG
 from logs import features, read
 from waiting import wait_for
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs

@@ -22,7 +22,7 @@ from mcap.writer import Writer
 from spliced import run, write_log
 
 from hearthlog.analyzer.export.text import _moments, in_order, json_lines, quoted, text_lines
-from hearthlog.analyzer.logs.typed_columns import decode_all
+from hearthlog.analyzer.logs.selection import decode_all
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.frames import NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.files import find_logs

@@ -18,19 +18,22 @@ from mcap.opcode import Opcode
 from spliced import record_logs, run
 from stores import put
 
-import hearthlog.analyzer.logs.catalog.making
+import hearthlog.analyzer.logs.catalog_writer
 from hearthlog.analyzer.errors import LostClusterError
-from hearthlog.analyzer.logs.catalog.catalog import (
+from hearthlog.analyzer.logs.catalog import (
     DAMAGED,
     FINISHED,
     LOG,
+    SCHEMA,
     UNFINISHED,
+    homes,
+    label_amounts,
+    part_of,
     read_catalog,
+    sealed,
+    write_table,
 )
-from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed, write_table
-from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
-from hearthlog.analyzer.logs.catalog.making import write_catalog
-from hearthlog.analyzer.logs.catalog.parts import part_of
+from hearthlog.analyzer.logs.catalog_writer import write_catalog
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.workers.workers import InlineWorkers, open_workers
@@ -244,7 +247,7 @@ def test_more_labels_than_a_classifier_has_are_an_error_in_a_row(tmp_path):
 
 @pytest.fixture
 def file_by_file(monkeypatch):
-    monkeypatch.setattr(hearthlog.analyzer.logs.catalog.making, "_TASK", 1)
+    monkeypatch.setattr(hearthlog.analyzer.logs.catalog_writer, "_TASK", 1)
 
 
 @pytest.mark.usefixtures("file_by_file")

@@ -15,10 +15,10 @@ from spliced import run
 from stores import put
 from test_catalog import SECOND, fleet, recording, relabelled
 
-import hearthlog.analyzer.logs.listing
+import hearthlog.analyzer.logs.locations
 import hearthlog.analyzer.logs.selection
-from hearthlog.analyzer.logs.catalog.catalog import FINISHED, read_catalog
-from hearthlog.analyzer.logs.catalog.making import write_catalog
+from hearthlog.analyzer.logs.catalog import FINISHED, read_catalog
+from hearthlog.analyzer.logs.catalog_writer import write_catalog
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.schemas.errors import LogError, ignore_progress
 from hearthlog.schemas.logs.files import CATALOG_INDEX, find_logs, time_span
@@ -31,7 +31,7 @@ _TICK = 0.05  # s; clocks of disks are finer
 @pytest.fixture
 def old(monkeypatch):
     """Make the catalogue of a folder in which all has been as it is for a while."""
-    monkeypatch.setattr(hearthlog.analyzer.logs.listing, "_YOUNG", int(_TICK * SECOND))
+    monkeypatch.setattr(hearthlog.analyzer.logs.locations, "_YOUNG", int(_TICK * SECOND))
 
     def catalogue(folder, before=None, progress=ignore_progress):
         time.sleep(2 * _TICK)
@@ -72,13 +72,13 @@ def found_without(fleet: Path, *span: int | None) -> tuple:
 def looked_into(monkeypatch) -> list[str]:
     """Folders that were listed."""
     folders = []
-    before = hearthlog.analyzer.logs.listing.look_into
+    before = hearthlog.analyzer.logs.locations.look_into
 
     def look_into(folder):
         folders.append(folder)
         return before(folder)
 
-    monkeypatch.setattr(hearthlog.analyzer.logs.listing, "look_into", look_into)
+    monkeypatch.setattr(hearthlog.analyzer.logs.locations, "look_into", look_into)
     return folders
 
 
@@ -304,7 +304,7 @@ def test_what_was_before_a_span_comes_last_first(catalogued, old):
 
 
 def test_logs_that_were_not_read_for_the_catalogue_are_asked(fleet, old, monkeypatch):
-    monkeypatch.setattr(hearthlog.analyzer.logs.catalog.making, "_TASK", 1)
+    monkeypatch.setattr(hearthlog.analyzer.logs.catalog_writer, "_TASK", 1)
 
     def interrupt(share):
         if share > 1 / 3:

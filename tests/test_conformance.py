@@ -8,10 +8,10 @@ from mcap.records import Attachment, Message, Metadata
 from mcap.stream_reader import StreamReader
 from test_typescript import FOLDER, need_node
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.summarise import summarise
+from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.schemas.salvage.recover import recover_log
 
 # The set's statistics come before, or without, the channels they count; the format asks for these.

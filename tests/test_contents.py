@@ -16,9 +16,9 @@ from lossy import LossySource
 from mcap.records import Metadata
 from rewriting import Log
 
-from hearthlog.analyzer.doctor import examine
-from hearthlog.analyzer.logs import summarise as summarising
-from hearthlog.analyzer.logs.summarise import summarise
+from hearthlog.analyzer.doctor.examination import examine
+from hearthlog.analyzer.logs import summary as summarising
+from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record

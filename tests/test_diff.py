@@ -17,9 +17,8 @@ from stores import put
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.evaluation.event_scores import Events
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.spans import NONE
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.review.queue.judgeable_spans import (

@@ -17,11 +17,11 @@ from scipy.signal import resample_poly
 from test_capture import realtime_offset, recording, wait_for_frames
 
 import hearthlog
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
-from hearthlog.analyzer.logs.bearings import as_vectors, mean_bearings
 from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.logs.sound_vectors import as_vectors, mean_bearings
 from hearthlog.analyzer.review.timeline.live import LiveTimeline
 from hearthlog.analyzer.review.timeline.plots import DIRECTION, Plot, timeline_plots
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline

@@ -17,7 +17,7 @@ from logs import features, read
 from test_capture import recording, sound, wait_for_frames
 from waiting import wait_for
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.labelling.labelling_models import LabellingModels

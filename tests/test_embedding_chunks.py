@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames

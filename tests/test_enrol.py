@@ -13,7 +13,7 @@ from conftest import HEARTHLOG
 from spliced import run
 from stores import put
 
-from hearthlog.analyzer.logs.coverage import find_coverage
+from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.training.home_data import home_recordings

@@ -9,7 +9,7 @@ from conftest import HEARTHLOG
 from logs import features, read
 from test_capture import wait_for_frames
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.schemas.logs.files import find_logs
 
 INSTEAD = "labmic is not there; spare is heard in its place"

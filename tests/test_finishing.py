@@ -19,7 +19,7 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from waiting import wait_for
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames

@@ -17,7 +17,7 @@ from conftest import HEARTHLOG
 from foreign import FILES
 from spliced import run
 
-from hearthlog.analyzer.logs.coverage import find_coverage
+from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

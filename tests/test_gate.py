@@ -37,8 +37,7 @@ from hearthlog.analyzer.gate.recent_time import (
 from hearthlog.analyzer.gate.reference import Sound
 from hearthlog.analyzer.gate.rules import clearly_better, damages
 from hearthlog.analyzer.gate.two_models import LabelledFrames, TwoModels
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list

@@ -17,7 +17,7 @@ from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
 from hearthlog.analyzer.discover.read_sounds import read_log_sounds, read_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.analyzer.review.queue.span_sounds import span_sounds

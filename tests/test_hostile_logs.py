@@ -378,7 +378,7 @@ def test_the_doctor_looks_once_at_faults_that_are_alike(tmp_path, hearthlog, mon
 
 
 def test_the_doctor_passes_over_a_topic_of_countless_faults(tmp_path, hearthlog, monkeypatch):
-    monkeypatch.setattr("hearthlog.analyzer.doctor.file_checks._MOST_WRONG", 100)
+    monkeypatch.setattr("hearthlog.analyzer.doctor.examination._MOST_WRONG", 100)
     bag = Bag(tmp_path / "x.mcap", CompressionType.NONE)
     channel, whole = bag.channel("/s", STRING), bag.channel("/i", INT32)
     for i in range(1000):

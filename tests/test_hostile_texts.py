@@ -13,7 +13,7 @@ from mcap.records import Metadata
 from rewriting import Log
 from spliced import run
 
-from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.models.classifiers.model import PublicCollection
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings

@@ -7,7 +7,7 @@ import pytest
 from logreader import LogReader
 from logs import features
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer
 from rewriting import HEAD, Chunked, Log, split
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames

@@ -6,7 +6,7 @@ from logs import features, read
 from test_capture import wait_for_frames
 from test_rest import recording
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 
 
 def goes_on(labmic, logs):

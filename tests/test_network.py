@@ -27,7 +27,7 @@ from test_capture import (
     wait_for_frames,
 )
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.recorder.addresses import check_address, public_name
 from hearthlog.recorder.config import MicrophoneSettings
 from hearthlog.recorder.errors import DeviceError, SourceError

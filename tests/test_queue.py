@@ -13,9 +13,8 @@ from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import kept_time
-from hearthlog.analyzer.logs.coverage import find_coverage
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
+from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.logs.spans import NONE, cut, joined, one, pieces
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
 from hearthlog.analyzer.review.queue import asked

@@ -26,7 +26,7 @@ from stores import put
 from together import record_together
 from waiting import wait_for
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.relabel import labels

@@ -18,7 +18,7 @@ from spliced import run
 from test_capture import wait_for_frames
 from test_swap import wait_for
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.pause_schedule import (
     PauseSchedule,

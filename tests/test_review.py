@@ -24,8 +24,8 @@ from spliced import run
 from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings
+from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.queue.review_list import write_list

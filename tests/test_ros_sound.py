@@ -13,7 +13,7 @@ from conftest import HEARTHLOG
 from logs import features, read
 from rosgraph import DISTRIBUTIONS, Ros, end, next_domain, wait_until_logged
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 
 SPEAK = Path(__file__).parent / "ros" / "speak.py"
 RAW = "foxglove_msgs/msg/RawAudio"

@@ -15,9 +15,9 @@ from test_scenarios_at_once import START, record, sound
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.gate.reference import reference
-from hearthlog.analyzer.logs.catalog.catalog import read_catalog
+from hearthlog.analyzer.logs.catalog import read_catalog
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labellings import Labellings, LogContents, find_labellings
+from hearthlog.analyzer.logs.labelling import Labellings, LogContents, find_labellings
 from hearthlog.analyzer.marks.marks import (
     PERSON,
     RANDOM,

@@ -37,7 +37,7 @@ from hearthlog.analyzer.bridge.page.words import times
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.models.classifiers.classifier import Classifier

@@ -10,7 +10,7 @@ import pytest
 from logs import features, read
 from systemd import PREFIX, PROGRAM, booted
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.tools.service.unit import STATE, Needs, bridge_unit, system_unit, user_unit
 
 UNIT = "/etc/systemd/system/hearthlog.service"

@@ -15,8 +15,8 @@ from hearthlog.analyzer.gate.evidence import gather_evidence
 from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labelled_by import model_of
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings
+from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.span_sounds import labelling_model
 from hearthlog.analyzer.training.unreviewed import unreviewed_silence, unreviewed_sounds

@@ -10,7 +10,7 @@ from logreader import LogReader
 from lossy import LossySource
 from rewriting import Log
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.analyzer.replay.replay import replay as replay_logs

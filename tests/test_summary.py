@@ -16,8 +16,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from hearthlog.analyzer.logs.health import Status
-from hearthlog.analyzer.logs.summarise import summarise
+from hearthlog.analyzer.logs.recorder_info import Status
+from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model

@@ -16,7 +16,7 @@ from logreader import LogReader
 from logs import read
 from spliced import run
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.disk_keeper import keep_disk
 from hearthlog.recorder.retention import KeepingRules, Limits, ThinningDays

@@ -36,8 +36,8 @@ from hearthlog.analyzer.discover.voices import Evidence, joined, same_voice, sum
 from hearthlog.analyzer.discover.voices_file import VOICES, load_voices, save_voices
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.export.merge import merge_logs
-from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.model import LabelledSpans

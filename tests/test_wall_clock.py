@@ -10,7 +10,7 @@ from logs import features, read
 from test_capture import FRAME, SECONDS, wait_for_frames
 from waiting import wait_for
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_microphones
 

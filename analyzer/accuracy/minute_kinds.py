@@ -7,8 +7,7 @@ import numpy as np
 from hearthlog.analyzer.accuracy.events import MINUTE, sounding_minutes
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.labelling import unified
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings, unified
 from hearthlog.analyzer.logs.spans import joined, lengths
 from hearthlog.analyzer.marks.marks import RANDOM, read_reviewed
 from hearthlog.schemas.arrays import Bool

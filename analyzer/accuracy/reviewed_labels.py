@@ -10,9 +10,8 @@ import numpy as np
 from hearthlog.analyzer.accuracy.events import AROUND, MINUTE
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.labelled_by import model_of
-from hearthlog.analyzer.logs.labelling import Labelling, overlaid, unified
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
+from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, overlay
 from hearthlog.analyzer.marks.marks import (
     CHOICES,

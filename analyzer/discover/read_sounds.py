@@ -14,9 +14,9 @@ from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
 from hearthlog.analyzer.discover.groups import Groups
 from hearthlog.analyzer.discover.sound_spans import FrameLabels, SoundSpans, find_sounds
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.channel_names import checked_array_names
-from hearthlog.analyzer.logs.embeddings import mean_embeddings
 from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.selection import checked_array_names
+from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.columns import Columns, read_columns

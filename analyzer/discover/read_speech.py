@@ -18,8 +18,8 @@ from hearthlog.analyzer.discover.voice_space import (
     window_starts,
 )
 from hearthlog.analyzer.discover.voices import Evidence, summed, tell_apart
-from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
+from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.models.classes import SILENCE, SPEECH, class_name
 from hearthlog.schemas.arrays import Bool, Float64, Int64

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, events_of
-from hearthlog.analyzer.logs.labellings import NamedLabelling
+from hearthlog.analyzer.logs.labelling import NamedLabelling
 from hearthlog.analyzer.logs.spans import Overlay, overlay
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

@@ -15,13 +15,11 @@ from hearthlog.analyzer.evaluation.event_scores import (
     events_of,
     laid_out,
 )
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_classes, labelling_of
-from hearthlog.analyzer.logs.layers import with_layers
-from hearthlog.analyzer.logs.selection import Selection, select
+from hearthlog.analyzer.logs.layers import find_coverage, with_layers
+from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import common, joined
-from hearthlog.analyzer.marks.label_import import read_lines
+from hearthlog.analyzer.marks.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.schemas.arrays import Int64
@@ -202,7 +200,7 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     return TopicLabelling(topic, classes, labelling, tuple(selection.unfinished))
 
 
-def _segment_topic(selection: Selection, asked: str | None) -> str:
+def _segment_topic(selection: LogSelection, asked: str | None) -> str:
     """Find the topic of a recorder's segments."""
     topics = sorted(selection.topics_of(message_types.SEGMENT, SEGMENT_FIELDS))
     recorded = [topic for topic in topics if topic.count("/") == 2]

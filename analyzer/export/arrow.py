@@ -9,8 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.export.exporter import Table
-from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.analyzer.logs.selection import LogSelection, TypedColumns
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
@@ -26,7 +25,7 @@ _BYTES = {"byte", "char", "uint8"}  # arrays of them are binary
 _HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
 
 
-def schema_of(table: Table, selection: Selection) -> pa.Schema:
+def schema_of(table: Table, selection: LogSelection) -> pa.Schema:
     """Return the Arrow schema of a table: log time, publish time, sequence, then its fields.
 
     Its metadata are those of the channels that are equal in all logs, and the `hearthlog` records
@@ -35,7 +34,7 @@ def schema_of(table: Table, selection: Selection) -> pa.Schema:
     Parameters
     ----------
     table : Table
-    selection : Selection
+    selection : LogSelection
         Whose `hearthlog` records are among the metadata.
     """
     first, *others = [channel.metadata for channel, _ in table.channels]

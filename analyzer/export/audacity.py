@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import BinaryIO
 
 from hearthlog.analyzer.export.exporter import Table, table_exporter
-from hearthlog.analyzer.logs.selection import Damages, Selection
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.analyzer.logs.selection import Damages, LogSelection, TypedColumns
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, iterate_columns
@@ -20,7 +19,7 @@ class LabelTrack:
     the first segment. A segment that began before is cut.
     """
 
-    def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:
+    def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:
         self._stream = stream
         self._zero = _first_frame(table.topic, selection)
 
@@ -54,7 +53,7 @@ class LabelTrack:
         """Complete the file, which needs nothing."""
 
 
-def _first_frame(topic: str, selection: Selection) -> int | None:
+def _first_frame(topic: str, selection: LogSelection) -> int | None:
     features = topic_of(topic.split("/")[1] if topic.startswith("/") else "", "features")
     span = selection.start, selection.end
     stamps = {"header.stamp"}

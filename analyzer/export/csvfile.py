@@ -19,10 +19,8 @@ from hearthlog.analyzer.export.arrow import (
 )
 from hearthlog.analyzer.export.exporter import MOST_COLUMNS, Table, table_exporter
 from hearthlog.analyzer.export.text import json_texts
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.selection import LogSelection, TypedColumns, array_names
 from hearthlog.analyzer.logs.text_files import FORMULA, NUMBER
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.fields import DURATION, Field
@@ -40,7 +38,7 @@ class CsvFile:
     and an apostrophe stands before a text that a spreadsheet would take for a formula.
     """
 
-    def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:  # noqa: ARG002
+    def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:  # noqa: ARG002
         self._stream = stream
         self._table = table
         self._names: dict[str, list[str]] = {}  # of elements of arrays, in any log

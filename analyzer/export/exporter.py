@@ -12,8 +12,7 @@ from typing import Any, BinaryIO, NamedTuple, Protocol, cast
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.export.file_names import file_stem, unused_name
-from hearthlog.analyzer.logs.selection import Described, Selection
-from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
+from hearthlog.analyzer.logs.selection import Described, LogSelection, TypedColumns, decode_all
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, abridged, listed
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import (
@@ -236,7 +235,7 @@ class Exporter(NamedTuple):
         The only message type that it takes; empty for any.
     """
 
-    save: Callable[[Selection, OutputFiles, Progress], int | None]
+    save: Callable[[LogSelection, OutputFiles, Progress], int | None]
     type: str = ""
     fields: Collection[str] = ()
 
@@ -266,7 +265,7 @@ class TableWriter(Protocol):
 
 
 def write_tables(
-    selection: Selection,
+    selection: LogSelection,
     files: OutputFiles,
     progress: Progress,
     opened: Callable[[Table], TableWriter],
@@ -318,7 +317,7 @@ class _Writing:
         self._made: dict[tuple[str, int], list[Path]] = {}
         self._faults: dict[tuple[str, int], LogError] = {}
 
-    def read(self, selection: Selection, progress: Progress) -> set[str]:
+    def read(self, selection: LogSelection, progress: Progress) -> set[str]:
         """Write the messages of a selection; return the topics that have to be read once more."""
         for batch in selection.messages(progress):
             for topic, pieces in by_topic(decode_all(batch)).items():
@@ -425,7 +424,7 @@ class TableFile(io.RawIOBase):
 
 
 def table_exporter(
-    writer: Callable[[BinaryIO, Table, Selection], TableWriter],
+    writer: Callable[[BinaryIO, Table, LogSelection], TableWriter],
     type_: str = "",
     fields: Collection[str] = (),
 ) -> Exporter:
@@ -437,7 +436,7 @@ def table_exporter(
         Name of the only message type that the format takes; empty for any.
     """
 
-    def save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+    def save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
         def opened(table: Table) -> TableWriter:
             stream = cast(BinaryIO, TableFile(files.new(table.stem)))
             return writer(stream, table, selection)

@@ -21,7 +21,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hearthlog.analyzer.export.file_names import unused_name
 from hearthlog.analyzer.export.repeats import without_repeats
-from hearthlog.analyzer.logs.selection import Damages, Described, Selection, identity
+from hearthlog.analyzer.logs.selection import Damages, Described, LogSelection, identity
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.merged_reading import iterate_messages
@@ -51,7 +51,7 @@ _CHUNK_SPAN = 10 * NANOSECONDS  # as a recorder's
 
 
 def merge_logs(
-    selection: Selection,
+    selection: LogSelection,
     output: Path,
     progress: Progress = ignore_progress,
     *,
@@ -98,7 +98,7 @@ class WrittenLog(NamedTuple):
 
 
 def write_log(
-    selection: Selection,
+    selection: LogSelection,
     stream: BinaryIO,
     name: str,
     progress: Progress = ignore_progress,
@@ -134,7 +134,7 @@ def write_log(
     return WrittenLog(log.finish(name), repeated)
 
 
-def _count_repeated(selection: Selection) -> int:
+def _count_repeated(selection: LogSelection) -> int:
     """Count the messages in chunks that a log holds twice."""
     count = 0
     for path in selection.logs:
@@ -152,7 +152,7 @@ def _pass_over(_: Path, __: LogError) -> None:
 class _Log:
     """The log being written."""
 
-    def __init__(self, stream: BinaryIO, selection: Selection) -> None:
+    def __init__(self, stream: BinaryIO, selection: LogSelection) -> None:
         self._writer = CountedWriter(stream, chunk_span=_CHUNK_SPAN)
         self._schemas: dict[Hashable, int] = {}
         self._channels: dict[Hashable, int] = {}
@@ -323,7 +323,7 @@ def _key(record: McapRecord | None) -> Hashable:
 
 
 def _held_messages(
-    selection: Selection, first: Sequence[RawMessages]
+    selection: LogSelection, first: Sequence[RawMessages]
 ) -> Iterator[list[RawMessages]]:
     """Yield the messages before the span that a subscriber at its first message still receives."""
     topics = {
@@ -361,14 +361,14 @@ def _without_first(parts: Sequence[RawMessages], count: int) -> list[RawMessages
 
 
 def _earlier(
-    logs: Sequence[Path], topics: Collection[str], selection: Selection
+    logs: Sequence[Path], topics: Collection[str], selection: LogSelection
 ) -> Iterator[list[RawMessages]]:
     damages = Damages()
     earlier = iterate_messages(logs, topics, end=selection.start, on_damage=damages.add, once=True)
     return map(without_repeats, earlier)
 
 
-def _logs_of_held(selection: Selection, topics: Collection[str]) -> list[Path]:
+def _logs_of_held(selection: LogSelection, topics: Collection[str]) -> list[Path]:
     """Find the logs with the messages that channels of some topics keep, from the last log on."""
     logs: list[Path] = []
     missing = set(topics)

@@ -16,9 +16,7 @@ from hearthlog.analyzer.export.exporter import (
     write_tables,
 )
 from hearthlog.analyzer.export.text import json_texts
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.analyzer.logs.selection import LogSelection, TypedColumns, array_names
 from hearthlog.schemas.errors import LogError, Progress
 from hearthlog.schemas.logs.columns import Columns, join
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
@@ -80,7 +78,7 @@ class NpzFile:
         return False
 
 
-def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+def _save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
     sizes: Counter[NpzFile | None] = Counter()
     write_tables(selection, files, progress, lambda table: NpzFile(table, files, sizes))
 

@@ -8,8 +8,7 @@ import pyarrow.parquet as pq
 
 from hearthlog.analyzer.export.arrow import batch_of, schema_of
 from hearthlog.analyzer.export.exporter import Table, table_exporter
-from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.analyzer.logs.selection import LogSelection, TypedColumns
 
 _ROW_GROUP = 32 << 20  # bytes
 
@@ -20,7 +19,7 @@ class ParquetFile:
     Stamps are of type timestamp[ns, UTC]; the metadata are those of `schema_of`.
     """
 
-    def __init__(self, stream: BinaryIO, table: Table, selection: Selection) -> None:
+    def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:
         self._stream = stream
         self._table = table
         self._schema = schema_of(table, selection)

@@ -23,7 +23,7 @@ from rosbags.typesys.store import Typestore
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import held_count
-from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.selection import LogSelection
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import decode, unreadable, without_unreadable
@@ -39,7 +39,7 @@ _NOT_READ = re.compile("[\udc80-\udcff]")
 _LITTLE_ENDIAN = b"\x00\x01"
 
 
-def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+def _save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
     """Write a bag; the sequence numbers of headers, which ROS 2 does not have, are 0."""
     selection = selection.decodable()
     with Writer(files.path) as writer:

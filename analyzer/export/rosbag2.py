@@ -5,7 +5,7 @@ from typing import Any
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import is_for_rosbag2, write_log
-from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.selection import LogSelection
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress
 from hearthlog.schemas.messages.type_definitions import defined_types
 
@@ -15,7 +15,7 @@ _NO_PLACE = (
 )
 
 
-def _save(selection: Selection, files: OutputFiles, progress: Progress) -> int:
+def _save(selection: LogSelection, files: OutputFiles, progress: Progress) -> int:
     """Write a log and `metadata.yaml`, without topics whose channels rosbag2 cannot tell apart."""
     topics = [topic for topic, channels in selection.channels.items() if is_for_rosbag2(channels)]
     if selection.channels and not topics:
@@ -35,7 +35,7 @@ def _save(selection: Selection, files: OutputFiles, progress: Progress) -> int:
     return repeated
 
 
-def _warn_of_definitions(selection: Selection) -> None:
+def _warn_of_definitions(selection: LogSelection) -> None:
     """Warn of types with several definitions: readers of rosbag2 decode all by one of them."""
     known: dict[str, Any] = {}
     for topic, channels in selection.channels.items():

@@ -6,13 +6,12 @@ from typing import cast
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.formats import ExportFormat
-from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.analyzer.logs.typed_columns import is_compatible
+from hearthlog.analyzer.logs.selection import LogSelection, is_compatible
 from hearthlog.schemas.errors import LogError, Progress, abridged, ignore_progress
 from hearthlog.schemas.new_files import new_file, new_folder
 
 
-def exportable(selection: Selection, format_: ExportFormat) -> Selection:
+def exportable(selection: LogSelection, format_: ExportFormat) -> LogSelection:
     """Leave out the topics that a format is not for, as WAV is for clips of sound.
 
     Raise `LogError` if the selection has logs, and no topic is left.
@@ -32,7 +31,7 @@ def exportable(selection: Selection, format_: ExportFormat) -> Selection:
 
 
 def export(
-    selection: Selection,
+    selection: LogSelection,
     output: Path,
     format_: ExportFormat,
     progress: Progress = ignore_progress,

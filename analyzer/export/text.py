@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.analyzer.logs.selection import TypedColumns
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS, seconds_text
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field

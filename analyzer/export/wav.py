@@ -7,9 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles, Table, write_tables
-from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, Clip, clips_of
-from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, LoggedClip, clips_of
+from hearthlog.analyzer.logs.selection import LogSelection, TypedColumns
 from hearthlog.schemas.errors import LogError, Progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
@@ -30,7 +29,7 @@ class WavFiles:
     def __init__(self, name: Callable[[int], Path]) -> None:
         self._name = name
         self._file: wave.Wave_write | None = None
-        self._last: Clip | None = None
+        self._last: LoggedClip | None = None
         self._size = 0
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
@@ -47,7 +46,7 @@ class WavFiles:
                 self.finish()
             raise
 
-    def _write(self, clips: Iterable[Clip]) -> None:
+    def _write(self, clips: Iterable[LoggedClip]) -> None:
         for clip in clips:
             if self._file is None or not self._follows(clip):
                 self.finish()
@@ -63,7 +62,7 @@ class WavFiles:
         if file is not None:
             file.close()
 
-    def _follows(self, clip: Clip) -> bool:
+    def _follows(self, clip: LoggedClip) -> bool:
         last = self._last
         assert last is not None
         return (
@@ -73,7 +72,7 @@ class WavFiles:
         )
 
 
-def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+def _save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
     def opened(table: Table) -> WavFiles:
         return WavFiles(lambda start: files.new(f"{table.stem}_{_moment(start)}"))
 

@@ -12,8 +12,7 @@ from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_labellings
 from hearthlog.analyzer.gate.evidence import NOTHING_KNOWN, Right
 from hearthlog.analyzer.gate.reference import Sound, reference
-from hearthlog.analyzer.logs.labelling import Labelling, unified
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import joined, lengths
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
+from hearthlog.analyzer.logs.labelling import Labellings, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, joined, remains
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import UNKNOWN, class_name

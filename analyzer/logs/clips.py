@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.logs.selection import is_compatible
 from hearthlog.analyzer.logs.spans import Spans, joined
-from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -25,7 +25,7 @@ _NEAR = 10 * NANOSECONDS  # between the time of a message and that of its sound
 _TOUCHING = 5_000_000  # ns: stamps are as good as 1 ms
 
 
-class Clip(NamedTuple):
+class LoggedClip(NamedTuple):
     """One message of type `RawAudio`: sound from `start` on (ns of UTC), as 16-bit samples."""
 
     start: int
@@ -40,7 +40,7 @@ class Clip(NamedTuple):
         return self.start + samples * NANOSECONDS // self.rate
 
 
-def clips_of(columns: Columns) -> Iterator[Clip]:
+def clips_of(columns: Columns) -> Iterator[LoggedClip]:
     """Yield the clips of messages, in their order.
 
     Raise `LogError` if a field is missing, or if a clip is not `pcm-s16`, has fewer than 1000
@@ -62,7 +62,7 @@ def clips_of(columns: Columns) -> Iterator[Clip]:
             problem = f"{len(data)} bytes are no whole samples of {channels} channels"
         if problem:
             raise LogError(f"{columns.topic}: a clip cannot be read ({problem})")
-        yield Clip(start, rate, channels, bytes(data))
+        yield LoggedClip(start, rate, channels, bytes(data))
 
 
 def read_clips(
@@ -94,7 +94,7 @@ def read_clips(
         yield clip.start, clip.rate, _mono(clip)
 
 
-def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterator[Clip]:
+def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterator[LoggedClip]:
     for batch in iterate_messages([path], [name], start, end):
         for raw in batch:
             if not is_compatible(raw.channel, raw.schema, message_types.RAW_AUDIO, CLIP_FIELDS):
@@ -149,6 +149,6 @@ def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple
     return rate, sound
 
 
-def _mono(clip: Clip) -> Float32:
+def _mono(clip: LoggedClip) -> Float32:
     samples = np.frombuffer(clip.data, "<i2").astype(np.float32) / _FULL_SCALE
     return samples if clip.channels == 1 else samples.reshape(-1, clip.channels).mean(axis=1)

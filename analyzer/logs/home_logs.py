@@ -1,20 +1,29 @@
-"""The logs of a home and their layers, and of which time each of them may speak, by name."""
+"""The logs of a home: their layers, spans, days, models, and networks of sounds."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, tzinfo
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.labelled_by import NO_MODEL, LabelledBy, models_of
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
+from hearthlog.analyzer.logs.recorder_info import (
+    NO_MODEL,
+    LabelledBy,
+    embedding_source,
+    microphones_of,
+    models_of,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name, time_span
 from hearthlog.schemas.logs.metadata import recorded_scenarios
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _NEVER = 1 << 62
 _TAIL = 60 * NANOSECONDS  # of a day that may be missing from a whole one
@@ -227,3 +236,47 @@ def _closed(entries: Iterable[HomeLog]) -> Iterator[HomeLog]:
         following = dict(zip(starts, [*starts[1:], _NEVER], strict=True))
         for entry in same:
             yield entry if entry.end < _NEVER else entry._replace(end=following[entry.start])
+
+
+_MOST = 4  # changes that are named
+
+
+def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
+    """Say when a home began to be heard with a network, with another one, or without any.
+
+    Returns
+    -------
+    list of str
+        A line for each microphone that is not always heard in one way.
+    """
+    heard: dict[tuple[str, str], list[tuple[int, EmbeddingSpace | None]]] = {}
+    for log in logs:
+        with suppress(LogError), LogFile(log.path) as file:
+            for microphone in sorted(microphones_of(file, "features")):
+                source = embedding_source(file, microphone)
+                space = None if source is None else source.space
+                heard.setdefault((log.node, microphone), []).append((log.start, space))
+    return [
+        f"{microphone}: {_changes(times, zone)}"
+        for (_, microphone), times in sorted(heard.items())
+        if len({space for _, space in times}) > 1
+    ]
+
+
+def _changes(times: list[tuple[int, EmbeddingSpace | None]], zone: tzinfo) -> str:
+    parts = [f"heard {_with(times[0][1], None)}"]
+    for (_, before), (start, space) in pairwise(times):
+        if space != before:
+            moment = f"{local_time(start, zone):%Y-%m-%d %H:%M}"
+            parts.append(f"from {moment} {_with(space, before)}")
+    if len(parts) > _MOST:
+        parts = [parts[0], "…", *parts[1 - _MOST :]]
+    text = ", ".join(parts)
+    return f"{text}; only what one network heard is compared, all else by features"
+
+
+def _with(space: EmbeddingSpace | None, before: EmbeddingSpace | None) -> str:
+    if space is None:
+        return "without a network"
+    same = before is not None and before.network == space.network
+    return f"with another projection of {space.network}" if same else f"with {space.network}"

@@ -1,16 +1,33 @@
-"""A labelling: labelled spans of time by one source, as arrays, and how segments become one."""
+"""Labellings: labelled spans of time by a recorder, a model or a reviewer."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.spans import joined, remains
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.layers import find_with_layers
+from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
+from hearthlog.analyzer.logs.spans import joined, one, pieces, remains
 from hearthlog.models.classes import CLASS_NAME, class_name, translation
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.files import map_logs
+from hearthlog.schemas.logs.columns import Columns, join, read_columns
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    RELABEL,
+    TopicName,
+    labelling_topic,
+    parse_topic,
+    relabelling,
+    scenario_labelling,
+)
 
 SEGMENT_FIELDS = {"header.stamp", "duration", "label"}
 MOST_CLASSES = 100
@@ -130,3 +147,294 @@ def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
             raise LogError(f"{topic}: {label[:64]!r} cannot be the name of a class")
     if len(starts) and starts[0] < 0:
         raise LogError(f"{topic}: has a segment before 1970")
+
+
+LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
+_EVER = 1 << 62  # nanoseconds
+
+
+class LogContents(NamedTuple):
+    """A log or a layer, and what labels it has."""
+
+    path: Path
+    first: int  # log times in nanoseconds
+    last: int
+    complete: bool
+    segments: frozenset[str]  # topics of segments
+    classes: Mapping[str, Sequence[str]]  # by topic of labels: the names of their probabilities
+
+
+class NamedLabelling(NamedTuple):
+    """One labelling of one microphone."""
+
+    name: str  # `live`, `review`, `scenario/<name>` or `relabel/<model>`
+    classes: tuple[str, ...]  # the labels that there may be
+    labelling: Labelling  # in the order of time, one label at a time
+
+    def called_as(self, classes: Sequence[str]) -> "NamedLabelling":
+        """Give each label the name that its class has among some classes."""
+        names = translation(self.classes, classes)
+        own = tuple(dict.fromkeys(names.values()))
+        return NamedLabelling(self.name, own, self.labelling.called_as(classes))
+
+
+@dataclass
+class Labellings:
+    """The labellings of a log, or of a folder of logs."""
+
+    logs: Sequence[LogContents]  # with their layers, in the order of time
+    losses: list[str] = field(default_factory=list)  # what could not be used, and why
+
+    def microphone(self, name: str | None) -> str:
+        """Return the named microphone, or the only one.
+
+        Parameters
+        ----------
+        name : str or None
+            None for the only one.
+
+        Raises
+        ------
+        LogError
+            If there are no segments.
+        DataError
+            If there are several microphones and `name` is None, or none of this name.
+        """
+        names = {topic.microphone for topic in self._topics()}
+        there = ", ".join(sorted(names))
+        if not names:
+            raise LogError(
+                "no segments; if the log was recorded without a model, relabel it with one"
+                f"{self._first_loss()}"
+            )
+        if name is None and len(names) > 1:
+            raise DataError(f"choose one with --microphone: {there}")
+        if name is not None and name not in names:
+            raise DataError(
+                f"no segments of a microphone {name[:64]!r}; there is {there}{self._first_loss()}"
+            )
+        return name or names.pop()
+
+    def names(self, microphone: str) -> list[str]:
+        """List the labellings of a microphone.
+
+        Parameters
+        ----------
+        microphone : str
+            Its name.
+
+        Returns
+        -------
+        list of str
+            `live` first, then the others in the order of the alphabet.
+        """
+        names = {t.labelling for t in self._topics() if t.microphone == microphone}
+        return sorted(names, key=lambda name: (name != LIVE, name))
+
+    def find(self, microphone: str, text: str) -> str:
+        """Find the name of the labelling that a user asks for.
+
+        Parameters
+        ----------
+        microphone : str
+        text : str
+            `live`, `review`, `scenario/<name>`, `relabel/<model>`, the name of a scenario or of a
+            model, or `relabel` if there is only one.
+
+        Returns
+        -------
+        str
+            `live`, `review`, `scenario/<name>` or `relabel/<model>`.
+
+        Raises
+        ------
+        DataError
+            If the microphone has no such labelling, or a scenario and a model are called so.
+        """
+        names = self.names(microphone)
+        layers = [name for name in names if name.startswith(f"{RELABEL}/")]
+        if text == RELABEL and len(layers) == 1:
+            return layers[0]
+        if text in names:
+            return text
+        layer = relabelling(text.removeprefix(f"{RELABEL}/"))
+        matching = [name for name in (layer, scenario_labelling(text)) if name in names]
+        if len(matching) == 1:
+            return matching[0]
+        if matching:
+            raise DataError(f"{microphone}: which {text[:64]!r}? There is {' and '.join(matching)}")
+        there = f"there is {', '.join(names)}{self._first_loss()}"
+        raise DataError(f"{microphone}: no labelling {text[:64]!r}; {there}")
+
+    def read(
+        self,
+        microphone: str,
+        name: str,
+        start: int | None = None,
+        end: int | None = None,
+        progress: Progress = ignore_progress,
+    ) -> NamedLabelling:
+        """Read the segments of a labelling.
+
+        What cannot be read of a damaged log is missing; `losses` then say so.
+
+        Parameters
+        ----------
+        microphone, name : str
+            As `microphone` and `find` return them.
+        start, end : int, optional
+            Nanoseconds of UTC: what is before `start` and after `end` is cut off. By default there
+            is no limit.
+        progress : callable, optional
+            Is told the share of the logs that is done, 0 to 1.
+
+        Raises
+        ------
+        LogError
+            If there is no segment in this span of time, if segments overlap, if the first begins
+            before 1970, or if labels are too many or cannot be names of classes.
+        """
+        topic = labelling_topic(microphone, name, "segment")
+        labelling = self._labelling(topic, start, end, progress)
+        if labelling is None:
+            limited = "" if start is None and end is None else " in this span of time"
+            raise LogError(f"{topic}: there is no segment{limited}{self._first_loss()}")
+        labels = labelling_topic(microphone, name, "label")
+        named = [log.classes.get(labels, ()) for log in self.logs]
+        classes = all_classes(topic, named, labelling.labels)
+        check_labelling(topic, labelling.starts, classes)
+        return NamedLabelling(name, classes, labelling)
+
+    def with_topic(
+        self, topic: str, start: int | None = None, end: int | None = None
+    ) -> list[LogContents]:
+        """List the logs that have a topic and may have messages in a span of time.
+
+        Parameters
+        ----------
+        topic : str
+            Of segments or labels.
+        start, end : int, optional
+            Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
+            limit.
+
+        Returns
+        -------
+        list of LogContents
+            In the order of time.
+        """
+        return [
+            log
+            for log in self.logs
+            if (topic in log.segments or topic in log.classes)
+            and (start is None or log.last >= start)
+            and (end is None or log.first < end)
+        ]
+
+    def unfinished(self, topics: Sequence[str]) -> list[Path]:
+        """List the unfinished logs that have one of some topics.
+
+        Parameters
+        ----------
+        topics : sequence of str
+            Of segments.
+        """
+        return [log.path for log in self.logs if not log.complete and log.segments & set(topics)]
+
+    def lose(self, error: LogError) -> None:
+        """Append the text of an error to `losses`, once.
+
+        Parameters
+        ----------
+        error : LogError
+            Why a log could not be read.
+        """
+        if str(error) not in self.losses:
+            self.losses.append(str(error))
+
+    def _first_loss(self) -> str:
+        return f"; {self.losses[0]}" if self.losses else ""
+
+    def _labelling(
+        self, topic: str, start: int | None, end: int | None, progress: Progress
+    ) -> Labelling | None:
+        parts = list(self._segments(topic, start, end, progress))
+        if not parts:
+            return None
+        whole = labelling_of(join(parts))
+        span = one(-_EVER if start is None else start, _EVER if end is None else end)
+        spans, rows, _ = pieces(whole, span)
+        return Labelling(*spans, whole.labels[rows]) if len(rows) else None
+
+    def _segments(
+        self, topic: str, start: int | None, end: int | None, progress: Progress
+    ) -> Iterator[Columns]:
+        logs = self.with_topic(topic, start)
+        for i, log in enumerate(logs):
+            progress(i / len(logs))
+            try:
+                columns = read_columns([log.path], {topic}, start, fields=SEGMENT_FIELDS).get(topic)
+            except LogError as error:
+                self.lose(error)
+                continue
+            if columns is not None:
+                yield columns
+                if end is not None and columns.log_times[-1] >= end:
+                    return  # not before: what begins in the span may end, and be logged, later
+
+    def _topics(self) -> list[TopicName]:
+        names = {name for log in self.logs for name in log.segments}
+        topics = [topic for name in names if (topic := parse_topic(name)) is not None]
+        return [topic for topic in topics if topic.kind == "segment"]
+
+
+def find_labellings(*paths: Path) -> Labellings:
+    """Find the labellings of logs and their layers, or of folders of logs.
+
+    Parameters
+    ----------
+    *paths : Path
+        Logs, or folders of logs.
+
+    Returns
+    -------
+    Labellings
+        Its `losses` name the logs that cannot be read.
+
+    Raises
+    ------
+    LogError
+        If there is no log, if none can be read, or if none has a message.
+    """
+    opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
+    logs = [log for log in opened if isinstance(log, LogContents)]
+    losses = [str(error) for error in opened if isinstance(error, LogError)]
+    if not logs:
+        raise LogError(losses[0] if losses else f"{paths[0]}: there is no message in these logs")
+    return Labellings(sorted(logs, key=lambda log: log.first), losses)
+
+
+def _opened(path: Path) -> LogContents | LogError | None:
+    """Look into a log; None if it is sound, and empty."""
+    try:
+        selection = select([path])
+        if selection.logs:
+            return _log(path, selection)
+        with LogFile(path) as file:
+            complete = file.complete
+    except LogError as error:
+        return error
+    return None if complete else LogError(f"{path}: unfinished, and nothing of it is whole")
+
+
+def _log(path: Path, selection: LogSelection) -> LogContents:
+    classes = {
+        topic: [
+            name
+            for channel, _ in selection.channels[topic]
+            for name in array_names(channel.metadata, "probabilities")
+        ]
+        for topic in selection.topics_of(message_types.LABEL, LABEL_FIELDS)
+    }
+    segments = frozenset(selection.topics_of(message_types.SEGMENT, SEGMENT_FIELDS))
+    return LogContents(path, *selection.span, not selection.unfinished, segments, classes)

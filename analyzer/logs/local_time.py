@@ -8,7 +8,7 @@ from hearthlog.recorder.pause_schedule import DEFAULT, time_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 
-KEY = "timezone"  # in the `hearthlog` metadata record of a log
+TIMEZONE = "timezone"  # in the `hearthlog` metadata record of a log
 EVENING, MORNING = 22, 7  # of the clock: between them is the night
 Span = tuple[int, int]
 
@@ -28,7 +28,7 @@ def home_zone(name: str | None, records: Iterable[Mapping[str, str]] = ()) -> tz
     """
     if name is not None:
         return _zone(name, "use a name such as Europe/Vienna, or UTC")
-    recorded = next((record[KEY] for record in records if record.get(KEY)), DEFAULT)
+    recorded = next((record[TIMEZONE] for record in records if record.get(TIMEZONE)), DEFAULT)
     return _zone(recorded, "the logs say so; name the right one with --timezone")
 
 

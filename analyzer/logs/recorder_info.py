@@ -1,18 +1,20 @@
-"""What a log says of the recorder that wrote it."""
+"""The recorder of a log: its configuration, feature set, models and health."""
 
+import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mcap import records
 from mcap.opcode import Opcode
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS
-from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
+from hearthlog.analyzer.logs.selection import array_names, decode_types, is_compatible
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21 import AUROS21
@@ -20,6 +22,8 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.contents import Status
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.logs.metadata import (
     FEATURE_SET_DIGEST,
@@ -27,12 +31,19 @@ from hearthlog.schemas.logs.metadata import (
     FEATURE_SET_VERSION,
     features_of_microphone,
     read_provenance,
+    recorded_scenarios,
 )
 from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import EmbeddingSource, check_microphone_name, topic
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    EmbeddingSource,
+    check_microphone_name,
+    parse_topic,
+    topic,
+)
 
 CONFIGURATION = "configuration.json"
 _INFO = ("device", "feature_set", "model", "model_sha256")
@@ -289,3 +300,162 @@ def _configuration(path: Path, attachments: Sequence[Attachment]) -> Configurati
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(["", *(str(part)[:64] for part in first["loc"])])
         raise LogError(f"{path}: {CONFIGURATION}{where}: {first['msg']}") from error
+
+
+_ANY = ""  # microphone, where the record alone names a model
+
+
+class LabelledBy(NamedTuple):
+    """A model; both texts are empty for none."""
+
+    model: str
+    model_sha256: str
+
+
+NO_MODEL = LabelledBy("", "")
+
+
+def models_of(log: Path) -> Mapping[str, LabelledBy]:
+    """Read which models labelled the microphones of a log.
+
+    Returns
+    -------
+    mapping of str to LabelledBy
+        By the names of the microphones, in their order. Of a file in which none of them says it,
+        that of its `hearthlog` record, by an empty name. Empty if it says nothing, is damaged, or
+        has no message of several microphones yet.
+    """
+    models: dict[str, LabelledBy] = {}
+    with suppress(LogError), LogFile(log) as file:
+        names = sorted(microphones_of(file, "info"))
+        for name in names:
+            info = first_message(file, topic(name, "info"), message_types.STREAM_INFO)
+            if info:
+                models[name] = LabelledBy(info["model"], info["model_sha256"])
+        if not models and len(names) <= 1:
+            for record in read_provenance(file)[-1:]:
+                models[_ANY] = LabelledBy(record.get("model", ""), record.get("model_sha256", ""))
+    return models
+
+
+def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
+    """Read which model labelled a microphone of a log, or of a layer; as `models_of`.
+
+    Parameters
+    ----------
+    scenario : str, optional
+        For which it labelled; empty for the sounds of the home.
+    """
+    if scenario:
+        return scenario_models(log).get((microphone, scenario), NO_MODEL)
+    models = models_of(log)
+    return models.get(microphone, models.get(_ANY, NO_MODEL))
+
+
+def scenario_models(log: Path) -> Mapping[tuple[str, str], LabelledBy]:
+    """Read which models labelled for the scenarios of a log.
+
+    Returns
+    -------
+    mapping of (str, str) to LabelledBy
+        By microphone and scenario; empty if there is none, or the log is damaged.
+    """
+    of_scenarios: dict[tuple[str, str], LabelledBy] = {}
+    with suppress(LogError), LogFile(log) as file:
+        for record in read_provenance(file):
+            for one in recorded_scenarios(record):
+                of_scenarios[one.microphone, one.name] = LabelledBy(one.model, one.sha256)
+    return of_scenarios
+
+
+_LONGEST = 200  # characters
+
+
+class Trouble(NamedTuple):
+    """What was not well, from when to when (ns of UTC): a gap, or what diagnostics say."""
+
+    source: str
+    text: str
+    start: int
+    end: int
+
+
+class MicrophoneHealth(NamedTuple):
+    """How a microphone was at a time (ns of UTC): the worst level, and all that was not well.
+
+    `floor_dbfs` is the level of the floor of the room, NaN where it is not known.
+    """
+
+    microphone: str
+    time: int
+    level: int
+    text: str
+    floor_dbfs: float
+
+
+def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
+    """Yield the gaps of messages, without those of no length.
+
+    Raise `LogError` if one of these fields is missing.
+    """
+    starts, durations = columns["header.stamp"], columns["duration"]
+    rows = zip(starts.tolist(), durations.tolist(), columns["reason"].tolist(), strict=True)
+    for start, nanoseconds, reason in rows:
+        if nanoseconds > 0:
+            yield Trouble(f"{node}/{columns.topic}", reason, start, start + nanoseconds)
+
+
+def microphone_states(columns: Columns) -> Iterator[MicrophoneHealth]:
+    """Yield the state of a microphone for each diagnostic message that is about one.
+
+    Raise `LogError` if one of these fields is missing.
+    """
+    times, names = columns["header.stamp"].tolist(), columns["header.frame_id"].tolist()
+    for time, name, statuses in zip(times, names, columns["status"], strict=True):
+        topic = parse_topic(f"/{name}/info")
+        if topic is not None and topic.labelling == LIVE:
+            level = max((status["level"] for status in statuses), default=0)
+            bad = [status["message"] for status in statuses if status["level"]]
+            yield MicrophoneHealth(name, time, level, "; ".join(bad)[:_LONGEST], _floor(statuses))
+
+
+def _floor(statuses: Sequence[Any]) -> float:
+    for status in statuses:
+        for pair in status["values"]:
+            if pair["key"] == "floor_dbfs":
+                with suppress(ValueError):
+                    value = float(pair["value"])
+                    return value if math.isfinite(value) else math.nan
+    return math.nan
+
+
+def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
+    """Yield what was not well, from when it was said until something else was said.
+
+    Parameters
+    ----------
+    end : int
+        Nanoseconds of UTC. The last trouble of a name ends with the last status of that name, or
+        here if that is earlier.
+    """
+    for name, same in groupby(sorted(statuses), lambda status: status.name):
+        own = list(same)
+        texts = [(status.time, status.message if status.level else None) for status in own]
+        for start, stop, text in lasting(texts, min(own[-1].time, end)):
+            yield Trouble(name, text, start, stop)
+
+
+def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple[int, int, str]]:
+    """Let each text last until the next one that differs, and the last one until `end`.
+
+    Parameters
+    ----------
+    texts : sequence of (int, str or None)
+        When something was said (nanoseconds of UTC), in the order of time; None where there is
+        nothing to say.
+    """
+    changes = [(next(same)[0], text) for text, same in groupby(texts, lambda pair: pair[1])]
+    ends = [*(time for time, _ in changes[1:]), end]
+    for (start, text), stop in zip(changes, ends, strict=False):
+        if text is not None:
+            yield start, stop, text

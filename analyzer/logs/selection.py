@@ -1,5 +1,6 @@
-"""Topics, by name or by pattern, and a span of time of some logs."""
+"""Topics and a span of time of some logs, and their messages as columns."""
 
+import json
 import warnings
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -7,23 +8,114 @@ from fnmatch import fnmatchcase
 from itertools import chain
 from pathlib import Path
 from threading import Lock
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.records import Channel, Schema
 
-from hearthlog.analyzer.logs.log_spans import LogSpans, find_spans
-from hearthlog.analyzer.logs.typed_columns import is_compatible
+from hearthlog.analyzer.logs.locations import LogSpans, find_spans
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, abridged, ignore_progress
 from hearthlog.schemas.files import map_logs
-from hearthlog.schemas.logs.columns import leave_out, unreadable
+from hearthlog.schemas.logs.columns import Columns, decode, decode_readable, leave_out, unreadable
 from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.metadata import read_provenance
+from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
 from hearthlog.schemas.mcap.logfile import RECOVER, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import MESSAGE_HEAD
+from hearthlog.schemas.messages.fields import Field, fields_of, missing_fields
+from hearthlog.schemas.messages.type_definitions import message_type
+
+
+class TypedColumns(NamedTuple):
+    """Messages of one topic, and their fields by path."""
+
+    columns: Columns
+    fields: Mapping[str, Field]
+
+
+def decode_types(
+    path: Path, batch: Iterable[RawMessages], types: Mapping[str, Collection[str]]
+) -> list[Columns]:
+    """Decode the messages of some types, and leave out all others.
+
+    Parameters
+    ----------
+    types : mapping of str to collection of str
+        Paths of the fields to decode, by name of the type; `is_compatible` says which fields a
+        type may have.
+
+    Raises
+    ------
+    LogError
+        If a message is not of the type that its channel says.
+    """
+    decoded: list[Columns] = []
+    try:
+        for type_, fields in types.items():
+            same = [raw for raw in batch if is_compatible(raw.channel, raw.schema, type_, fields)]
+            decoded += decode(same, fields)
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    return decoded
+
+
+def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
+    """Decode messages of any type with all of their fields.
+
+    Parameters
+    ----------
+    batch : iterable of RawMessages
+        Messages, still encoded.
+
+    Returns
+    -------
+    list of TypedColumns
+        Messages of one topic and definition are together. What cannot be decoded is left out, with
+        a `HearthlogWarning`, as `decode_readable` does.
+    """
+    groups: dict[Any, list[RawMessages]] = {}
+    for raw in batch:
+        definition = None if raw.schema is None else (raw.schema.name, raw.schema.data)
+        groups.setdefault((raw.channel.topic, definition), []).append(raw)
+    decoded: list[TypedColumns] = []
+    for group in groups.values():
+        schema = group[0].schema
+        if parts := decode_readable(group):
+            assert schema is not None  # it was decoded
+            fields = fields_of(message_type(schema.name, schema.encoding, schema.data))
+            decoded += [TypedColumns(columns, fields) for columns in parts]
+    return decoded
+
+
+def is_compatible(
+    channel: Channel, schema: Schema | None, type_: str, fields: Collection[str]
+) -> bool:
+    """Tell whether a channel has messages of a type, from which some fields can be read.
+
+    Any version of a type of ours can be read: fields that were appended later have defaults. If a
+    definition is of no version of the type, a `HearthlogWarning` says so.
+
+    Parameters
+    ----------
+    schema : Schema or None
+        Of the channel; None if it has none.
+
+    Returns
+    -------
+    bool
+        False also if the channel is of another type, or not encoded as CDR.
+    """
+    if schema is None or schema.name != type_ or channel.message_encoding != ENCODING:
+        return False
+    missing = missing_fields(type_, schema.encoding, schema.data, frozenset(fields))
+    if missing:
+        text = f"{type_} is defined without {missing} as hearthlog has it: not read"
+        warnings.warn(HearthlogWarning(text, channel.topic), stacklevel=2)
+    return not missing
+
 
 _LAST = (1 << 63) - 1  # log time
 _NAMED = 5  # topics of which none can be decoded
@@ -57,7 +149,7 @@ class Damages:
 
 
 @dataclass(frozen=True)
-class Selection:
+class LogSelection:
     """Topics and a span of time of some logs."""
 
     logs: Sequence[Path]  # those with messages in the span
@@ -150,7 +242,7 @@ class Selection:
             if all(is_compatible(*channel, type_, fields) for channel in channels)
         ]
 
-    def only(self, topics: Collection[str]) -> "Selection":
+    def only(self, topics: Collection[str]) -> "LogSelection":
         """Return the selection without its other topics.
 
         Parameters
@@ -161,7 +253,7 @@ class Selection:
         left = {topic: same for topic, same in self.channels.items() if topic in topics}
         return replace(self, topics=frozenset(topics), channels=left)
 
-    def decodable(self) -> "Selection":
+    def decodable(self) -> "LogSelection":
         """Return the selection without channels that cannot be decoded, each with a warning.
 
         These are not of ROS 2, or the log does not define their type as it can be understood.
@@ -208,7 +300,7 @@ def select(
     patterns: Sequence[str] = (),
     start: int | None = None,
     end: int | None = None,
-) -> Selection:
+) -> LogSelection:
     """Find the logs that have messages in a span of time, and their topics of some names.
 
     A log that is damaged is left out, with a warning, unless there is no other.
@@ -264,7 +356,7 @@ def select(
         if record not in metadata:
             metadata.append(record)
     silent.sort(key=str)
-    return Selection(
+    return LogSelection(
         logs=[path for _, _, path in chosen],
         empty=silent,
         unfinished=[
@@ -342,3 +434,62 @@ def _matching(patterns: Sequence[str], topics: Iterable[str]) -> frozenset[str]:
             raise LogError(f"no topic {pattern}; there are {abridged(names)}")
         matching.update(fitting)
     return frozenset(matching)
+
+
+_MOST_NAMES = 256
+
+
+def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
+    """Return the names that a channel gives to the elements of an array.
+
+    Parameters
+    ----------
+    metadata : mapping of str to str
+        Of the channel; its `<field>_names` is a JSON list of texts.
+    field : str
+        Path of the array in the message, such as `values`.
+
+    Returns
+    -------
+    list of str
+        In the order of the elements; empty if there are no names, if one cannot be printed, or if
+        two are equal.
+    """
+    names = _names(metadata, field)
+    fit = all(name.isprintable() for name in names) and len(set(names)) == len(names)
+    return names if fit else []
+
+
+def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, ...]:
+    """Return the names that a channel gives to the elements of an array: one for each.
+
+    Parameters
+    ----------
+    field : str
+        Path of the array in the message, such as `values`.
+
+    Raises
+    ------
+    LogError
+        If the messages have no such field, if there are no names or more than 256, if two names
+        are equal, or if there are more or fewer names than elements.
+    """
+    where = f"{path}: {columns.topic}"
+    names = _names(columns.metadata, field)
+    if not names:
+        raise LogError(f"{where}: the channel does not name its values")
+    if len(names) > _MOST_NAMES or len(set(names)) < len(names):
+        raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
+    if columns[field].shape[1:] != (len(names),):
+        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
+    return tuple(names)
+
+
+def _names(metadata: Mapping[str, str], field: str) -> list[str]:
+    """Read a list of texts; none if it is anything else."""
+    try:
+        names: Any = json.loads(metadata.get(f"{field}_names", ""))
+        "".join(names).encode()  # or JSON has other things than texts, or halves of characters
+    except (ValueError, TypeError, RecursionError):
+        return []
+    return names if isinstance(names, list) else []

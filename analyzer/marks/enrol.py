@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.export.merge import merge_logs
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.coverage import find_coverage
-from hearthlog.analyzer.logs.layers import latest_records
-from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.logs.layers import find_coverage, latest_records
+from hearthlog.analyzer.logs.selection import array_names, select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import CLASS_NAME, SILENCE, class_name
 from hearthlog.models.features.feature_set import SILENCE_POWER

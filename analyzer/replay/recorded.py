@@ -6,10 +6,15 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, LARGEST_FRAME, directions_of
-from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
-from hearthlog.analyzer.logs.typed_columns import is_compatible
+from hearthlog.analyzer.logs.selection import is_compatible
+from hearthlog.analyzer.logs.sound_vectors import (
+    DIRECTION_FIELDS,
+    EMBEDDING_FIELDS,
+    LARGEST_FRAME,
+    directions_of,
+    embeddings_of,
+)
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, NOWHERE, Auxiliary, Directions
 from hearthlog.models.embedding.projection import NO_EMBEDDINGS, Embeddings
 from hearthlog.recorder.events import Gap, SourceHealth

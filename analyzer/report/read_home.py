@@ -7,8 +7,6 @@ import numpy as np
 
 from hearthlog.analyzer.accuracy.reviewed_labels import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.health import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import (
     MOST_CLASSES,
@@ -19,9 +17,10 @@ from hearthlog.analyzer.logs.labelling import (
     overlaid,
     unified,
 )
-from hearthlog.analyzer.logs.selection import Selection, select
+from hearthlog.analyzer.logs.recorder_info import Trouble, gaps_of, troubles_of
+from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import Spans, common, joined, one
-from hearthlog.analyzer.marks.formats.class_names import find_class_names
+from hearthlog.analyzer.marks.label_files import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import CLASS_NAME, OTHER, class_name
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -170,7 +169,7 @@ def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
             continue  # it is not of these days
 
 
-def _lose_unfinished(home: HomeData, entry: HomeLog, selection: Selection) -> None:
+def _lose_unfinished(home: HomeData, entry: HomeLog, selection: LogSelection) -> None:
     if selection.unfinished and not selection.logs:
         home.lose(f"{entry.path}: unfinished, and nothing of it is whole")
     elif selection.unfinished:

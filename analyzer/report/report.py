@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.accuracy.checked_minutes import read_checked_minutes
-from hearthlog.analyzer.logs.health import Trouble
-from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day
+from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day, network_changes
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
-from hearthlog.analyzer.logs.networks import network_changes
+from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import common, joined, one
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.daily_metrics import HOUR, day_of

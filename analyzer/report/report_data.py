@@ -6,7 +6,7 @@ from datetime import date, tzinfo
 
 from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
 from hearthlog.analyzer.accuracy.count_range import FEWEST as FEWEST_CHECKED
-from hearthlog.analyzer.logs.health import Trouble
+from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes

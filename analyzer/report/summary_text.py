@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from hearthlog.analyzer.logs.health import Trouble
 from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.report.class_words import (
     clock_text,

@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.directions import DIRECTION_FIELDS, directions_of
-from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
+from hearthlog.analyzer.logs.selection import array_names
+from hearthlog.analyzer.logs.sound_vectors import (
+    DIRECTION_FIELDS,
+    EMBEDDING_FIELDS,
+    directions_of,
+    embeddings_of,
+)
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
 from hearthlog.models.classifiers.evidence import NOWHERE, Directions
 from hearthlog.models.embedding.projection import NO_EMBEDDINGS, Embeddings

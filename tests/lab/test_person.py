@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.spans import one, overlay, pieces
 from hearthlog.analyzer.marks.marks import read_marks, read_reviewed
 from hearthlog.models.starter import GENERAL, starter_file

@@ -18,9 +18,9 @@ from hearthlog.tools.cli.table import NAME_WIDTH, print_table
 from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, number, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.coverage import Coverage
-    from hearthlog.analyzer.marks.formats.left_out import LeftOut
-    from hearthlog.analyzer.marks.label_import import Folded
+    from hearthlog.analyzer.logs.layers import Coverage
+    from hearthlog.analyzer.marks.formats.labels import SkippedLabels
+    from hearthlog.analyzer.marks.label_files import Folded
     from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 
 _SCENARIO = "Scenario that the marks are of, by its name; else they are of the sounds of the home."
@@ -75,13 +75,17 @@ def import_labels(
     `hearthlog review --queue --save` made the file, spans that still have a label were looked at.
     Exit status 3: some labels were left out.
     """
-    from hearthlog.analyzer.logs.coverage import find_coverage
-    from hearthlog.analyzer.marks.formats.class_names import read_class_map
+    from hearthlog.analyzer.logs.layers import find_coverage
     from hearthlog.analyzer.marks.formats.labels import Choice
-    from hearthlog.analyzer.marks.label_import import ImportOptions
-    from hearthlog.analyzer.marks.label_import import import_labels as read_labels
-    from hearthlog.analyzer.marks.marks import RANDOM, read_marks, read_reviewed, write_marks
-    from hearthlog.analyzer.marks.merge_marks import new_marks
+    from hearthlog.analyzer.marks.label_files import ImportOptions, read_class_map
+    from hearthlog.analyzer.marks.label_files import import_labels as read_labels
+    from hearthlog.analyzer.marks.marks import (
+        RANDOM,
+        new_marks,
+        read_marks,
+        read_reviewed,
+        write_marks,
+    )
     from hearthlog.analyzer.review.queue.asked import (
         asked_path,
         check_scenario,
@@ -157,8 +161,8 @@ def export_labels(
     scenario: Annotated[str, typer.Option(help=_SCENARIO, show_default="none")] = "",
 ) -> None:
     """Write the marks of review layers to a label file."""
-    from hearthlog.analyzer.logs.coverage import find_coverage
-    from hearthlog.analyzer.marks.formats.label_files import write_labels
+    from hearthlog.analyzer.logs.layers import find_coverage
+    from hearthlog.analyzer.marks.label_files import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
     from hearthlog.schemas.new_files import check_new
 
@@ -244,7 +248,7 @@ def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
             raise typer.Exit(1)
 
 
-def _losses(left_out: "LeftOut") -> Iterator[str]:
+def _losses(left_out: "SkippedLabels") -> Iterator[str]:
     """Say how many labels of each kind were left out, and which was the first."""
     kinds = list(left_out.kinds())
     for count, first in kinds[:_SHOWN]:

@@ -10,7 +10,7 @@ from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.selection import Selection
+    from hearthlog.analyzer.logs.selection import LogSelection
 
 
 def cat(
@@ -28,8 +28,7 @@ def cat(
     Exit status 3: a log is unfinished.
     """
     from hearthlog.analyzer.export.text import in_order, json_lines, text_lines
-    from hearthlog.analyzer.logs.selection import select
-    from hearthlog.analyzer.logs.typed_columns import decode_all
+    from hearthlog.analyzer.logs.selection import decode_all, select
 
     selection = select(logs, topics or [], *parse_span(start, end)).decodable()
     if output_format == "csv" and len(selection.channels) > 1:
@@ -44,10 +43,10 @@ def cat(
     end_with_warnings(unfinished_lines(selection.unfinished))
 
 
-def _print_table(selection: "Selection") -> None:
+def _print_table(selection: "LogSelection") -> None:
     from hearthlog.analyzer.export.csvfile import CsvFile
     from hearthlog.analyzer.export.exporter import one_table, tables_of
-    from hearthlog.analyzer.logs.typed_columns import decode_all
+    from hearthlog.analyzer.logs.selection import decode_all
 
     for topic, channels in selection.channels.items():
         remedy = "choose other logs, or export --format csv, which makes a file for each"

@@ -14,8 +14,7 @@ from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.catalog.catalog import Catalog
-    from hearthlog.analyzer.logs.catalog.fleet import HomeSummary, LabelAmount
+    from hearthlog.analyzer.logs.catalog import Catalog, HomeTotals, LabelAmount
 
 _HOMES_SHOWN = 40  # that is a page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
@@ -50,8 +49,13 @@ def catalog(
     from hearthlog.schemas.logs.files import check_allowed
 
     require("pyarrow")
-    from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, UNFINISHED
-    from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts, scenario_amounts
+    from hearthlog.analyzer.logs.catalog import (
+        DAMAGED,
+        UNFINISHED,
+        homes,
+        label_amounts,
+        scenario_amounts,
+    )
 
     check_allowed(folder)
     if folder.is_file():
@@ -78,8 +82,8 @@ def catalog(
 
 
 def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
-    from hearthlog.analyzer.logs.catalog.catalog import read_catalog
-    from hearthlog.analyzer.logs.catalog.making import write_catalog
+    from hearthlog.analyzer.logs.catalog import read_catalog
+    from hearthlog.analyzer.logs.catalog_writer import write_catalog
     from hearthlog.analyzer.workers import open_workers
 
     previous = read_catalog(folder)
@@ -96,13 +100,13 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
         raise
 
 
-def _home(home: "HomeSummary") -> dict[str, object]:
+def _home(home: "HomeTotals") -> dict[str, object]:
     times = {"start": moment(home.start), "end": moment(home.end)}
     return asdict(home) | times | {"hours": home.hours}
 
 
 def _print(
-    homes: Sequence["HomeSummary"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
+    homes: Sequence["HomeTotals"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
 ) -> None:
     print_table(("home", *_COUNTS, *_FIGURES), _home_rows(homes))
     if len(homes) > _HOMES_SHOWN:
@@ -111,14 +115,14 @@ def _print(
     print_lines(first_of("unfinished", unfinished))
 
 
-def _home_rows(homes: Sequence["HomeSummary"]) -> Iterator[Sequence[str]]:
+def _home_rows(homes: Sequence["HomeTotals"]) -> Iterator[Sequence[str]]:
     for home in homes[:_HOMES_SHOWN]:
         yield _home_row(home.home or "-", [home])
     if len(homes) > 1:
         yield _home_row(number(len(homes), "home"), homes)
 
 
-def _home_row(name: str, homes: Sequence["HomeSummary"]) -> Sequence[str]:
+def _home_row(name: str, homes: Sequence["HomeTotals"]) -> Sequence[str]:
     starts = [home.start for home in homes if home.start is not None]
     ends = [home.end for home in homes if home.end is not None]
     return [

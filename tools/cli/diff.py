@@ -25,7 +25,7 @@ from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.text import end_with_warnings, tell, unfinished_lines, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.labellings import Labellings, NamedLabelling
+    from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
     from hearthlog.analyzer.review.queue.review_list import ReviewSpan
 
 _SHOWN, _QUEUED = 10, 60
@@ -62,7 +62,7 @@ def diff(
 
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
-    from hearthlog.analyzer.logs.labellings import find_labellings
+    from hearthlog.analyzer.logs.labelling import find_labellings
     from hearthlog.analyzer.review.queue.review_list import write_list
     from hearthlog.schemas.messages.topics import labelling_topic
 

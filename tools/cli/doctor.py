@@ -11,7 +11,7 @@ from hearthlog.tools.cli.options import Json, LocalLogs, check_output
 from hearthlog.tools.cli.text import number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.doctor import Findings
+    from hearthlog.analyzer.doctor.findings import Findings
 
 
 def doctor(
@@ -59,7 +59,7 @@ def doctor(
     if live:
         _examine_live(paths[0], ping_url, ping_file, as_json=as_json)
         return
-    from hearthlog.analyzer.doctor import examine
+    from hearthlog.analyzer.doctor.examination import examine
     from hearthlog.tools.cli.progress import share_done
 
     missing: list[str] = []
@@ -78,9 +78,8 @@ def doctor(
 
 def _network_changes(paths: list[Path]) -> list[str]:
     """Say when a home began, changed or lost a network, which is no fault of a log."""
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.home_logs import find_home_logs, network_changes
     from hearthlog.analyzer.logs.local_time import home_zone
-    from hearthlog.analyzer.logs.networks import network_changes
     from hearthlog.schemas.errors import LogError
 
     try:

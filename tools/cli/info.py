@@ -16,7 +16,7 @@ from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.summary import Summary
+    from hearthlog.analyzer.logs.summary import LogSummary
     from hearthlog.schemas.logs.contents import Status
     from hearthlog.schemas.logs.metadata import RecordedScenario
     from hearthlog.tools.cli.accuracy_text import Accuracy
@@ -36,7 +36,7 @@ def info(
     """
     if catalog:
         wrong_use("say `hearthlog catalog FOLDER`")
-    from hearthlog.analyzer.logs.summarise import summarise
+    from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.modelfile.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
     from hearthlog.tools.cli.info_gist import next_step
@@ -71,7 +71,7 @@ def info(
 
 
 def _model_lines(
-    summary: "Summary", path: Path, scenarios: "Sequence[RecordedScenario]"
+    summary: "LogSummary", path: Path, scenarios: "Sequence[RecordedScenario]"
 ) -> Iterator[str]:
     """Name the models that label beside the recorder's."""
     if (candidate := _candidate(summary, path)) is not None:
@@ -80,7 +80,7 @@ def _model_lines(
         yield f"scenario {one.name}, {one.microphone}: model {one.model} ({one.sha256[:12]})"
 
 
-def _candidate(summary: "Summary", path: Path) -> str | None:
+def _candidate(summary: "LogSummary", path: Path) -> str | None:
     """Name the model that labels beside the recorder's; None if none did."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.schemas.messages.topics import CANDIDATE
@@ -98,7 +98,7 @@ def _candidate(summary: "Summary", path: Path) -> str | None:
     return None
 
 
-def _scenarios(summary: "Summary", path: Path) -> "list[RecordedScenario]":
+def _scenarios(summary: "LogSummary", path: Path) -> "list[RecordedScenario]":
     """Return the scenarios that have labels, each with the last model that labelled for it."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.schemas.logs.metadata import recorded_scenarios
@@ -113,7 +113,7 @@ def _scenarios(summary: "Summary", path: Path) -> "list[RecordedScenario]":
     return [last[key] for key in sorted(last)]
 
 
-def _accuracy(summary: "Summary", path: Path) -> "Accuracy | None":
+def _accuracy(summary: "LogSummary", path: Path) -> "Accuracy | None":
     """Read how right the labels of a recorder are; None if there are none."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.tools.cli.accuracy_text import Accuracy
@@ -135,7 +135,7 @@ def _each(paths: Sequence[Path], progress: Progress) -> Iterator[Path]:
         progress(count / len(paths))
 
 
-def _as_json(summary: "Summary") -> dict[str, Any]:
+def _as_json(summary: "LogSummary") -> dict[str, Any]:
     first, last = summary.span or (None, None)
     return {
         "files": [str(path) for path in summary.files],
@@ -199,7 +199,7 @@ def _health(health: "Status | None") -> dict[str, str] | None:
     }
 
 
-def _print(summary: "Summary") -> None:
+def _print(summary: "LogSummary") -> None:
     from hearthlog.tools.cli.info_gist import gist
 
     print_lines(gist(summary))
@@ -220,7 +220,7 @@ def _print(summary: "Summary") -> None:
     print_lines(_gap_lines(summary))
 
 
-def _lines(summary: "Summary") -> Iterator[str]:
+def _lines(summary: "LogSummary") -> Iterator[str]:
     """Describe the files, by what they contain and by what their metadata says."""
     chunks = f", {number(summary.chunks, 'chunk')}" if summary.chunks else ""
     ratio = summary.compression_ratio
@@ -256,7 +256,7 @@ def _lines(summary: "Summary") -> Iterator[str]:
             yield f"{what}: {one['level']}, {one['time']} {one['name']}: {one['message']}"
 
 
-def _gap_lines(summary: "Summary") -> Iterator[str]:
+def _gap_lines(summary: "LogSummary") -> Iterator[str]:
     lines = [
         f"{gap.microphone} {moment(gap.start)} {gap.seconds:.3f} s, "
         f"{number(gap.frames_lost, 'frame')}: {gap.reason}"
@@ -265,7 +265,7 @@ def _gap_lines(summary: "Summary") -> Iterator[str]:
     yield from first_of("gap", lines)
 
 
-def _label_rows(summary: "Summary") -> Iterator[tuple[str, ...]]:
+def _label_rows(summary: "LogSummary") -> Iterator[tuple[str, ...]]:
     for microphone in dict.fromkeys([*summary.label_seconds, *summary.segments]):
         seconds = summary.label_seconds.get(microphone, Counter())
         segments = summary.segments.get(microphone, Counter())

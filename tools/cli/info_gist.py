@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hearthlog.analyzer.logs.summary import Summary
+from hearthlog.analyzer.logs.summary import LogSummary
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
@@ -14,7 +14,7 @@ from hearthlog.tools.cli.options import models_folder
 from hearthlog.tools.cli.text import JUDGED_BY, number
 
 
-def gist(summary: Summary) -> Iterator[str]:
+def gist(summary: LogSummary) -> Iterator[str]:
     """Say in words what was heard, how much of it is in doubt, and what was not heard."""
     for microphone, seconds in summary.segment_seconds.items():
         if "/" in microphone:  # of a layer
@@ -40,7 +40,7 @@ def gist(summary: Summary) -> Iterator[str]:
         )
 
 
-def next_step(summary: Summary, path: Path) -> str | None:
+def next_step(summary: LogSummary, path: Path) -> str | None:
     """Say what to do for better labels; None if these are no logs of a recorder."""
     if not summary.streams:
         return None

@@ -34,7 +34,7 @@ from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, tell, wrong_u
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hearthlog.analyzer.logs.labellings import Labellings
+    from hearthlog.analyzer.logs.labelling import Labellings
     from hearthlog.analyzer.logs.spans import Spans
     from hearthlog.analyzer.review.queue.asked import SoundFile
     from hearthlog.analyzer.review.queue.review_list import ReviewSpan
@@ -299,7 +299,7 @@ def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
 ) -> "tuple[list[ReviewItem], Marking]":
     """Find what is to be gone through, and what is corrected."""
-    from hearthlog.analyzer.logs.labellings import find_labellings
+    from hearthlog.analyzer.logs.labelling import find_labellings
     from hearthlog.analyzer.review.queue.asked import corrected_name
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.queue_items import review_items
@@ -329,11 +329,10 @@ def _work(
 
 def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | None) -> None:
     """Write the spans of a queue, and what sound of them was kept, for who has no viewer."""
-    from hearthlog.analyzer.logs.coverage import find_coverage
-    from hearthlog.analyzer.logs.labellings import find_labellings
-    from hearthlog.analyzer.logs.layers import zone_of
+    from hearthlog.analyzer.logs.labelling import find_labellings
+    from hearthlog.analyzer.logs.layers import find_coverage, zone_of
     from hearthlog.analyzer.marks.formats.formats import AUDACITY
-    from hearthlog.analyzer.marks.formats.label_files import write_labels
+    from hearthlog.analyzer.marks.label_files import write_labels
     from hearthlog.analyzer.review.queue.asked import (
         asked_path,
         drawn_minutes,

@@ -24,8 +24,7 @@ from hearthlog.analyzer.accuracy.events import (
     television_minutes,
 )
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.labelling import Labelling, unified
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import joined, lengths
 from hearthlog.analyzer.review.queue.random_minutes import Minutes, draw_minutes
 from hearthlog.models.classes import SILENCE, UNKNOWN

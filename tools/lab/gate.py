@@ -27,8 +27,7 @@ from hearthlog.analyzer.gate.recent_time import (
     unlearned_time,
 )
 from hearthlog.analyzer.gate.two_models import TwoModels, joined_frames
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adapt import adapt_model

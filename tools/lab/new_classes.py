@@ -20,8 +20,8 @@ import typer
 
 from hearthlog.analyzer.gate.judge import judge
 from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
-from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.home_lessons import home_lessons

@@ -17,8 +17,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

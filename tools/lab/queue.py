@@ -17,9 +17,8 @@ import typer
 
 from hearthlog.analyzer.evaluation.event_scores import events_of
 from hearthlog.analyzer.evaluation.scenes import Colour, background, compose
-from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
+from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, rows_at
 from hearthlog.analyzer.review.queue.judgeable_spans import judgeable_spans
 from hearthlog.analyzer.review.queue.ranking import USEFUL, make_queue

@@ -17,8 +17,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.labelling import Labelling, unified
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE

@@ -14,7 +14,7 @@ import numpy as np
 import soundfile
 import typer
 
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.spans import one, pieces
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.starter import GENERAL

@@ -7,9 +7,8 @@ from pathlib import Path
 from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
 from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
 from hearthlog.analyzer.bridge.listeners import listener_of
-from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.selection import Described, select
+from hearthlog.analyzer.logs.selection import Described, array_names, select
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

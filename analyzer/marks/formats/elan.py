@@ -18,9 +18,15 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.sax import parse
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, made_text
-from hearthlog.analyzer.marks.formats.left_out import WRONG_TIME, LineError
+from hearthlog.analyzer.logs.layers import Coverage
+from hearthlog.analyzer.marks.formats.labels import (
+    WRONG_TIME,
+    Choice,
+    FileLabel,
+    LabelCodec,
+    LineError,
+    made_text,
+)
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.errors import listed
 from hearthlog.schemas.frames import seconds_text, time_text
@@ -290,3 +296,8 @@ def _add_types(root: ET.Element, kinds: Sequence[str]) -> None:
         DESCRIPTION="1-1 association with a parent annotation",
         STEREOTYPE="Symbolic_Association",
     )
+
+
+CODECS: Mapping[str, LabelCodec] = {
+    "ELAN": LabelCodec(read, write),
+}

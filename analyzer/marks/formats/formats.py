@@ -1,6 +1,6 @@
 """The formats of label files: the one table that readers, writers and the command line use.
 
-A format is a module of this folder, with the functions of `label_files.LabelCodec`, and a row here.
+A format is a `LabelCodec` in the `CODECS` of a module of this folder, and a row of its name here.
 """
 
 from pathlib import Path
@@ -28,16 +28,16 @@ class LabelFormat(NamedTuple):
         return f"*{self.suffix}" if named else f"*{self.suffix} ({self.name})"
 
 
-AUDACITY = LabelFormat("Audacity", ".txt", "audacity")
-RAVEN = LabelFormat("Raven", ".selections.txt", "raven", has_columns=True)
+AUDACITY = LabelFormat("Audacity", ".txt", "tables")
+RAVEN = LabelFormat("Raven", ".selections.txt", "tables", has_columns=True)
 FORMATS = (
     AUDACITY,
     RAVEN,
-    LabelFormat("CSV", ".csv", "csvfile", has_columns=True),
+    LabelFormat("CSV", ".csv", "tables", has_columns=True),
     # XML takes more for as many labels.
     LabelFormat("ELAN", ".eaf", "elan", 64 * _MEGABYTE, has_tiers=True),
     LabelFormat("Label Studio", ".json", "labelstudio"),
-    LabelFormat("RTTM", ".rttm", "rttm"),
+    LabelFormat("RTTM", ".rttm", "tables"),
 )
 PATTERNS = listed([each.pattern for each in FORMATS])
 

@@ -1,23 +1,73 @@
-"""Labels as they are in a file, and the marks that they become."""
+"""Labels of a label file, the marks they become, and errors of those that are skipped."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.left_out import (
-    EMPTY,
-    OTHER,
-    POINT,
-    WRONG_TIME,
-    LineError,
-    place_text,
-)
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import LATEST, PERSON_NAME, Mark
 from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
+
+UNREADABLE, EMPTY, POINT, OVERLAP = "unreadable line", "empty label", "point", "overlap"
+WRONG_TIME = "wrong time"
+OTHER = "label"
+
+
+def place_text(path: Path, place: int | str) -> str:
+    """Write the place of a label for an error: `file:line`, or `file: place`."""
+    return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
+
+
+class LineError(DataError):
+    """A label of a file that cannot be a mark.
+
+    Parameters
+    ----------
+    alike : str, optional
+        What labels of the kind must have in common to be counted together.
+    """
+
+    def __init__(self, where: str, kind: str, reason: str, alike: str = "") -> None:
+        super().__init__(f"{where}: {reason}")
+        self.kind = kind
+        self.alike = alike
+
+
+class SkippedLabels:
+    """Labels of a file that are left out: how many of each kind, and the first of them.
+
+    Parameters
+    ----------
+    strict : bool
+        Whether none may be left out.
+    """
+
+    def __init__(self, *, strict: bool) -> None:
+        self._strict = strict
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._first: dict[tuple[str, str], LineError] = {}
+
+    def add(self, error: LineError) -> None:
+        """Leave out a label.
+
+        Raise `LineError` if none may be left out.
+        """
+        if self._strict:
+            raise error
+        key = error.kind, error.alike
+        self._counts[key] += 1
+        self._first.setdefault(key, error)
+
+    def kinds(self) -> Iterator[tuple[int, LineError]]:
+        """Yield how many there are of each kind, and the first; the most first."""
+        for key, count in self._counts.most_common():
+            yield count, self._first[key]
+
 
 _SECONDS = re.compile(r"[-+]?([0-9]{1,10}(\.[0-9]{0,18})?|\.[0-9]{1,18})([eE][-+]?[0-9]{1,2})?")
 _DECIMAL_COMMA = re.compile(r"([-+]?[0-9]*),([0-9]+([eE][-+]?[0-9]{1,2})?)")
@@ -63,6 +113,25 @@ class Choice(NamedTuple):
 
     tiers: Sequence[str] = ()
     columns: Mapping[str, str] = {}
+
+
+class LabelCodec(NamedTuple):
+    """The functions of a format.
+
+    Attributes
+    ----------
+    read : callable
+        Yields the labels of a file in its order, from its path (for messages), its text and a
+        `Choice`; a `LineError` for a line that is no label. Raises `DataError`, with file and
+        place, if the text is not of this format.
+    write : callable
+        Returns the text of a file that `read` reads again, from its path (for messages), at least
+        one mark, and the coverage of all of their microphones. Raises `DataError` if the format
+        has no place for several microphones.
+    """
+
+    read: Callable[[Path, str, Choice], Iterator[FileLabel | LineError]]
+    write: Callable[[Path, Sequence[Mark], Mapping[str, Coverage]], str]
 
 
 class PlacedMark(NamedTuple):

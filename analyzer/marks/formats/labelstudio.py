@@ -7,9 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, made_text
-from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
+from hearthlog.analyzer.logs.layers import Coverage
+from hearthlog.analyzer.marks.formats.labels import (
+    UNREADABLE,
+    Choice,
+    FileLabel,
+    LabelCodec,
+    LineError,
+    made_text,
+    place_text,
+)
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.frames import seconds_text, time_text
 
@@ -154,3 +161,8 @@ def _completed(annotation: Mapping[str, Any]) -> tuple[str, str]:
 def _text(value: Any) -> str:
     """Return a text, empty for null; other values as JSON."""
     return value if isinstance(value, str) else "" if value is None else dumps(value)
+
+
+CODECS: Mapping[str, LabelCodec] = {
+    "Label Studio": LabelCodec(read, write),
+}

@@ -1,21 +1,29 @@
-"""Tables of labels: a line for each, in columns that are found by their names."""
+"""Label files of one line a label: CSV, Raven, Audacity and RTTM."""
 
 import csv
+import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.text_files import csv_rows, without_disarming
+from hearthlog.analyzer.logs.layers import Coverage
+from hearthlog.analyzer.logs.text_files import csv_rows, disarmed, numbered_lines, without_disarming
 from hearthlog.analyzer.marks.formats.labels import (
+    UNREADABLE,
     Choice,
     FileLabel,
+    LabelCodec,
+    LineError,
     add_seconds,
     is_seconds,
+    made_text,
+    place_text,
     with_point,
 )
-from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.errors import listed
+from hearthlog.schemas.frames import seconds_text, time_text
 
 _NAMES: Mapping[str, Sequence[str]] = {
     "start": ("start", "start time", "begin", "begin time", "onset", "time"),
@@ -41,7 +49,7 @@ def is_table(text: str) -> bool:
     return bool(start and (end or duration))
 
 
-def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
+def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
     """Yield the rows of a table, each once: Raven may list it for every view and channel.
 
     Fields are separated by tabs, semicolons or commas: by what the first line has most of. Unless
@@ -156,3 +164,169 @@ def _plain(name: str) -> str:
 
 def _first_line(text: str) -> str:
     return text.lstrip().split("\n", 1)[0]
+
+
+_CSV_COLUMNS = ("start", "end", "label", "microphone", "reviewer", "made", "corrects")
+
+
+def write_csv(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+    """Write a table with all fields of the marks.
+
+    Parameters
+    ----------
+    coverage : mapping of str to Coverage
+        Not used: times are written in UTC.
+
+    Returns
+    -------
+    str
+        The text of the file; an apostrophe stands before what a spreadsheet would run.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_CSV_COLUMNS)
+    for mark in marks:
+        start, end = time_text(mark.start), time_text(mark.end)
+        origin = mark.reviewer, made_text(mark), mark.corrects
+        texts = mark.label, mark.microphone, *origin
+        table.writerow([start, end, *map(disarmed, texts)])
+    return text.getvalue()
+
+
+_BAND = ("0.000", "8000.000")  # Hz, of sound at 16 kHz
+_RAVEN_COLUMNS = (
+    "Selection",
+    "View",
+    "Channel",
+    "Begin Time (s)",
+    "End Time (s)",
+    "Low Freq (Hz)",
+    "High Freq (Hz)",
+    "Annotation",
+    "Microphone",
+    "Reviewer",
+    "Made",
+    "Corrects",
+)
+
+
+def write_raven(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+    """Write a table with columns for all fields of the marks, which Raven keeps.
+
+    Parameters
+    ----------
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+    """
+    channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
+    lines = ["\t".join(_RAVEN_COLUMNS)]
+    for number, mark in enumerate(marks, 1):
+        zero = coverage[mark.microphone].starts[0]
+        fields = [
+            str(number),
+            "Spectrogram 1",
+            str(channels[mark.microphone]),
+            seconds_text(mark.start - zero),
+            seconds_text(mark.end - zero),
+            *_BAND,
+            mark.label,
+            mark.microphone,
+            mark.reviewer,
+            made_text(mark),
+            mark.corrects,
+        ]
+        lines.append("\t".join(fields))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def read_audacity(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
+    """Yield the labels of a track, whose times may have decimal commas.
+
+    Raise `DataError` if the text has too many lines.
+    """
+    for number, line in numbered_lines(path, text):
+        if line.startswith("\\"):  # the pitch of a spectral selection
+            continue
+        start, end, label, *_ = [*(field.strip() for field in line.split("\t")), "", ""]
+        if not end:
+            reason = "is not start, end and label with tabs between them"
+            yield LineError(place_text(path, number), UNREADABLE, reason)
+            continue
+        yield FileLabel(number, with_point(start), with_point(end), label)
+
+
+def write_audacity(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
+    """Write a track, which has no place for microphones and reviewers.
+
+    Parameters
+    ----------
+    marks : sequence of Mark
+        At least one; all of one microphone.
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+
+    Raises
+    ------
+    DataError
+        If the marks are of several microphones.
+    """
+    microphones = sorted({mark.microphone for mark in marks})
+    if len(microphones) > 1:
+        names = ", ".join(microphones)
+        raise DataError(f"{path}: is for one microphone: choose one with --microphone ({names})")
+    zero = coverage[microphones[0]].starts[0]
+    return "".join(
+        f"{seconds_text(mark.start - zero)}\t{seconds_text(mark.end - zero)}\t{mark.label}\n"
+        for mark in marks
+    )
+
+
+_SPEAKER = "SPEAKER"
+_FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
+
+
+def read_rttm(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
+    """Yield the labels; lines of other types, and comments, are left out.
+
+    Raise `DataError` if the text has too many lines.
+    """
+    for number, line in numbered_lines(path, text):
+        fields, where = line.split(), place_text(path, number)
+        if fields[0].startswith(";;"):
+            continue
+        if len(fields) not in _FIELDS:
+            yield LineError(where, UNREADABLE, "is no line of RTTM, which has 9 or 10 fields")
+        elif fields[0] == _SPEAKER:
+            _, microphone, _, onset, duration, _, _, label, *_ = fields
+            try:
+                end = add_seconds(where, onset, duration)
+            except LineError as error:
+                yield error
+                continue
+            yield FileLabel(number, onset, end, label, microphone)
+
+
+def write_rttm(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+    """Write a line for each mark.
+
+    Parameters
+    ----------
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+    """
+    lines = []
+    for mark in marks:
+        onset = seconds_text(mark.start - coverage[mark.microphone].starts[0])
+        duration = seconds_text(mark.end - mark.start)
+        lines.append(
+            f"{_SPEAKER} {mark.microphone} 1 {onset} {duration} <NA> <NA> {mark.label} <NA> <NA>\n"
+        )
+    return "".join(lines)
+
+
+CODECS: Mapping[str, LabelCodec] = {
+    "Audacity": LabelCodec(read_audacity, write_audacity),
+    "CSV": LabelCodec(read_table, write_csv),
+    "Raven": LabelCodec(read_table, write_raven),
+    "RTTM": LabelCodec(read_rttm, write_rttm),
+}

@@ -14,8 +14,8 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import SAMPLE_BYTES, kept_sound, kept_time
-from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, pieces
 from hearthlog.analyzer.marks.formats.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan

@@ -9,7 +9,7 @@ from hearthlog.analyzer.evaluation.event_scores import Events, events_of
 from hearthlog.analyzer.gate.changed_time import ChangedTime, find_changed_time
 from hearthlog.analyzer.gate.judge import find_champion, other_features
 from hearthlog.analyzer.gate.recent_time import recent_logs
-from hearthlog.analyzer.logs.labellings import Labellings, NamedLabelling
+from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     JudgeableSpans,

@@ -7,8 +7,8 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, events_of
-from hearthlog.analyzer.logs.embeddings import EMBEDDING_FIELDS, embeddings_of
-from hearthlog.analyzer.logs.labellings import Labellings, LogContents, NamedLabelling
+from hearthlog.analyzer.logs.labelling import Labellings, LogContents, NamedLabelling
+from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import Spans
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     judgeable_spans,

@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import Difference
-from hearthlog.analyzer.logs.labellings import NamedLabelling
+from hearthlog.analyzer.logs.labelling import NamedLabelling
 from hearthlog.analyzer.logs.spans import Spans, one, pieces
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.marks.marks import RANDOM

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.logs.labellings import Labellings
+from hearthlog.analyzer.logs.labelling import Labellings
 from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.analyzer.marks.marks import RANDOM, read_review
 from hearthlog.schemas.errors import LogError

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.embeddings import mean_embeddings
-from hearthlog.analyzer.logs.labelled_by import model_of
-from hearthlog.analyzer.logs.labellings import Labellings, LogContents
+from hearthlog.analyzer.logs.labelling import Labellings, LogContents
+from hearthlog.analyzer.logs.recorder_info import model_of
+from hearthlog.analyzer.logs.selection import array_names
+from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
 from hearthlog.analyzer.logs.spans import ranges
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.models.classifiers.model import Model

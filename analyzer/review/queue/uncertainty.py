@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.schemas.arrays import Float64, Int64

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Coverage
+from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import (
     RANDOM,
     Mark,

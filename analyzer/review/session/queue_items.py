@@ -7,7 +7,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.gate.changes import A_DAY, class_words, time_words
-from hearthlog.analyzer.logs.labellings import Labellings, NamedLabelling
+from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, joined
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.queue.asked import check_scenario, chosen_as

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.bearings import degrees_of
-from hearthlog.analyzer.logs.health import MicrophoneState, lasting
+from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, lasting
+from hearthlog.analyzer.logs.sound_vectors import degrees_of
 from hearthlog.analyzer.marks.marks import Reviewed, ReviewedSpan
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
@@ -75,7 +75,7 @@ class _Microphone:
     reviewed: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by scenario
     gaps: list[LabelledSpans] = field(default_factory=list)
     directions: GridMeans | None = None  # ahead and left
-    states: list[MicrophoneState] = field(default_factory=list)
+    states: list[MicrophoneHealth] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
 
@@ -285,7 +285,7 @@ def _runs(parts: Iterable[FrameValues], after: int, step: int) -> Iterator[Label
 
 
 def _floor(
-    states: Sequence[MicrophoneState], grid: Grid, features: GridSeries | None
+    states: Sequence[MicrophoneHealth], grid: Grid, features: GridSeries | None
 ) -> Float64 | None:
     """Let a floor last until the next message, as far as features were recorded."""
     states = [state for state in states if not math.isnan(state.floor_dbfs)]
@@ -296,7 +296,7 @@ def _floor(
     return np.where(np.isnan(features.values).all(axis=1), math.nan, floor)
 
 
-def _trouble_spans(states: Sequence[MicrophoneState], end: int) -> LabelledSpans:
+def _trouble_spans(states: Sequence[MicrophoneHealth], end: int) -> LabelledSpans:
     """Let a trouble last until the next message says that it is over, or that it is another."""
     changes = [(state.time, state.text or None) for state in states]
     spans = [span for span in lasting(changes, end) if span[0] < span[1]]

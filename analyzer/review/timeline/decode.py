@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.logs.bearings import as_vectors
-from hearthlog.analyzer.logs.channel_names import checked_array_names
-from hearthlog.analyzer.logs.health import MicrophoneState, microphone_states
+from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_states
+from hearthlog.analyzer.logs.selection import checked_array_names
+from hearthlog.analyzer.logs.sound_vectors import as_vectors
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float32, Float64, Int64
@@ -101,7 +101,7 @@ class DirectionRows(NamedTuple):
 class StateRows(NamedTuple):
     """How microphones were, by the diagnostics."""
 
-    states: list[MicrophoneState]
+    states: list[MicrophoneHealth]
 
 
 Rows = FeatureRows | LabelRows | SegmentRows | GapRows | DirectionRows | StateRows | LogLines

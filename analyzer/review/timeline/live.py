@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.bearings import degrees_of
-from hearthlog.analyzer.logs.health import MicrophoneState
+from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth
+from hearthlog.analyzer.logs.selection import decode_types
+from hearthlog.analyzer.logs.sound_vectors import degrees_of
 from hearthlog.analyzer.logs.spans import rows_at
-from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
     FIELDS,
@@ -229,7 +229,7 @@ def _gaps(rows: GapRows) -> StateLane:
 
 
 def _states(rows: StateRows) -> Iterator[StateLane | Plot]:
-    by_microphone: dict[str, list[MicrophoneState]] = {}
+    by_microphone: dict[str, list[MicrophoneHealth]] = {}
     for state in rows.states:
         by_microphone.setdefault(state.microphone, []).append(state)
     for name, states in sorted(by_microphone.items()):

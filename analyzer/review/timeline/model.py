@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.coverage import Coverage
+from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.home_clock import HomeClock, home_clock

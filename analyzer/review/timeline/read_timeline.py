@@ -10,12 +10,17 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import read_clips
-from hearthlog.analyzer.logs.coverage import Coverage, coverage_of
-from hearthlog.analyzer.logs.layers import TimedFile, find_timed_files, latest_records
+from hearthlog.analyzer.logs.layers import (
+    Coverage,
+    TimedFile,
+    coverage_of,
+    find_timed_files,
+    latest_records,
+)
 from hearthlog.analyzer.logs.local_time import home_zone
+from hearthlog.analyzer.logs.selection import decode_types
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.logs.spans import one as one_span
-from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.marks.marks import read_review
 from hearthlog.analyzer.review.timeline.collect import Collector
 from hearthlog.analyzer.review.timeline.decode import FIELDS, read_rows, shown_topic

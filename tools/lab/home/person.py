@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.logs.coverage import Coverage, find_coverage
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
+from hearthlog.analyzer.logs.layers import Coverage, find_coverage
 from hearthlog.analyzer.logs.spans import one, overlay, pieces
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.ranking import USEFUL

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.doctor import examine_file
+from hearthlog.analyzer.doctor.examination import examine_file
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.messages.topics import topic

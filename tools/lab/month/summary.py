@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import stem
 from hearthlog.tools.lab.month.account import holes

@@ -22,13 +22,17 @@ from hearthlog.analyzer.export.exporter import (
     with_numbers,
 )
 from hearthlog.analyzer.extras import require
-from hearthlog.analyzer.logs.bearings import Bearings, as_vectors, mean_bearings
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
+from hearthlog.analyzer.logs.labelling import Labelling, Labellings, find_labellings
 from hearthlog.analyzer.logs.layers import with_layers
-from hearthlog.analyzer.logs.selection import Damages, Selection, select
-from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
+from hearthlog.analyzer.logs.selection import (
+    Damages,
+    LogSelection,
+    TypedColumns,
+    array_names,
+    decode_all,
+    select,
+)
+from hearthlog.analyzer.logs.sound_vectors import Bearings, as_vectors, mean_bearings
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs import follow as growing
@@ -330,7 +334,7 @@ class Logs:
     def _labellings(self) -> Labellings:
         return find_labellings(self.path)
 
-    def _select(self, topic: str) -> Selection:
+    def _select(self, topic: str) -> LogSelection:
         """Select one topic, which may be only in logs outside of the span of time."""
         selection = self._selection
         if topic not in selection.channels:
@@ -410,7 +414,7 @@ def follow(
     return growing.follow(Path(path), topics, start, stop=stop)
 
 
-def _read_table(selection: Selection) -> tuple[Table, list[list[TypedColumns]]]:
+def _read_table(selection: LogSelection) -> tuple[Table, list[list[TypedColumns]]]:
     """Read a topic whose messages fit into one table; LogError if they do not."""
     ((topic, channels),) = selection.channels.items()
     batches = list(filter(None, map(decode_all, selection.messages())))

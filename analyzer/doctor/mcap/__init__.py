@@ -1,1 +1,0 @@
-"""Whether a file is sound MCAP: its records, chunks, indexes and summary."""

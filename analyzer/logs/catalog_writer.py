@@ -1,0 +1,403 @@
+"""The writer of a catalogue: inventories of new and changed logs, taken by workers."""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.logs.catalog import (
+    DAMAGED,
+    FINISHED,
+    LOG,
+    SCHEMA,
+    UNFINISHED,
+    Catalog,
+    CatalogRow,
+    divided,
+    table_of,
+    write_parts,
+)
+from hearthlog.analyzer.logs.labelling import MOST_CLASSES
+from hearthlog.analyzer.logs.locations import (
+    NEVER,
+    SPAN,
+    ListedLog,
+    catalogued_name,
+    list_logs,
+    size_and_time,
+    write_index,
+)
+from hearthlog.analyzer.logs.selection import decode_types, is_compatible
+from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
+from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
+from hearthlog.schemas.files import map_logs
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.files import log_name, log_of_layer, time_span
+from hearthlog.schemas.logs.metadata import read_provenance, recorded_scenarios
+from hearthlog.schemas.mcap.chunks import read_in_batches
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    RELABEL,
+    REVIEW,
+    SCENARIO,
+    microphone_of,
+    parse_topic,
+    scenario_name,
+)
+
+_FEATURES: dict[str, Sequence[str]] = {message_types.FEATURES: ("header.stamp", "frame")}
+_EVENTS: dict[str, Sequence[str]] = {
+    message_types.SEGMENT: ("duration", "label"),
+    message_types.GAP: ("duration",),
+}
+_OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
+    (message_types.STREAM_INFO, message_types.STATISTICS, message_types.LABEL), ()
+)
+_LONGEST = 1000  # characters of what a log says of itself
+
+
+@dataclass
+class LogInventory:
+    """What a log holds."""
+
+    complete: bool  # whether it was finished
+    span: tuple[int, int] | None  # first and last log time
+    # what its `hearthlog` records say, so far as they agree
+    record: dict[str, str] = field(default_factory=dict)
+    microphones: list[str] = field(default_factory=list)
+    frames: int = 0  # messages of features
+    # number and stamp of the first and of the last frame; None where there are no features, or
+    # those of several microphones
+    first: tuple[int, int] | None = None
+    last: tuple[int, int] | None = None
+    gaps: int = 0
+    gap_seconds: float = 0.0
+    # By scenario, which is empty for the sounds of the home, and by label: of its segments
+    seconds: dict[str, Counter[str]] = field(default_factory=dict)
+    segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number
+
+
+def read_contents(path: Path, labelling: str) -> LogInventory:
+    """Read what a log holds, without decoding its features.
+
+    Parameters
+    ----------
+    labelling : str
+        `live`, `relabel` or `review`; only segments of this labelling, and of its scenarios, are
+        counted.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, or a part of it that is needed is damaged.
+    """
+    span = time_span(path)
+    with LogFile(path) as file:
+        contents = LogInventory(file.complete, span, _common_record(file))
+        reading = _Reading(file, contents, labelling)
+        if file.statistics is None:  # nothing says how many messages there are, or where
+            reading.read(file.chunks, _EVENTS | _FEATURES)
+        else:
+            reading.read(reading.chunks_with(_EVENTS), _EVENTS)
+            reading.read(_ends(reading.chunks_with(_FEATURES)), _FEATURES)
+            counts = file.statistics.channel_message_counts
+            ids = reading.channels_of(_FEATURES)
+            contents.frames = min(sum(counts.get(i, 0) for i in ids), file.size)
+        ours = [file.channels[i].topic for i in reading.channels_of(_OTHERS | _FEATURES | _EVENTS)]
+        contents.microphones = sorted({microphone_of(topic)[:_LONGEST] for topic in ours} - {""})
+        if len(reading.channels_of(_FEATURES)) > 1:
+            contents.first = contents.last = None
+    return contents
+
+
+def _common_record(file: LogFile) -> dict[str, str]:
+    """Read what the file says of itself, so far as its records agree."""
+    values_by_name: dict[str, set[str]] = {}
+    for record in read_provenance(file):
+        for name, value in record.items():
+            values_by_name.setdefault(name, set()).add(value[:_LONGEST])
+    return {name: values.pop() for name, values in values_by_name.items() if len(values) == 1}
+
+
+def _ends(chunks: NDArray[np.void]) -> NDArray[np.void]:
+    """Return the first and the last of some chunks."""
+    return chunks[np.unique([0, chunks["end"].argmax()])] if len(chunks) else chunks
+
+
+class _Reading:
+    """Reads messages of one log, and notes in its contents what they say."""
+
+    def __init__(self, file: LogFile, contents: LogInventory, labelling: str) -> None:
+        self._file = file
+        self._contents = contents
+        self._labelling = labelling
+
+    def channels_of(self, kinds: Mapping[str, Collection[str]]) -> set[int]:
+        """Return the channels of some types, of which some fields are wanted."""
+        schemas = self._file.schemas
+        return {
+            number
+            for number, channel in self._file.channels.items()
+            if any(
+                is_compatible(channel, schemas.get(channel.schema_id), *k) for k in kinds.items()
+            )
+        }
+
+    def chunks_with(self, kinds: Mapping[str, Collection[str]]) -> NDArray[np.void]:
+        """Return the chunks that hold messages of some types."""
+        return self._file.with_channels(self._file.chunks, self.channels_of(kinds))
+
+    def read(self, chunks: NDArray[np.void], types: Mapping[str, Collection[str]]) -> None:
+        """Read some chunks, a few at a time, and note their messages of some types."""
+        topics = None
+        if self._file.statistics is not None:
+            topics = {self._file.channels[i].topic for i in self.channels_of(types)}
+        for batch in read_in_batches(self._file, chunks, topics):
+            for columns in decode_types(self._file.path, batch, types):
+                self._note(columns)
+
+    def _note(self, columns: Columns) -> None:
+        if columns.type == message_types.FEATURES:
+            self._note_features(columns)
+        elif columns.type == message_types.GAP:
+            self._contents.gaps += len(columns)
+            self._contents.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
+        elif (scenario := self._scenario(columns.topic)) is not None:
+            self._note_segments(columns, scenario)
+
+    def _scenario(self, name: str) -> str | None:
+        """Return the scenario of which a topic has segments; None if they do not count."""
+        topic = parse_topic(name)
+        if topic is None or topic.kind != "segment":
+            return None
+        root = topic.labelling.partition("/")[0]
+        is_own = (LIVE if root == SCENARIO else root) == self._labelling
+        return scenario_name(topic.labelling) if is_own else None
+
+    def _note_features(self, columns: Columns) -> None:
+        ends = columns.take(np.array([0, len(columns) - 1]))
+        pairs = zip(ends["frame"].tolist(), ends["header.stamp"].tolist(), strict=True)
+        first, self._contents.last = pairs
+        self._contents.first = self._contents.first or first
+        self._contents.frames += len(columns)
+
+    def _note_segments(self, columns: Columns, scenario: str) -> None:
+        amounts = self._contents.segments, self._contents.seconds
+        counts, lengths = (amount.setdefault(scenario, Counter()) for amount in amounts)
+        labels, numbers = np.unique(columns["label"], return_inverse=True)
+        seconds = np.bincount(numbers, columns["duration"] / NANOSECONDS)
+        for label, count, length in zip(
+            labels.tolist(), np.bincount(numbers).tolist(), seconds.tolist(), strict=True
+        ):
+            counts[label[:_LONGEST]] += count
+            lengths[label[:_LONGEST]] += length
+        if len(amounts[0]) > MOST_CLASSES:
+            raise LogError(f"{self._file.path}: has more than {MOST_CLASSES} scenarios")
+        if len(counts) > MOST_CLASSES:
+            raise LogError(
+                f"{self._file.path}: has more than {MOST_CLASSES} different labels; "
+                "no classifier has so many"
+            )
+
+
+_HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
+
+
+def read_rows(folder: Path, names: Sequence[str]) -> pa.Table:
+    """Make the rows of some files: the task of a worker."""
+    paths = [folder.joinpath(*name.split("/")) for name in names]
+    rows = [row for read in map_logs(partial(_read_row, folder), paths) for row in read]
+    return table_of([vars(row) for row in rows])
+
+
+def _read_row(folder: Path, path: Path) -> list[CatalogRow]:
+    """Make the row of a file; none if the file has gone."""
+    name = log_name(path)
+    kind = name.layer.partition("-")[0]
+    if kind not in {RELABEL, REVIEW}:  # sound is no labelling
+        kind = LOG
+    home = _HOME.fullmatch(_relative(path, folder))
+    try:
+        size, mtime = size_and_time(path)
+    except LogError:
+        return []
+    row = CatalogRow(
+        path=_relative(path, folder),
+        home="" if home is None else home[1] or "",
+        node=name.node or None,
+        kind=kind,
+        log=None if kind == LOG else _relative(log_of_layer(path), folder),
+        size=size,
+        mtime=mtime,
+    )
+    try:
+        return [_filled(row, read_contents(path, LIVE if kind == LOG else kind))]
+    except LogError as error:
+        if not path.exists():  # a recorder has completed it, and given it another name
+            return []
+        return [replace(row, error=str(error).removeprefix(f"{path}: "))]
+
+
+def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
+    """Add what was found in a file to its row."""
+    record = {name: value for name, value in contents.record.items() if value}
+    start, end = contents.span or (None, None)
+    first, last = contents.first or (None, None), contents.last or (None, None)
+    return replace(
+        row,
+        node=record.get("node", row.node),
+        state=FINISHED if contents.complete else UNFINISHED,
+        microphones=contents.microphones,
+        start=start,
+        end=end,
+        frames=contents.frames,
+        first_frame=first[0],
+        first_stamp=first[1],
+        last_frame=last[0],
+        last_stamp=last[1],
+        feature_set=record.get("feature_set"),
+        model=record.get("model"),
+        model_sha256=record.get("model_sha256"),
+        input_sha256=record.get("input_sha256"),
+        version=record.get("version"),
+        gaps=contents.gaps,
+        gap_seconds=contents.gap_seconds,
+        labels=list(_labels(contents, "")),
+        scenarios=[
+            {"scenario": scenario, "model": _model(record, scenario), **labelled}
+            for scenario in sorted(contents.segments.keys() - {""})
+            for labelled in _labels(contents, scenario)
+        ],
+    )
+
+
+def _labels(contents: LogInventory, scenario: str) -> Iterator[dict[str, Any]]:
+    for label, count in sorted(contents.segments.get(scenario, {}).items()):
+        minutes = contents.seconds[scenario][label] / 60
+        yield {"label": label, "minutes": minutes, "segments": count}
+
+
+def _model(record: Mapping[str, str], scenario: str) -> str:
+    """Name the models that labelled for a scenario, of which microphones may have different ones.
+
+    Empty where a person did.
+    """
+    models = {one.model for one in recorded_scenarios(record) if one.name == scenario}
+    return ", ".join(sorted(models))
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return catalogued_name(path.relative_to(folder).as_posix())
+
+
+_TASK = 100  # files
+
+
+def write_catalog(
+    folder: Path,
+    before: Catalog | None = None,
+    progress: Progress = ignore_progress,
+    workers: Workers | None = None,
+) -> Catalog:
+    """Make the catalogue of a folder, and replace those parts of an older one that changed.
+
+    Parameters
+    ----------
+    before : Catalog, optional
+        What there is: files that are as it says are not read again, damaged ones excepted. By
+        default all files are read.
+    progress : callable, optional
+        Is told the share of the files that is done, 0 to 1.
+
+    Raises
+    ------
+    LogError
+        If there is no log, or the catalogue cannot be written.
+    WorkerError
+        If workers are lost; the catalogue then has what was read so far.
+    KeyboardInterrupt
+        If interrupted; the catalogue then has what was read so far.
+    """
+    listing = list_logs(folder)
+    listed = listing.logs
+    kept, new = _divided(listed, before)
+    rows = pa.array(kept, pa.int64())
+    tables = [SCHEMA.empty_table() if before is None else before.table.take(rows)]
+    stopped: BaseException | None = None
+    try:
+        for read, done in _read(folder, new, workers or InlineWorkers()):
+            tables.append(read)
+            progress((len(kept) + done) / len(listed))
+    except (KeyboardInterrupt, HearthlogError) as error:
+        stopped = error
+    parts = dict(divided(pa.concat_tables(tables)))
+    old = {} if before is None else dict(divided(before.table))
+    write_parts(folder, parts, old)
+    ordered = [parts[name] for name in sorted(parts)]
+    catalog = Catalog(folder, pa.concat_tables([SCHEMA.empty_table(), *ordered]))
+    write_index(folder, listing, _spans(listed, catalog))
+    if stopped is not None:
+        raise stopped
+    return catalog
+
+
+def _spans(listed: Sequence[ListedLog], catalog: Catalog) -> NDArray[np.void]:
+    """Tell the spans of files as they were listed; what was not read, or was changed, has none."""
+    numbers = catalog.files.rows_of(listed)
+    read = [place for place, number in enumerate(numbers) if number is not None]
+    rows = catalog.table.take(pa.array((n for n in numbers if n is not None), pa.int64()))
+    spans = np.full(len(listed), NEVER, SPAN)
+    for name in ("start", "end", "size", "mtime"):
+        spans[name][read] = pc.fill_null(rows[name].cast(pa.int64()), NEVER).to_numpy()
+    spans["finished"] = [not log.name.endswith(ACTIVE_SUFFIX) for log in listed]
+    spans["finished"][read] &= pc.equal(rows["state"], FINISHED).to_numpy()
+    return spans
+
+
+def _divided(
+    listed: Sequence[ListedLog], before: Catalog | None
+) -> tuple[list[int], list[ListedLog]]:
+    """Tell which rows are still true, and which files are to be read."""
+    if before is None:
+        return [], list(listed)
+    kept: list[int] = []
+    new: list[ListedLog] = []
+    damaged = np.array(before.table["state"].to_pylist()) == DAMAGED
+    for log, number in zip(listed, before.files.rows_of(listed), strict=True):
+        # What could not be read then may be readable now, though the file is the same.
+        if number is None or damaged[number]:
+            new.append(log)
+        else:
+            kept.append(number)
+    return kept, new
+
+
+def _read(
+    folder: Path, logs: Sequence[ListedLog], workers: Workers
+) -> Iterable[tuple[pa.Table, int]]:
+    """Yield the rows of files, some at a time, and how many files are done."""
+    tasks = (logs[first : first + _TASK] for first in range(0, len(logs), _TASK))
+    running: dict[Future[pa.Table], int] = {}
+    done = 0
+    while True:
+        most = 2 * workers.parallel if workers.parallel > 1 else 1  # no worker waits for the next
+        while len(running) < most and (task := next(tasks, None)):
+            names = [log.name for log in task]
+            running[workers.submit(read_rows, folder, names)] = len(names)
+        if not running:
+            return
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            done += running.pop(future)
+            yield future.result(), done

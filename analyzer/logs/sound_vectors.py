@@ -1,0 +1,175 @@
+"""Directions and embeddings of a log as vectors, and their means over spans of time."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.logs.spans import ranges
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, Directions
+from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Embeddings
+from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import EmbeddingSource, EmbeddingSpace
+
+
+class Bearings(NamedTuple):
+    """Whence the sound of each of some spans came.
+
+    Attributes
+    ----------
+    azimuths : np.ndarray [shape=(n,)], float64
+        In radians, counter-clockwise from x; NaN where nothing was located.
+    spreads : np.ndarray [shape=(n,)], float64
+        Circular standard deviation, in radians; NaN where nothing was located. It is large where
+        the sound moved, or there were several.
+    counts : np.ndarray [shape=(n,)], int64
+        Of the blocks that were located.
+    """
+
+    azimuths: Float64
+    spreads: Float64
+    counts: Int64
+
+
+def as_vectors(azimuths: Float32, confidences: Float32) -> Float64:
+    """Turn directions into vectors that can be added.
+
+    Parameters
+    ----------
+    azimuths : np.ndarray [shape=(n,)], float32
+        In radians.
+    confidences : np.ndarray [shape=(n,)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 2)], float64
+        Ahead and left: of a length that is the confidence.
+    """
+    turned = azimuths.astype(np.float64)
+    return np.stack([np.cos(turned), np.sin(turned)], axis=1) * confidences[:, np.newaxis]
+
+
+def degrees_of(vectors: Float64) -> Float64:
+    """Return whence vectors come, in degrees.
+
+    Parameters
+    ----------
+    vectors : np.ndarray [shape=(n, 2)], float64
+        Ahead and left; NaN gives NaN.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+        -180 to 180; 90 is left.
+    """
+    ahead, left = vectors.T
+    return np.rad2deg(np.arctan2(left, ahead))
+
+
+def mean_bearings(times: Int64, vectors: Float64, starts: Int64, ends: Int64) -> Bearings:
+    """Compute whence the sound of spans came.
+
+    The circular mean and standard deviation are those of Mardia and Jupp, "Directional Statistics",
+    2000, weighted by the confidence.
+
+    Parameters
+    ----------
+    times : np.ndarray [shape=(m,)], int64
+        Starts of the blocks that were located, in their order, in nanoseconds of UTC.
+    vectors : np.ndarray [shape=(m, 2)], float64
+        As `as_vectors` makes them.
+    starts, ends : np.ndarray [shape=(n,)], int64
+        Of the spans, which may overlap. A block belongs to those in which it begins.
+    """
+    first, last = np.searchsorted(times, starts), np.searchsorted(times, ends)
+    weights = np.hypot(*vectors.T)
+    sums = np.zeros((len(times) + 1, 3))
+    np.cumsum(np.column_stack([vectors, weights]), axis=0, out=sums[1:])
+    counts = np.maximum(last - first, 0)
+    ahead, left, weight = np.where(counts[:, np.newaxis] > 0, sums[last] - sums[first], np.nan).T
+    with np.errstate(divide="ignore"):
+        agreement = np.minimum(np.hypot(ahead, left) / weight, 1.0)
+        spreads = np.sqrt(-2 * np.log(agreement))
+    return Bearings(np.arctan2(left, ahead), spreads, counts)
+
+
+LARGEST_FRAME = 1 << 62
+DIRECTION_FIELDS = ("header.stamp", "frame", "azimuth", "confidence")
+
+
+def directions_of(columns: Columns) -> Directions:
+    """Return the directions that a log has.
+
+    Raise `LogError` if no array has such directions.
+    """
+    stamps, numbers, azimuths, confidences = (columns[path] for path in DIRECTION_FIELDS)
+    possible = (numbers <= LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)
+    possible &= (np.abs(azimuths) <= np.float32(np.pi)) & (confidences >= 0) & (confidences <= 1)
+    if not possible.all():
+        raise LogError(f"{columns.topic}: holds directions that no array has")
+    return Directions(numbers.astype(np.int64), stamps, azimuths, confidences)
+
+
+_COMPONENT = "component_"  # of what a network hears: its groups of names make few things alike
+_WINDOW = WINDOW_FRAMES * FRAME_NANOSECONDS
+EMBEDDING_FIELDS = ("header.stamp", "frame", "frames", "values")
+
+
+def embeddings_of(columns: Columns) -> Embeddings:
+    """Return the embeddings that a log has.
+
+    Raise `LogError` if no recorder writes such embeddings.
+    """
+    stamps, numbers, frames, values = (columns[path] for path in EMBEDDING_FIELDS)
+    possible = (numbers <= LARGEST_FRAME) & (numbers % HOP_FRAMES == 0) & (frames == WINDOW_FRAMES)
+    if not possible.all() or values.ndim != 2:
+        raise LogError(f"{columns.topic}: holds embeddings that no recorder writes")
+    return Embeddings(numbers.astype(np.int64), stamps, values)
+
+
+def mean_embeddings(
+    columns: Columns | None, starts: Int64, ends: Int64
+) -> tuple[EmbeddingSpace | None, Float32]:
+    """Return what a network hears in spans: its components, by how much of a window each is in.
+
+    Parameters
+    ----------
+    columns : Columns or None
+        Of one log, with stamps and values; None if it has no embeddings.
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    space : EmbeddingSpace or None
+        With what they can be compared; None for embeddings that do not say it.
+    means : np.ndarray [shape=(n, k)], float32
+        In steps of the logged integers; NaN for a span without a window.
+    """
+    none = np.empty((len(starts), 0), np.float32)
+    if columns is None or columns.type != message_types.EMBEDDING or not len(columns):
+        return None, none
+    source = EmbeddingSource.from_metadata(columns.metadata)
+    if source is None or columns["values"].shape[1:] != (len(source.names),):
+        return None, none
+    own = [place for place, name in enumerate(source.names) if name.startswith(_COMPONENT)]
+    if not own:
+        return None, none
+    order = np.argsort(columns["header.stamp"], kind="stable")  # a clock may have been set back
+    stamps, values = columns["header.stamp"][order], columns["values"][order][:, own]
+    means = np.full((len(starts), len(own)), np.nan, np.float32)
+    first = np.searchsorted(stamps + _WINDOW, starts, "right")
+    counts = np.searchsorted(stamps, ends) - first
+    there = np.flatnonzero(counts > 0)
+    if len(there):
+        first, counts = first[there].astype(np.int64), counts[there].astype(np.int64)
+        span, rows = ranges(first, counts)
+        begins = np.cumsum(counts) - counts
+        last = np.minimum(stamps[rows] + _WINDOW, ends[there][span])
+        weights = (last - np.maximum(stamps[rows], starts[there][span])).astype(np.float64)
+        weights /= np.add.reduceat(weights, begins)[span]
+        means[there] = np.add.reduceat(weights[:, np.newaxis] * values[rows], begins)
+    return source.space, means

@@ -1,0 +1,339 @@
+"""Label files of any format, imported as marks and written from marks."""
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple, cast
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.layers import ROUNDING, Coverage
+from hearthlog.analyzer.logs.text_files import read_text
+from hearthlog.analyzer.marks.formats.formats import AUDACITY, RAVEN, LabelFormat, find_format
+from hearthlog.analyzer.marks.formats.labels import (
+    OTHER,
+    OVERLAP,
+    Choice,
+    FileLabel,
+    LabelCodec,
+    LineError,
+    PlacedMark,
+    SkippedLabels,
+    make_mark,
+    place_text,
+)
+from hearthlog.analyzer.marks.formats.tables import is_table
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.models.classes import CLASS_NAME, find_class
+from hearthlog.schemas.files import read_toml
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.new_files import new_file
+
+_CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # that a name may have
+
+
+def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
+    """Yield the labels of a file as they are there.
+
+    Yields
+    ------
+    FileLabel or LineError
+        In the order of the file; an error for a line that is no label.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is too large or no label file, or has nothing to choose from.
+    """
+    format_ = find_format(path) or AUDACITY
+    text = read_text(path, "label file", format_.size_limit)
+    if format_ in {AUDACITY, RAVEN}:
+        format_ = RAVEN if choice.columns or is_table(text) else AUDACITY
+    if choice.columns and not format_.has_columns:
+        raise DataError(f"{path}: has no columns to choose with --column; tables have")
+    if choice.tiers and not format_.has_tiers:
+        raise DataError(f"{path}: has no tiers to choose with --tier; documents of ELAN have")
+    return _codec(format_).read(path, text, choice)
+
+
+def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> None:
+    """Write marks as a label file that `read_rows` reads again.
+
+    Raise `DataError` if there are no marks, if the file would be too large, or if the marks are
+    of several microphones and the format has no place for them. Raise `LogError` if the file
+    exists, or cannot be written.
+    """
+    if not marks:
+        raise DataError("no marks to export: nothing was imported or marked in these logs yet")
+    format_ = find_format(path)
+    assert format_ is not None
+    harmless = [_without_controls(mark) for mark in marks]
+    raw = _codec(format_).write(path, harmless, coverage).encode()
+    if len(raw) > format_.size_limit:
+        limit = format_.size_limit >> 20
+        raise DataError(f"{path}: would be larger than {limit} MB; export fewer logs")
+    with new_file(path) as temporary:
+        temporary.write_bytes(raw)
+
+
+def _codec(format_: LabelFormat) -> LabelCodec:
+    module = import_module(f"hearthlog.analyzer.marks.formats.{format_.module}")
+    return cast(LabelCodec, module.CODECS[format_.name])
+
+
+def _without_controls(mark: Mark) -> Mark:
+    """Replace the characters of names that would steer a terminal."""
+    return mark._replace(
+        reviewer=mark.reviewer.translate(_CONTROLS), corrects=mark.corrects.translate(_CONTROLS)
+    )
+
+
+_LONGEST = 200  # characters of a label; to normalise many accents takes the square of their number
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue"})
+_SEPARATORS = re.compile(r"[\s_-]+")
+
+
+class ClassNames(NamedTuple):
+    """What labels mean."""
+
+    certain: Mapping[str, str]
+    folded: Mapping[str, str]
+
+
+def read_class_map(path: Path) -> dict[str, str]:
+    """Read a table of labels and their classes.
+
+    Raise `DataError` if the file cannot be read, has something else than names of classes, or
+    names two for one label.
+    """
+    classes: dict[str, str] = {}
+    for label, name in read_toml(path, "map", DataError).items():
+        if not isinstance(name, str) or not CLASS_NAME.fullmatch(name):
+            raise DataError(
+                f"{path}: {label[:64]!r} needs the name of a class in quotes (lower-case letters, "
+                'digits and \'_\'), as "Tap Water" = "tap_water"'
+            )
+        other = classes.setdefault(_spelt(label), name)
+        if other != name:
+            raise DataError(f"{path}: {label[:64]!r} has two classes: {other} and {name}")
+    return classes
+
+
+def find_class_names(labels: Iterable[str], class_map: Mapping[str, str] | None) -> ClassNames:
+    """Find the classes that labels mean; without a map, any name may be that of a new one.
+
+    Parameters
+    ----------
+    class_map : mapping of str to str or None
+        As `read_class_map` returns it. With a map, only classes that it or hearthlog knows are
+        found for labels that are no names.
+    """
+    given = class_map or {}
+    classes = set(given.values())
+    certain: dict[str, str] = {}
+    folded: dict[str, str] = {}
+    for label in set(labels):
+        mapped = given.get(_spelt(label))
+        name = _folded(label)
+        if mapped or CLASS_NAME.fullmatch(label):
+            certain[label] = mapped or label
+        elif name and (class_map is None or name in classes or find_class(name)):
+            folded[label] = name
+    return ClassNames(certain, folded)
+
+
+def _spelt(label: str) -> str:
+    """Return a label as it is compared: capitals and the width of blanks make no difference."""
+    if len(label) > _LONGEST:
+        return label
+    return " ".join(unicodedata.normalize("NFC", label).casefold().split())
+
+
+def _folded(label: str) -> str:
+    """Return the name of a class that is spelt like a label; empty if there is none."""
+    if len(label) > _LONGEST:
+        return ""
+    letters = unicodedata.normalize("NFD", _spelt(label).translate(_UMLAUTS))
+    plain = "".join(c for c in letters if not unicodedata.combining(c))
+    row = find_class(plain)
+    if row is not None:
+        return row.name
+    name = _SEPARATORS.sub("_", plain).strip("_")
+    return name if CLASS_NAME.fullmatch(name) else ""
+
+
+class ImportOptions(NamedTuple):
+    """How a label file is read."""
+
+    microphone: str | None = None
+    class_map: Mapping[str, str] | None = None
+    choice: Choice = Choice()
+    strict: bool = False
+
+
+class Folded(NamedTuple):
+    """A label that is no name of a class, the name that is spelt like it, and their number."""
+
+    label: str
+    name: str
+    labels: int
+
+
+class Imported(NamedTuple):
+    """The marks of a label file."""
+
+    by_log: dict[Path, list[Mark]]
+    left_out: SkippedLabels
+    moved: Mapping[str, int]
+
+
+def import_labels(
+    path: Path,
+    coverage: Mapping[str, Coverage],
+    options: ImportOptions,
+    agree: Callable[[Sequence[Folded]], None],
+) -> Imported:
+    """Read a label file as marks that do not overlap, in the logs that cover them.
+
+    Parameters
+    ----------
+    agree : callable
+        Is called once if labels are taken as names of classes that are only spelt like them; raises
+        if that is not wanted.
+
+    Raises
+    ------
+    DataError
+        With file and place, if the file cannot be read, is no label file or holds no labels; if
+        `options.strict`, also if a label cannot be a mark.
+    """
+    left_out, moved = SkippedLabels(strict=options.strict), Counter[str]()
+    placed = list(_placed(path, coverage, options, left_out, moved))
+    if not placed and not any(left_out.kinds()):
+        raise DataError(f"{path}: holds no labels")
+    counts = Counter(each.mark.label for each in placed)
+    certain, folded = find_class_names(counts, options.class_map)
+    if folded:
+        often = [label for label, _ in counts.most_common() if label in folded]
+        agree([Folded(label, folded[label], counts[label]) for label in often])
+    named = _named(path, placed, {**certain, **folded}, left_out)
+    heard = _heard(path, named, coverage, left_out)
+    by_log: dict[Path, list[Mark]] = {}
+    for _, mark in _without_overlaps(path, heard, left_out):
+        for log, start, end in coverage[mark.microphone].split(mark.start, mark.end):
+            by_log.setdefault(log, []).append(mark._replace(start=start, end=end))
+    return Imported(by_log, left_out, moved)
+
+
+def read_lines(path: Path, coverage: Mapping[str, Coverage], microphone: str) -> list[PlacedMark]:
+    """Read a label file whose labels may overlap, and may lie where nothing was recorded.
+
+    Returns
+    -------
+    list of PlacedMark
+        In the order of the file, with their lines, or their places in a file that has none.
+
+    Raises
+    ------
+    DataError
+        With file and place, if the file cannot be read, is no label file or holds no labels, or if
+        a label cannot be a mark.
+    """
+    placed = []
+    for row in read_rows(path, Choice()):
+        if isinstance(row, LineError):
+            raise row
+        placed.append(make_mark(path, row, coverage, microphone))
+        if not CLASS_NAME.fullmatch(row.label):
+            raise _unnamed(path, placed[-1])
+    if not placed:
+        raise DataError(f"{path}: holds no labels")
+    return placed
+
+
+def _placed(
+    path: Path,
+    coverage: Mapping[str, Coverage],
+    options: ImportOptions,
+    left_out: SkippedLabels,
+    moved: Counter[str],
+) -> Iterator[PlacedMark]:
+    """Yield the labels of a file as marks, whose labels are those of the file."""
+    for row in read_rows(path, options.choice):
+        try:
+            if isinstance(row, LineError):
+                raise row
+            chosen = options.microphone or row.microphone
+            if chosen != row.microphone:
+                moved.update({row.microphone} & coverage.keys())
+            mark = make_mark(path, row._replace(microphone=chosen), coverage, None)
+        except LineError as error:
+            left_out.add(error)
+        else:
+            yield mark
+
+
+def _named(
+    path: Path, placed: Iterable[PlacedMark], names: Mapping[str, str], left_out: SkippedLabels
+) -> Iterator[PlacedMark]:
+    """Yield marks whose labels are classes."""
+    for each in placed:
+        name = names.get(each.mark.label)
+        if name is None:
+            left_out.add(_unnamed(path, each))
+        else:
+            yield each._replace(mark=each.mark._replace(label=name))
+
+
+def _heard(
+    path: Path,
+    placed: Iterable[PlacedMark],
+    coverage: Mapping[str, Coverage],
+    left_out: SkippedLabels,
+) -> Iterator[PlacedMark]:
+    """Yield marks of what was recorded."""
+    for each in placed:
+        mark = each.mark
+        if coverage[mark.microphone].split(mark.start, mark.end):
+            yield each
+        else:
+            reason = (
+                f"{mark.label} lies outside of what {mark.microphone} heard; `hearthlog info` "
+                "shows when that was"
+            )
+            left_out.add(LineError(place_text(path, each.place), OTHER, reason))
+
+
+def _unnamed(path: Path, placed: PlacedMark) -> LineError:
+    label = placed.mark.label
+    reason = (
+        f"{label[:64]!r} is the name of no class; name one in a --map, as "
+        f'{label[:64]!r} = "tap_water"'
+    )
+    return LineError(place_text(path, placed.place), OTHER, reason, label)
+
+
+def _without_overlaps(
+    path: Path, placed: Iterable[PlacedMark], left_out: SkippedLabels
+) -> Iterator[PlacedMark]:
+    """Yield marks by microphone and time, cut where one that starts earlier goes on.
+
+    One of which another class takes more than a frame, or all, is a loss. Of those that start and
+    end together the first in the file stays.
+    """
+    last: PlacedMark | None = None
+    for each in sorted(placed, key=lambda each: each.mark[:3]):
+        mark = each.mark
+        if last is not None and last.mark.microphone == mark.microphone:
+            taken = min(mark.end, last.mark.end) - mark.start
+            much = min(FRAME_NANOSECONDS, mark.end - mark.start - 1)
+            if mark.label != last.mark.label and taken > much:
+                line = f"line {last.place}" if isinstance(last.place, int) else last.place
+                reason = f"{mark.label} overlaps {last.mark.label} in {line}, which stays"
+                left_out.add(LineError(place_text(path, each.place), OVERLAP, reason))
+            mark = mark._replace(start=max(mark.start, last.mark.end))
+        if mark == each.mark or mark.end - mark.start > ROUNDING:
+            last = each._replace(mark=mark)
+            yield last
