@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT

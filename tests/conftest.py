@@ -18,15 +18,14 @@ from stores import bucket, in_memory, s3_account, throttled_account
 from streams import camera, live_server
 
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.manifest import load_scenario, read_manifest
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.transitions import (
+from hearthlog.analyzer.training.train import (
     LAG_SECONDS,
     REACH_SECONDS,
     SHORTEST_SECONDS,
     default_transitions,
+    train_model,
 )
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.features.installed import DEFAULT

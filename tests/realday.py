@@ -11,8 +11,7 @@ import soundfile
 from lossy import LossySource
 
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, read_manifest
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model

@@ -15,9 +15,16 @@ from scipy.special import betaincinv
 from spliced import run
 
 from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, read_checked_minutes
-from hearthlog.analyzer.accuracy.count_range import FEWEST, beta_quantile, checked_rates, strata_of
-from hearthlog.analyzer.accuracy.events import MINUTE, events_of, television_minutes
-from hearthlog.analyzer.gate.reference import reference
+from hearthlog.analyzer.accuracy.event_counts import (
+    FEWEST,
+    MINUTE,
+    beta_quantile,
+    checked_rates,
+    events_of,
+    strata_of,
+    television_minutes,
+)
+from hearthlog.analyzer.gate.recent_time import reference
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span

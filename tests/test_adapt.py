@@ -12,25 +12,28 @@ from blobs import blobs, with_arrays
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
-from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
+from hearthlog.analyzer.evaluation.method_scores import KINDS, evaluate_method
+from hearthlog.analyzer.evaluation.model_scores import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.training.adapt import adapt_model
+from hearthlog.analyzer.training.adaptation import adapt_model, is_moved, learned_over
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
-from hearthlog.analyzer.training.home_data import (
+from hearthlog.analyzer.training.home_recordings import (
     HOME_WEIGHT,
     home_recordings,
     lesson_recordings,
 )
-from hearthlog.analyzer.training.home_landmarks import is_moved, learned_over
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.learned_inputs import kept_inputs
-from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.manifest import (
+    BUILTIN,
+    LABELS,
+    Scenario,
+    read_manifest,
+    scenario_of,
+)
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario, scenario_of
 from hearthlog.analyzer.training.svm_method import BANDS, SVM
-from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.transitions import default_transitions
+from hearthlog.analyzer.training.train import default_transitions, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hearthlog.analyzer.accuracy.events import events_of
+from hearthlog.analyzer.accuracy.event_counts import events_of
 from hearthlog.analyzer.bridge.day import iso_time, today
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import EventRecord

@@ -14,9 +14,9 @@ from hearthlog.analyzer.training.calibration import (
     inverse_temperature,
     nested_probabilities,
     scores_elsewhere,
+    softmax,
     unknown_bias,
 )
-from hearthlog.analyzer.training.cross_validation import softmax
 from hearthlog.analyzer.training.scores import calibration_error
 
 pytestmark = pytest.mark.fast

@@ -17,8 +17,7 @@ from logs import read
 from spliced import run
 from test_swap import block, count, labels_by, recording, said, wait_for
 
-from hearthlog.analyzer.gate.evidence import gather_evidence
-from hearthlog.analyzer.gate.on_trial import compare_on_trial
+from hearthlog.analyzer.gate.comparison import compare_on_trial, gather_evidence
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks

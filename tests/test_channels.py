@@ -11,7 +11,7 @@ from test_capture import recording, wait_for_frames
 from test_network import Address
 
 from hearthlog import classify, extract_features, load_model
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import SourceError

@@ -12,7 +12,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from hearthlog.analyzer.training.cross_validation import softmax
+from hearthlog.analyzer.training.calibration import softmax
 from hearthlog.analyzer.training.learned_inputs import in_whole_steps, rounded
 from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
 from hearthlog.analyzer.training.train import train_model

@@ -24,8 +24,7 @@ from spliced import raw_messages, small_disk
 from waiting import wait_for
 
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.manifest import load_scenario, read_manifest
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Description
 from hearthlog.models.features.auros21 import WINDOW_FRAMES

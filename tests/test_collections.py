@@ -13,15 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from hearthlog.analyzer.collections.clip import Sound
-from hearthlog.analyzer.collections.fsd50k import short_licence
-from hearthlog.analyzer.collections.installed import COLLECTIONS
-from hearthlog.analyzer.collections.label_map import LabelMap, read_map, shipped_map
-from hearthlog.analyzer.collections.make_manifest import make_manifest
-from hearthlog.analyzer.collections.spans import labelled_parts
+from hearthlog.analyzer.collections.manifest_writer import (
+    LabelMap,
+    labelled_parts,
+    make_manifest,
+    read_map,
+    shipped_map,
+)
+from hearthlog.analyzer.collections.readers import COLLECTIONS, CategorySpan, short_licence
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.modelfile.modelfile import load_model, model_card
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.main import make_app
@@ -434,7 +435,7 @@ def test_a_map_that_makes_no_sense_is_refused(written, tmp_path, text, reason):
 TIMES = made.DESED.replace(",", "\t") + "\n"
 MAP = LabelMap({"a": "a", "b": "b", "also a": "a"}, frozenset({"all"}), frozenset({"vague"}))
 SOUNDS = st.builds(
-    lambda name, start, length: Sound((name,), start / 4, (start + length) / 4),
+    lambda name, start, length: CategorySpan((name,), start / 4, (start + length) / 4),
     st.sampled_from(["a", "b", "also a", "all", "vague", "unnamed"]),
     st.integers(0, 40),
     st.integers(1, 20),
@@ -457,11 +458,11 @@ def test_parts_are_a_second_or_more_of_one_label(sounds):
 
 
 def test_a_sound_in_the_last_moment_is_extended_towards_the_start():
-    (part,), _ = labelled_parts([Sound(("a",), 9.9, 10.0)], 10.0, MAP)
+    (part,), _ = labelled_parts([CategorySpan(("a",), 9.9, 10.0)], 10.0, MAP)
     assert part[2:] == (9.0, 10.0)
-    (part,), _ = labelled_parts([Sound(("a",), 0.0, 0.5)], 10.0, MAP)
+    (part,), _ = labelled_parts([CategorySpan(("a",), 0.0, 0.5)], 10.0, MAP)
     assert part[2:] == (0.0, 1.0)
-    (part,), _ = labelled_parts([Sound(("a",))], inf, MAP)
+    (part,), _ = labelled_parts([CategorySpan(("a",))], inf, MAP)
     assert part[2:] == (0.0, inf)
 
 
@@ -615,7 +616,7 @@ def test_a_table_beyond_reason_is_refused_unread(copied, tmp_path):
 
 
 def test_a_manifest_that_could_not_be_read_again_is_not_made(written, tmp_path, monkeypatch):
-    monkeypatch.setattr("hearthlog.analyzer.collections.make_manifest.SIZE_LIMIT", 500)
+    monkeypatch.setattr("hearthlog.analyzer.collections.manifest_writer.SIZE_LIMIT", 500)
     message = refusal("esc50", written["esc50"], tmp_path / "m.csv")
     assert message.endswith("which `train` does not read; leave out some of the audio")
 

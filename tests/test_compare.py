@@ -12,14 +12,12 @@ from kept import keep_models
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.compare_models import compare_models
-from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model
+from hearthlog.analyzer.evaluation.model_scores import compare_models, evaluate_model
 from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
-from hearthlog.analyzer.training.adapt import adapt_model
+from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
-from hearthlog.analyzer.training.home_data import home_recordings
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+from hearthlog.analyzer.training.home_recordings import home_recordings
+from hearthlog.analyzer.training.manifest import load_scenario, read_manifest, scenario_of
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

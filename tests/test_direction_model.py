@@ -26,11 +26,15 @@ from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.analyzer.replay.replay import replay
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.confirmed import chosen, confirmed_segments
-from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
-from hearthlog.analyzer.training.sightings import Sighting, evidence_of, with_directions
+from hearthlog.analyzer.training.adaptation import adapt_model
+from hearthlog.analyzer.training.direction_samples import (
+    DirectionSample,
+    evidence_of,
+    with_directions,
+)
+from hearthlog.analyzer.training.home_recordings import read_reviewed_sound
+from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.pseudo_labels import chosen, confirmed_segments
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import (
@@ -269,7 +273,9 @@ def test_evidence_is_full_once_nothing_depends_on_what_was_before(blocks, first,
 def seen(sector, hour):
     shares = np.zeros(SECTORS)
     shares[sector % SECTORS] = 1.0
-    return Sighting("mic", 24 * 3600 * NANOSECONDS + round(hour * 3600) * NANOSECONDS, shares)
+    return DirectionSample(
+        "mic", 24 * 3600 * NANOSECONDS + round(hour * 3600) * NANOSECONDS, shares
+    )
 
 
 def taught(*marks):

@@ -9,11 +9,11 @@ import pytest
 from blobs import blobs
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
-from hearthlog.analyzer.training import clip_embeddings as hearing
-from hearthlog.analyzer.training import installed
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.clip_embeddings import (
+from hearthlog.analyzer.evaluation.method_scores import evaluate_method
+from hearthlog.analyzer.training import clips as hearing
+from hearthlog.analyzer.training import train as installed
+from hearthlog.analyzer.training.adaptation import adapt_model, base_heads, learn_home
+from hearthlog.analyzer.training.clips import (
     AS_IT_IS,
     IN_A_ROOM,
     SHORT,
@@ -26,19 +26,17 @@ from hearthlog.analyzer.training.dataset import (
     build_dataset,
     cut_recordings,
 )
-from hearthlog.analyzer.training.heads import learn_heads
-from hearthlog.analyzer.training.home_heads import base_heads, learn_home
-from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.mixture import (
+from hearthlog.analyzer.training.heads import (
     HeadInputs,
     Tried,
     best_mix,
     head_inputs_of,
+    learn_heads,
     names_head,
     rejecting_head,
 )
-from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
+from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM
+from hearthlog.analyzer.training.manifest import BUILTIN, Scenario, read_manifest
 from hearthlog.analyzer.training.train import group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import UNTAUGHT, EmbeddingHeads

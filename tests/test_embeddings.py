@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary, EmbeddingEvidence
 from hearthlog.models.embedding.networks import YAMNET, load_embedder

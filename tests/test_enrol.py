@@ -16,8 +16,8 @@ from stores import put
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
-from hearthlog.analyzer.training.home_data import home_recordings
-from hearthlog.analyzer.training.home_lessons import home_lessons
+from hearthlog.analyzer.training.home_recordings import home_recordings
+from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

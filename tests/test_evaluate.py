@@ -12,8 +12,6 @@ from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_log import evaluate_labelling
-from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model
 from hearthlog.analyzer.evaluation.event_scores import (
     Events,
     event_based,
@@ -21,13 +19,13 @@ from hearthlog.analyzer.evaluation.event_scores import (
     laid_out,
     segment_based,
 )
+from hearthlog.analyzer.evaluation.log_scores import evaluate_labelling
+from hearthlog.analyzer.evaluation.model_scores import evaluate_model
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, common, joined
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.clips import clip_frames, steady_noise
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.rooms import steady_noise
-from hearthlog.analyzer.training.scenario import BUILTIN, scenario_of
+from hearthlog.analyzer.training.manifest import BUILTIN, read_manifest, scenario_of
 from hearthlog.analyzer.training.scores import (
     Bin,
     calibration_error,
@@ -36,8 +34,7 @@ from hearthlog.analyzer.training.scores import (
     score,
 )
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.transitions import default_transitions
+from hearthlog.analyzer.training.train import default_transitions, train_model
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_infos
-from hearthlog.analyzer.training.installed import method_named
-from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.manifest import load_scenario
+from hearthlog.analyzer.training.train import method_named
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.sources.decoding import read_audio

@@ -15,28 +15,32 @@ import pytest
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.difference import compare_labellings
-from hearthlog.analyzer.gate.changes import Changes, changes_of_frames, changes_of_labellings
-from hearthlog.analyzer.gate.evidence import (
-    Evidence,
-    Right,
+from hearthlog.analyzer.evaluation.event_scores import compare_labellings
+from hearthlog.analyzer.gate.comparison import (
+    HomeComparison,
+    PairedAccuracy,
     _outcomes,
     _right,
     _taught,
     gather_evidence,
 )
-from hearthlog.analyzer.gate.judge import Verdict, find_champion
+from hearthlog.analyzer.gate.paired_labels import (
+    LabelChanges,
+    PairedFrames,
+    TwoModels,
+    changes_of_frames,
+    changes_of_labellings,
+)
+from hearthlog.analyzer.gate.promotion_check import Verdict, clearly_better, damages, find_champion
 from hearthlog.analyzer.gate.recent_time import (
-    Part,
+    KnownSound,
+    LogSpan,
     RecentLog,
     choose,
     minutes_a_day,
     recent_logs,
     sample,
 )
-from hearthlog.analyzer.gate.reference import Sound
-from hearthlog.analyzer.gate.rules import clearly_better, damages
-from hearthlog.analyzer.gate.two_models import LabelledFrames, TwoModels
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
@@ -394,7 +398,9 @@ def test_a_judgement_that_is_none_lets_no_model_speak(tmp_path, kind):
 
 def test_a_sample_is_of_all_days_and_all_times_of_day_and_no_more_than_was_asked_for():
     hour = 3600 * SECOND
-    parts = [Part(Path(f"{i}"), START + i * hour, START + (i + 1) * hour) for i in range(14 * 24)]
+    parts = [
+        LogSpan(Path(f"{i}"), START + i * hour, START + (i + 1) * hour) for i in range(14 * 24)
+    ]
     chosen = sample(parts, 36, 300 * SECOND)
     assert {part.end - part.start for part in chosen} == {300 * SECOND}
     begins = np.array([part.start for part in chosen])
@@ -406,7 +412,9 @@ def test_a_sample_is_of_all_days_and_all_times_of_day_and_no_more_than_was_asked
 
 def test_a_home_that_is_mostly_quiet_is_heard_where_it_is_not():
     hour = 3600 * SECOND
-    parts = [Part(Path(f"{i}"), START + i * hour, START + (i + 1) * hour) for i in range(14 * 24)]
+    parts = [
+        LogSpan(Path(f"{i}"), START + i * hour, START + (i + 1) * hour) for i in range(14 * 24)
+    ]
     starts = START + np.arange(14 * 24) * hour + 600 * SECOND
     sounding = Spans(starts, starts + 60 * SECOND)
     chosen = choose(parts, sounding)
@@ -458,20 +466,20 @@ def test_logs_that_cannot_be_read_or_are_weeks_old_are_passed_over(place):
 
 
 def test_right_is_better_only_beyond_chance():
-    assert clearly_better(Right(30, 10, 20, 12, 2))
-    assert not clearly_better(Right(30, 10, 12, 6, 4))
-    assert not clearly_better(Right())
+    assert clearly_better(PairedAccuracy(30, 10, 20, 12, 2))
+    assert not clearly_better(PairedAccuracy(30, 10, 12, 6, 4))
+    assert not clearly_better(PairedAccuracy())
 
 
-NOTHING_KNOWN = Right()
+NOTHING_KNOWN = PairedAccuracy()
 
 
 def evidence(minutes, right=NOTHING_KNOWN, sure=None):
     """Make evidence of a home with silence, speech and music, in minutes of a day."""
     table = np.array(minutes, float)
     certain = np.zeros_like(table) if sure is None else np.array(sure, float)
-    changes = Changes(["silence", "speech", "music"], table)
-    return Evidence(60.0, 14 * 1440.0, changes, certain, right, Right(), [])
+    changes = LabelChanges(["silence", "speech", "music"], table)
+    return HomeComparison(60.0, 14 * 1440.0, changes, certain, right, PairedAccuracy(), [])
 
 
 @pytest.mark.parametrize(("minutes", "more"), [(9.6, "1 more minute,"), (8.2, "2 more minutes,")])
@@ -483,12 +491,12 @@ def test_how_much_more_has_to_be_recorded_is_said(minutes, more):
 
 def test_a_model_that_changes_much_has_to_be_right_about_more():
     much = [[1300, 0, 0], [0, 70, 30], [0, 0, 40]]
-    (said,) = damages(evidence(much, Right(40, 30, 30, 3, 3)), "one")
+    (said,) = damages(evidence(much, PairedAccuracy(40, 30, 30, 3, 3)), "one")
     assert "it is right about 30, one about 30, and 30 min a day would change: " in said
-    assert damages(evidence(much, Right(40, 30, 33, 6, 3)), "one") == []
+    assert damages(evidence(much, PairedAccuracy(40, 30, 33, 6, 3)), "one") == []
     assert damages(evidence(much), "one") == []  # nothing was drawn at random
     little = [[1300, 0, 0], [0, 80, 20], [0, 0, 40]]
-    assert damages(evidence(little, Right(40, 30, 30, 3, 3)), "one") == []
+    assert damages(evidence(little, PairedAccuracy(40, 30, 30, 3, 3)), "one") == []
 
 
 def test_a_day_of_which_hours_were_recorded_is_said_to_be_one(capsys):
@@ -508,9 +516,9 @@ COUGHING_BECOMES_NEW = [[1300, 0, 0, 0], [0, 10, 0, 50], [0, 0, 40, 0], [0, 0, 0
 def with_new_class(known):
     """Make evidence of a home whose marks teach laughing, which takes most of the coughing."""
     table = np.array(COUGHING_BECOMES_NEW, float)
-    changes = Changes(["silence", "coughing", "music", "laughing"], table)
-    nothing = Right()
-    return Evidence(
+    changes = LabelChanges(["silence", "coughing", "music", "laughing"], table)
+    nothing = PairedAccuracy()
+    return HomeComparison(
         60.0, 14 * 1440.0, changes, table, nothing, nothing, [], nothing, {"laughing"}, known
     )
 
@@ -566,10 +574,10 @@ def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refus
     def reasons(known, column=(0, 0, 0, 20), each=" a day"):
         table = np.diag([1200.0, 100.0, 100.0, 0.0])
         table[:, 3] = column
-        changes = Changes(["silence", "speech", "music", "hum"], table, each)
-        nothing = Right()
+        changes = LabelChanges(["silence", "speech", "music", "hum"], table, each)
+        nothing = PairedAccuracy()
         home = 60.0, 1440.0, changes, np.zeros((4, 4)), nothing, nothing, [], nothing
-        return damages(Evidence(*home, {"hum"}, known), "one")
+        return damages(HomeComparison(*home, {"hum"}, known), "one")
 
     marks = {("hum", "silence", "hum"): 9, ("hum", "speech", "hum"): 9}
     assert reasons(marks | {("music", "music", "music"): 12, ("music", "music", "hum"): 4}) == []
@@ -629,22 +637,24 @@ def test_what_a_new_class_takes_over_is_judged_by_marks_that_were_learned_from(l
 
 
 def test_right_is_said_of_sounds_and_a_model_is_wrong_about_a_class_that_it_lacks():
-    frames = LabelledFrames(
+    frames = PairedFrames(
         np.arange(40) * 50_000_000, np.repeat([0, 1, 1, 1], 10), np.repeat([0, 1, 1, 2], 10),
         np.ones(40, np.float32), np.ones(40),
     )  # fmt: skip
     names = ["silence", "speech", "dog"]
     known = [("silence", 0), ("speech", 10), ("cat", 20), ("dog", 30)]
-    sounds = [Sound(i * 50_000_000, (i + 10) * 50_000_000, name, True, "mic") for name, i in known]
+    sounds = [
+        KnownSound(i * 50_000_000, (i + 10) * 50_000_000, name, True, "mic") for name, i in known
+    ]
     outcomes = list(_outcomes(sounds, frames, names))
     assert _right(one for one in outcomes if one.label != "silence") == (3, 1, 2, 1, 0)
 
 
 def test_fewer_right_by_chance_is_no_damage():
     same = [[1300, 0, 0], [0, 100, 0], [0, 0, 40]]
-    assert damages(evidence(same, Right(40, 30, 29, 4, 5)), "one") == []
-    assert damages(evidence(same, Right(40, 30, 25, 2, 7)), "one") != []
-    heard = replace(evidence(same), quiet=Right(9, 9, 3, 0, 6))
+    assert damages(evidence(same, PairedAccuracy(40, 30, 29, 4, 5)), "one") == []
+    assert damages(evidence(same, PairedAccuracy(40, 30, 25, 2, 7)), "one") != []
+    heard = replace(evidence(same), quiet=PairedAccuracy(9, 9, 3, 0, 6))
     assert damages(heard, "one") == [
         "of 9 silences of the minutes that were drawn at random it leaves 3 silent, one 9"
     ]
@@ -657,8 +667,8 @@ def test_sound_that_vanishes_and_a_class_that_multiplies_are_damage_unless_rando
     ]
     music = [[1290, 0, 10], [0, 30, 70], [0, 0, 15]]
     assert damages(evidence(music), "one") == ["music rises from 15 min a day to 1 h 35 min"]
-    assert damages(evidence(music, Right(60, 20, 50, 32, 2)), "one") == []
-    quiet = replace(evidence(music), quiet=Right(40, 0, 40, 40, 0))
+    assert damages(evidence(music, PairedAccuracy(60, 20, 50, 32, 2)), "one") == []
+    quiet = replace(evidence(music), quiet=PairedAccuracy(40, 0, 40, 40, 0))
     assert damages(quiet, "one") == ["music rises from 15 min a day to 1 h 35 min"]
 
 

@@ -4,7 +4,7 @@ import librosa
 import numpy as np
 import pytest
 
-from hearthlog.analyzer.training.learned_segments import segment_digests
+from hearthlog.analyzer.training.dataset import segment_digests
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.home33 import HOME33, rounded
 

@@ -13,23 +13,23 @@ from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.confirmed import (
-    chosen,
-    confirmed_segments,
-    labelled_segments,
-)
+from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import CONFIRMED
-from hearthlog.analyzer.training.home_data import (
+from hearthlog.analyzer.training.home_recordings import (
     HOME,
     HOME_WEIGHT,
     MOST_OF_MARK,
     lesson_recordings,
+    read_reviewed_sound,
 )
-from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
-from hearthlog.analyzer.training.scenario import scenario_of
-from hearthlog.analyzer.training.unreviewed import unreviewed_sounds
+from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.manifest import scenario_of
+from hearthlog.analyzer.training.pseudo_labels import (
+    chosen,
+    confirmed_segments,
+    labelled_segments,
+    unreviewed_sounds,
+)
 from hearthlog.models.classifiers.model import Description
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
@@ -261,7 +261,7 @@ def test_a_home_that_is_never_silent_is_refused_and_a_mark_of_silence_helps(
     model = load_model(model_file)
     quiet = next(one for one in segments(home) if one[2] == "silence")
     loud = next(one for one in segments(home) if one[2] != "silence")
-    nowhere = "hearthlog.analyzer.training.home_lessons.unreviewed_silence"
+    nowhere = "hearthlog.analyzer.training.home_training_set.unreviewed_silence"
     monkeypatch.setattr(nowhere, lambda *_: [])
     write(home, [loud])
     with pytest.raises(DataError, match="mark some seconds in which nothing sounds as silence"):

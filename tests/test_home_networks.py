@@ -21,9 +21,8 @@ from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.analyzer.review.queue.span_sounds import span_sounds
-from hearthlog.analyzer.training.home_data import lesson_recordings
-from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
+from hearthlog.analyzer.training.home_recordings import lesson_recordings, read_reviewed_sound
+from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hearthlog.analyzer.training.home_spans import merged_spans
+from hearthlog.analyzer.training.train import merged_spans
 from hearthlog.models.classifiers.model import MOST_SPANS
 
 pytestmark = pytest.mark.fast

@@ -10,7 +10,7 @@ import soundfile
 from logs import read
 
 from hearthlog import classify, extract_features
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.features.installed import DEFAULT

@@ -15,7 +15,7 @@ from spliced import run
 from test_scenarios_at_once import keep, renamed, replace_file
 
 from hearthlog.analyzer.bridge.alerts.rules import MoreThan, unknown_class
-from hearthlog.analyzer.training.adapt import base_classes
+from hearthlog.analyzer.training.adaptation import base_classes
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary

@@ -5,8 +5,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.manifest import left_out_lines, read_manifest
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, load_scenario
+from hearthlog.analyzer.training.manifest import (
+    BUILTIN,
+    LABELS,
+    left_out_lines,
+    load_scenario,
+    read_manifest,
+)
 
 pytestmark = pytest.mark.fast
 

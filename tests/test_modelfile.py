@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
 from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.svm_method import SVM
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier, LabelTiming, label_timing

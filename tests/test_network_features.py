@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_infos
-from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.train import method_named
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile.modelfile import load_model

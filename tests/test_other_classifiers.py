@@ -30,13 +30,11 @@ from test_blas import runnable
 from threadpoolctl import threadpool_limits
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.adapt import adapt_model, base_classes
-from hearthlog.analyzer.training.home_landmarks import is_moved
-from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.adaptation import adapt_model, base_classes, is_moved
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.learned_inputs import balanced, in_whole_steps, rounded
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.train import method_named, train_model
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.svm_rbf import weakest_pairs
 from hearthlog.models.errors import ModelError

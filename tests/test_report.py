@@ -17,7 +17,7 @@ from logs import read
 from PIL import Image
 from spliced import run
 
-from hearthlog.analyzer.accuracy.count_range import Strata, checked_rates
+from hearthlog.analyzer.accuracy.event_counts import Strata, checked_rates
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs

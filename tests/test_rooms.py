@@ -7,14 +7,19 @@ import pytest
 import soundfile
 from scipy.signal import welch
 
-from hearthlog.analyzer.training import rooms
+from hearthlog.analyzer.training import clips as rooms
+from hearthlog.analyzer.training.clips import empty_room, in_room, reverberated, steady_noise
 from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.learned_inputs import spread_over_classes
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
+from hearthlog.analyzer.training.manifest import (
+    LABELS,
+    LabelledClip,
+    Scenario,
+    load_scenario,
+    read_manifest,
+)
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.rooms import empty_room, in_room, reverberated, steady_noise
-from hearthlog.analyzer.training.scenario import LABELS, Scenario, load_scenario
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import FloorTracker
@@ -43,7 +48,7 @@ def speech_like(seconds, level, seed=0):
 @pytest.fixture
 def plain(monkeypatch):
     """Rooms without echoes, microphones that are even, and floors that are known exactly."""
-    monkeypatch.setattr(rooms, "_SHARE", 0.0)
+    monkeypatch.setattr(rooms, "_COPIED_SHARE", 0.0)
     monkeypatch.setattr(rooms, "_FLOOR_ERROR_DB", 0.0)
 
 

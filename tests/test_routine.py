@@ -21,18 +21,23 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import joined, one, without
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.routine_text import difference_text, judgement_text
-from hearthlog.analyzer.routine import usual
-from hearthlog.analyzer.routine.compare import FEWEST, Routines, compare
+from hearthlog.analyzer.routine import day_anomaly as usual
+from hearthlog.analyzer.routine.day_anomaly import (
+    FEWEST,
+    Routines,
+    compare,
+    fit_baseline,
+    regular_hours,
+)
 from hearthlog.analyzer.routine.day_profile import (
     COUNT,
     FIRST,
     LAST,
     LENGTH,
-    Figure,
-    HomeSound,
+    DayFigure,
+    HomeSegments,
     Profiles,
 )
-from hearthlog.analyzer.routine.usual import learn, regular_hours
 from hearthlog.schemas.frames import NANOSECONDS
 
 MONDAY = date(2026, 2, 2)
@@ -84,7 +89,7 @@ def home(days, zone=UTC, gaps=()):
         for name in ("starts", "ends", "labels")
     )
     order = np.argsort(starts, kind="stable")
-    return HomeSound(
+    return HomeSegments(
         Labelling(starts[order], ends[order], labels[order]), dict.fromkeys(CLASSES, covered)
     )
 
@@ -150,7 +155,7 @@ def test_what_was_not_heard_is_not_said_to_be_missing():
     morning = [(day + 5 * HOUR * NANOSECONDS, day + int(8.5 * HOUR) * NANOSECONDS)]
     profiles = Profiles(home(month(usual_day), gaps=morning), UTC, night_after=False)
     values = profiles.of(MONDAY + timedelta(days=29)).values
-    assert np.isnan(values[profiles.figures.index(Figure(FIRST, "clock"))])
+    assert np.isnan(values[profiles.figures.index(DayFigure(FIRST, "clock"))])
 
 
 def test_what_is_late_on_a_weekday_may_be_usual_at_a_weekend():
@@ -196,7 +201,7 @@ def test_hours_are_those_of_the_clock_on_days_that_it_is_changed():
     rng = np.random.default_rng(5)
     days = [usual_day(rng) for _ in range(60)]  # the clock is set forward on 29 March
     profiles = Profiles(home(days, zone=VIENNA), VIENNA, night_after=False)
-    place = profiles.figures.index(Figure(FIRST, "clock"))
+    place = profiles.figures.index(DayFigure(FIRST, "clock"))
     for number in (54, 55, 56):
         day = profiles.of(MONDAY + timedelta(days=number))
         assert 6.4 * 60 < day.values[place] < 7.8 * 60
@@ -213,7 +218,7 @@ def test_the_night_is_the_one_before_or_the_one_after():
     heard = home(days)
     for night_after, number in ((False, 2), (True, 1)):
         profiles = Profiles(heard, UTC, night_after=night_after)
-        place = profiles.figures.index(Figure("coughing", COUNT, night=True))
+        place = profiles.figures.index(DayFigure("coughing", COUNT, night=True))
         counts = [profiles.of(MONDAY + timedelta(days=n)).values[place] for n in (1, 2)]
         assert [count > 25 for count in counts] == [number == 1, number == 2]
 
@@ -226,7 +231,7 @@ def test_coughing_beside_a_television_does_not_count():
     coughs = [(at("20:00") + 60 * n + 16, 1, "coughing", 1) for n in range(60)]
     days[0] = sorted([*days[0], *television, *coughs])
     profiles = Profiles(home(days), UTC, night_after=False)
-    place = profiles.figures.index(Figure("coughing", COUNT))
+    place = profiles.figures.index(DayFigure("coughing", COUNT))
     assert profiles.of(MONDAY).values[place] == plain.values[place]
 
 
@@ -235,7 +240,7 @@ def test_a_busy_half_hour_has_five_sounds():
     day = [*four, *((at("09:00") + 120 * n, 3, "tap_water", 1) for n in range(5))]
     profiles = Profiles(home([day, day, day]), UTC, night_after=False)
     values = profiles.of(MONDAY + timedelta(days=1)).values
-    clock = [profiles.figures.index(Figure(what, "clock")) for what in (FIRST, LAST)]
+    clock = [profiles.figures.index(DayFigure(what, "clock")) for what in (FIRST, LAST)]
     assert values[clock].tolist() == [540, 548]
 
 
@@ -278,7 +283,7 @@ def test_days_that_are_left_out_are_compared_with_all_others_and_not_with_themse
     weekend = np.array([day.day.weekday() >= 5 for day in days[:-1]])
     for row in (0, 11):
         rest = np.arange(19) != row
-        own = learn(table[rest], weekend[rest], compared.figures)
+        own = fit_baseline(table[rest], weekend[rest], compared.figures)
         expected = own.deviations(table[row], weekend[row])
         np.testing.assert_array_equal(compared.others[row], expected)
 

@@ -14,7 +14,7 @@ from test_review import Screen
 from test_scenarios_at_once import START, record, sound
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.gate.reference import reference
+from hearthlog.analyzer.gate.recent_time import reference
 from hearthlog.analyzer.logs.catalog import read_catalog
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labellings, LogContents, find_labellings
@@ -33,7 +33,7 @@ from hearthlog.analyzer.review.session.queue_items import queue_spans
 from hearthlog.analyzer.review.session.session import Session
 from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.analyzer.training.home_data import lesson_recordings
+from hearthlog.analyzer.training.home_recordings import lesson_recordings
 from hearthlog.analyzer.training.speakers import SPEAKERS, speaker_recordings
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.starter import BATHROOM

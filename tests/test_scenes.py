@@ -10,11 +10,18 @@ import soundfile
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation import evaluate_scenes as evaluation
-from hearthlog.analyzer.evaluation.evaluate_scenes import SceneOptions, evaluate_scenes
-from hearthlog.analyzer.evaluation.scenes import background, compose, compose_single, loudest
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import scenario_of
+from hearthlog.analyzer.evaluation.scenes import (
+    SceneOptions,
+    _labelling,
+    _moved,
+    _Recorder,
+    background,
+    compose,
+    compose_single,
+    evaluate_scenes,
+    loudest,
+)
+from hearthlog.analyzer.training.manifest import read_manifest, scenario_of
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import SAMPLE_RATE
@@ -158,9 +165,9 @@ def labelled(monkeypatch, heard, change):
 
     def record(self, scene):
         del self
-        return scene.truth, change(evaluation._labelling(scene.truth))
+        return scene.truth, change(_labelling(scene.truth))
 
-    monkeypatch.setattr(evaluation._Recorder, "record", record)
+    monkeypatch.setattr(_Recorder, "record", record)
     return evaluate_scenes(*heard, OPTIONS, ignore_progress)
 
 
@@ -180,9 +187,9 @@ def test_what_is_recorded_is_what_was_composed(monkeypatch, heard, training_set)
     def record(self, scene):
         del self
         recorded.append(scene)
-        return scene.truth, evaluation._labelling(scene.truth)
+        return scene.truth, _labelling(scene.truth)
 
-    monkeypatch.setattr(evaluation._Recorder, "record", record)
+    monkeypatch.setattr(_Recorder, "record", record)
     options = replace(OPTIONS, colour="pink", floor=-50.0, gain=-3.0)
     evaluate_scenes(*heard, options, ignore_progress)
     clips = {}
@@ -216,7 +223,7 @@ def test_a_cough_of_two_labels_is_found_once(monkeypatch, heard):
 
 
 def test_late_labels_and_wrong_ones_are_not(monkeypatch, heard):
-    late = labelled(monkeypatch, heard, lambda truth: evaluation._moved(truth, 10**9))
+    late = labelled(monkeypatch, heard, lambda truth: _moved(truth, 10**9))
     assert late.scores.macro_f1 < 0.85
     assert late.detections.event_based.macro_f1 < 0.2
     assert late.coughs.found == 0.0

@@ -18,7 +18,7 @@ from spliced import run
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from hearthlog.analyzer.errors import WorkerError
-from hearthlog.analyzer.training.cross_validation import cross_validate
+from hearthlog.analyzer.training.calibration import cross_validate
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds

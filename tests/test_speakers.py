@@ -15,8 +15,8 @@ from hearthlog.analyzer.discover.enrolled_voices import check_voices, is_of_two
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.enrol import enrol_file, enrol_log
 from hearthlog.analyzer.training.dataset import Recording
-from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.speakers import others_of, speaker_recordings, speakers_scenario
+from hearthlog.analyzer.training.train import method_named
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

@@ -11,8 +11,7 @@ import pytest
 import soundfile
 from conftest import HEARTHLOG
 
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.model import PublicCollection, may_be_shipped
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import read_projection

@@ -12,12 +12,17 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training import clip_sound
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training import clips as clip_sound
+from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
 from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
+from hearthlog.analyzer.training.manifest import (
+    BUILTIN,
+    LABELS,
+    LabelledClip,
+    Scenario,
+    read_manifest,
+)
 from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError

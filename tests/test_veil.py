@@ -12,7 +12,7 @@ from logreader import LogReader
 from logs import read
 from lossy import LossySource
 
-from hearthlog.analyzer.training.marked_sound import read_sound_of
+from hearthlog.analyzer.training.home_recordings import read_sound_of
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile.modelfile import load_model

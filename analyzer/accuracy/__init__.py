@@ -1,1 +1,1 @@
-"""How right the labels are in this home, measured by minutes that were drawn at random."""
+"""Accuracy of the labels in a home, by minutes drawn at random."""

@@ -1,34 +1,190 @@
-"""Minutes that were drawn at random and gone through: what labels say in them, and what is true."""
+"""Checked minutes: reviewed labels, and minutes drawn at random with their true events."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.count_range import (
+from hearthlog.analyzer.accuracy.event_counts import (
+    AROUND,
     FEWEST,
+    MINUTE,
+    SET_APART,
     CheckedRates,
     beta_quantile,
     checked_rates,
-)
-from hearthlog.analyzer.accuracy.events import (
-    AROUND,
-    MINUTE,
-    SET_APART,
     events_of,
     overlapping,
     sounding_minutes,
     television_minutes,
 )
-from hearthlog.analyzer.accuracy.reviewed_labels import ReviewedLabels, read_reviewed_labels
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.spans import Spans, cut, without
-from hearthlog.analyzer.marks.marks import RANDOM
-from hearthlog.models.classes import SILENCE
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
+from hearthlog.analyzer.logs.recorder_info import model_of
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, lengths, overlay, without
+from hearthlog.analyzer.marks.marks import (
+    CHOICES,
+    RANDOM,
+    Mark,
+    ReviewedSpan,
+    read_marks,
+    read_reviewed,
+)
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import REVIEW_LAYER, log_of_layer
+from hearthlog.schemas.messages.topics import LIVE, relabelling
 
-_AROUND = AROUND * MINUTE
+_FOLLOWING = 3  # logs: a segment is in the one in which it ends
+
+
+class ReviewedLabels(NamedTuple):
+    """A reviewed span, and the labels in it and in the ten minutes before and after.
+
+    Attributes
+    ----------
+    model : str
+        SHA-256 of the model that labelled; empty if unknown.
+    undecided : Spans
+        What a person could not decide: the labels there are neither right nor wrong.
+    """
+
+    span: ReviewedSpan
+    labels: Labelling
+    true: Labelling
+    model: str
+    undecided: Spans = NONE
+
+
+def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
+    """Count the spans that a person has looked at, but not because they were drawn at random."""
+    spans = [one for one in reviewed if one.span.chosen != RANDOM and not _is_undecided(one)]
+    return sum(2 * _changed(one) < one.span.end - one.span.start for one in spans), len(spans)
+
+
+def _is_undecided(reviewed: ReviewedLabels) -> bool:
+    start, end = reviewed.span.start, reviewed.span.end
+    return 2 * cut(reviewed.undecided, start, end).length >= end - start
+
+
+def _changed(reviewed: ReviewedLabels) -> int:
+    """Measure for how long another label is true in a span than was labelled."""
+    parts = overlay([reviewed.labels, reviewed.true]).in_all()
+    differs = reviewed.labels.labels[parts.rows[0]] != reviewed.true.labels[parts.rows[1]]
+    spans = Spans(parts.starts[differs], parts.ends[differs])
+    return cut(spans, reviewed.span.start, reviewed.span.end).length
+
+
+def read_reviewed_labels(  # noqa: PLR0913, PLR0917
+    logs: HomeLogs,
+    labelling: str,
+    start: int,
+    end: int,
+    losses: list[str],
+    chosen: Collection[str] = CHOICES,
+) -> Iterator[ReviewedLabels]:
+    """Read the labels of the spans that a person has gone through.
+
+    Parameters
+    ----------
+    start, end : int
+        Nanoseconds of UTC, of the logs whose review layers are read.
+    """
+    found: list[tuple[Path, ReviewedSpan]] = []
+    for layer in logs.between(start, end, REVIEW_LAYER):
+        log = log_of_layer(layer.path)
+        try:
+            spans = [span for span in read_reviewed(log) if span.chosen in chosen]
+        except LogError as error:
+            _lose(losses, error)
+            continue
+        found += [(log, span) for span in spans if span.corrects == labelling]
+    of_log: dict[Path, list[ReviewedSpan]] = {}
+    for log, span in _joined_parts(found):
+        of_log.setdefault(log, []).append(span)
+    for log, spans in of_log.items():
+        try:
+            yield from _reviewed_labels(logs, log, spans, labelling)
+        except (DataError, LogError) as error:
+            _lose(losses, error)
+
+
+def _lose(losses: list[str], error: Exception) -> None:
+    if str(error) not in losses:
+        losses.append(str(error))
+
+
+def _joined_parts(found: list[tuple[Path, ReviewedSpan]]) -> list[tuple[Path, ReviewedSpan]]:
+    """Join spans that were cut where one log ends and the next begins."""
+    whole: list[tuple[Path, ReviewedSpan]] = []
+    open_: dict[ReviewedSpan, tuple[int, Path]] = {}  # by the span that would go on: place, log
+    for log, span in found:
+        place, before = open_.pop(span._replace(end=0), (len(whole), log))
+        if place < len(whole) and before != log and _is_one(whole[place][1], span):
+            first, earlier = whole[place]
+            whole[place] = first, earlier._replace(end=span.end)
+        else:
+            place = len(whole)
+            whole.append((log, span))
+        open_[span._replace(start=span.end, end=0)] = place, log
+    return whole
+
+
+def _is_one(before: ReviewedSpan, after: ReviewedSpan) -> bool:
+    """Tell two parts of a drawn minute from two minutes, both of which were drawn."""
+    return before.chosen != RANDOM or after.end - before.start <= MINUTE
+
+
+def _reviewed_labels(
+    logs: HomeLogs, log: Path, spans: list[ReviewedSpan], labelling: str
+) -> Iterator[ReviewedLabels]:
+    near = _logs_around(logs, spans[0].start, max(span.end for span in spans))
+    sources = find_labellings(*near)
+    name = labelling if labelling == LIVE else relabelling(labelling)
+    models = {name: model_of(log, name) for name in {span.microphone for span in spans}}
+    marks = [mark for path in near for mark in _marks(path)]
+    for span in spans:
+        with suppress(LogError):  # nothing is labelled there
+            around = span.start - AROUND * MINUTE, span.end + AROUND * MINUTE
+            labels = unified(sources.read(span.microphone, name, *around).labelling)
+            own = [mark for mark in marks if mark.microphone == span.microphone]
+            decided = labelling_of_marks(one for one in own if class_name(one.label) != UNKNOWN)
+            rest = labelling_of_marks(one for one in own if class_name(one.label) == UNKNOWN)
+            yield ReviewedLabels(
+                span,
+                labels,
+                overlaid(labels, decided),
+                models[span.microphone].model_sha256,
+                joined(rest.starts, rest.ends),
+            )
+
+
+def _logs_around(logs: HomeLogs, start: int, end: int) -> list[Path]:
+    near = logs.between(start - AROUND * MINUTE, end)
+    later = logs.between(start)[:_FOLLOWING]
+    paths = dict.fromkeys(entry.path for entry in [*near, *later])
+    return [path for path in paths if path.exists()]
+
+
+def _marks(log: Path) -> list[Mark]:
+    with suppress(LogError):
+        return read_marks(log)
+    return []
+
+
+def labelling_of_marks(marks: Iterable[Mark]) -> Labelling:
+    """Make a labelling of marks of one microphone."""
+    ordered = sorted(marks)
+    return Labelling(
+        np.array([mark.start for mark in ordered], np.int64),
+        np.array([mark.end for mark in ordered], np.int64),
+        np.array([class_name(mark.label) for mark in ordered], object),
+    )
 
 
 class ClassCheck(NamedTuple):
@@ -191,7 +347,7 @@ def checked_minutes(reviewed: Iterable[ReviewedLabels]) -> CheckedMinutes:
 
 
 def _like_television(minute: ReviewedLabels) -> bool:
-    first = minute.span.start - _AROUND
+    first = minute.span.start - AROUND * MINUTE
     edges = np.arange(first, first + (2 * AROUND + 2) * MINUTE, MINUTE)
     return bool(television_minutes(minute.labels, edges)[AROUND])
 
@@ -217,3 +373,57 @@ def _begun(events: Spans, minute: ReviewedLabels) -> Spans:
     begun = Spans(events.starts[first:last], np.minimum(events.ends[first:last], span.end))
     decided = overlapping(begun, without(begun, minute.undecided))
     return Spans(begun.starts[decided], begun.ends[decided])
+
+
+_DAY = 1440 * MINUTE
+_MOST = 7  # days: more would hardly change the share, and take their time
+
+
+def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
+    """Tell for how many quiet minutes one checked stands, where one with sound stands for one.
+
+    That is the weight of Horvitz and Thompson, by the last seven days of which minutes were
+    checked.
+
+    Parameters
+    ----------
+    checked : np.ndarray [shape=(n,)], bool
+        Whether anything sounds in each checked minute.
+
+    Returns
+    -------
+    float
+        1 if only minutes of one kind were checked, or are there.
+    """
+    kinds = [sounding for day in _days(logs, labelling) for sounding in _sounding(logs, *day)]
+    sounding = np.concatenate([*kinds, np.empty(0, bool)])
+    loud, quiet = int(sounding.sum()), int((~sounding).sum())
+    checked_loud, checked_quiet = int(checked.sum()), int((~checked).sum())
+    if not (loud and quiet and checked_loud and checked_quiet):
+        return 1.0
+    return (quiet / checked_quiet) / (loud / checked_loud)
+
+
+def _days(logs: HomeLogs, labelling: str) -> list[tuple[int, str, str]]:
+    days = set()
+    for layer in logs.between(layer=REVIEW_LAYER):
+        try:
+            spans = read_reviewed(log_of_layer(layer.path))
+        except LogError:
+            continue  # whoever reads the minutes says so
+        own = (s for s in spans if s.chosen == RANDOM and s.corrects == labelling)
+        days |= {(span.start // _DAY * _DAY, span.microphone, labelling) for span in own}
+    return sorted(days)[-_MOST:]
+
+
+def _sounding(logs: HomeLogs, start: int, microphone: str, labelling: str) -> Iterator[Bool]:
+    """Tell which minutes of a day sound; those that are not labelled are left out."""
+    paths = [entry.path for entry in logs.between(start, start + _DAY) if entry.path.exists()]
+    name = labelling if labelling == LIVE else relabelling(labelling)
+    edges = start + np.arange(0, _DAY + 1, MINUTE)
+    try:
+        labels = find_labellings(*paths).read(microphone, name, start, start + _DAY).labelling
+    except (DataError, LogError):
+        return
+    labelled = lengths(joined(labels.starts, labels.ends), edges) > 0
+    yield sounding_minutes(unified(labels), edges)[labelled]

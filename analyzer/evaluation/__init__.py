@@ -1,1 +1,1 @@
-"""How good a model, or a labelling, is: scores, events, references, pictures."""
+"""Evaluation: scores of models and labellings against references, and their plots."""

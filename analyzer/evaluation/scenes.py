@@ -1,17 +1,49 @@
-"""Scenes: clips laid over steady noise, with the truth known."""
+"""Scenes: clips over steady noise, recorded as by a microphone, and scores of a model on them."""
 
 import random
+import tempfile
+import wave
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Event as Flag
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.fft import irfft, rfft
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.models.classes import SILENCE
+from hearthlog.analyzer.evaluation.event_scores import Detections
+from hearthlog.analyzer.evaluation.log_scores import evaluate_labelling, read_labelling
+from hearthlog.analyzer.evaluation.model_scores import check_classes
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.training.dataset import (
+    UNREADABLE,
+    clip_recordings,
+    cut_recordings,
+    learned_groups,
+)
+from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip, example_of
+from hearthlog.analyzer.training.scores import Scores
+from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.installed import feature_set
+from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.model_watch import ModelWatch
+from hearthlog.recorder.recording_session import RecordingSession
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import SAMPLE_RATE
+from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 
 Colour = Literal["white", "pink", "brown"]
 Clip = TypeVar("Clip")
@@ -205,3 +237,315 @@ def _laid(sounds: Iterator[tuple[str, Float32, float]], noise: Float32, gain: fl
     samples = noise[: int((now + _AFTER) * SAMPLE_RATE)]
     np.clip(samples, -1.0, 1.0, out=samples)
     return Scene(samples, [*truth, Span(end, len(samples) / SAMPLE_RATE, SILENCE)])
+
+
+_START = 1_772_323_200 * NANOSECONDS  # of every scene; any full hour does
+_APART = 24 * 3600 * NANOSECONDS
+_WRITTEN_AT_ONCE = 1 << 20  # samples
+_HOURS_A_DAY = 24
+_MOST_SECONDS = 60  # of a clip that are read
+
+Clips = dict[str, list[LabelledClip]]
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How scenes are composed.
+
+    Attributes
+    ----------
+    floor : float
+        Level of the noise in dBFS.
+    gain : float
+        Of the clips, in dB.
+    """
+
+    scenes: int = 3
+    seconds: float = 1800.0
+    floor: float = -70.0
+    colour: Colour = "white"
+    gain: float = 0.0
+    seed: int = 10
+
+
+@dataclass(frozen=True)
+class SceneScores:
+    """How good the labels of one scene are."""
+
+    seed: int
+    macro_f1: float  # of frames
+    event_f1: float  # macro
+    false_alarms_per_hour: float  # of all classes
+
+
+@dataclass(frozen=True)
+class SingleCoughs:
+    """What became of single coughs of 0.3 s.
+
+    Attributes
+    ----------
+    found : float
+        Share of them that a label of coughing overlaps.
+    """
+
+    coughs: int
+    found: float
+    median_seconds: float | None
+    others: float
+
+
+@dataclass(frozen=True)
+class ScenesEvaluation:
+    """How good a model is on scenes.
+
+    Attributes
+    ----------
+    scores : Scores
+        Of frames of 50 ms in all scenes; the groups are blocks of five minutes.
+    coughs : SingleCoughs or None
+        None where the model has no such class, or there is no clip of it.
+    truth, found : Labelling
+        Of the first scene, for pictures; in nanoseconds from its start.
+    """
+
+    scores: Scores
+    detections: Detections
+    scenes: list[SceneScores]
+    coughs: SingleCoughs | None
+    evaluated_seconds: float
+    sounds: int
+    clips: int
+    sources: int
+    sources_learned: int
+    lacking: tuple[str, ...]
+    skipped: Mapping[str, int]
+    left_out: Sequence[SkippedClip]
+    truth: Labelling
+    found: Labelling
+
+
+def evaluate_scenes(  # noqa: PLR0913, PLR0917
+    path: Path,
+    model: Model,
+    clips: Sequence[LabelledClip],
+    scenario: Scenario,
+    options: SceneOptions,
+    progress: Progress,
+) -> ScenesEvaluation:
+    """Compose scenes, record them with a model, and compare its labels with the truth.
+
+    Parameters
+    ----------
+    progress : callable
+        Told the share of the scenes that is done, 0 to 1.
+
+    Raises
+    ------
+    DataError
+        If the classes of the model are not those of the scenario, if no clip can be laid, or if a
+        scene has no time for a sound.
+    LogError, OSError
+        If there is no room for a scene in the folder of temporary files.
+    """
+    check_classes(model, scenario)
+    by_label, skipped, left_out = _usable(clips, scenario)
+    used = {scenario.find(label) for label in by_label}
+    wanted = [name for name in scenario.classes if name not in {UNKNOWN, scenario.find(SILENCE)}]
+    if not by_label:
+        reasons = "; ".join(f"{count}: {reason}" for reason, count in sorted(skipped.items()))
+        raise DataError(
+            f"no clip can be laid into a scene ({reasons[:300]}{example_of(left_out)}); "
+            f"give clips of {', '.join(wanted)[:300]}"
+        )
+    laid = [clip for same in by_label.values() for clip in same]
+    silence = scenario.find(SILENCE) or SILENCE
+    coughs = [clip for clip in laid if scenario.find(clip.label) == COUGHING]
+    scenes: list[tuple[Labelling, Labelling]] = []
+    singles: list[tuple[list[Span], Labelling]] = []
+    sounds = 0
+    with closing(ModelWatch(path, SimpleQueue())) as watch:
+        recorder = _Recorder(watch, progress, options.scenes * (2 if coughs else 1))
+        for seed in range(options.seed, options.seed + options.scenes):
+            noise = partial(background, options.seconds, options.floor, options.colour, seed)
+            # Made in the call, so that one scene is held at a time.
+            spans, found = recorder.record(compose(by_label, _read, noise(), seed, options.gain))
+            sounds += len(_without_silence(spans))
+            truth = [span._replace(label=scenario.find(span.label) or silence) for span in spans]
+            scenes.append((_labelling(truth), found))
+            if coughs:
+                singles.append(
+                    recorder.record(
+                        compose_single(COUGHING, coughs, _read, noise(), seed, options.gain)
+                    )
+                )
+    each = [evaluate_labelling(truth, found, model.classes) for truth, found in scenes]
+    true, said = (_apart(same) for same in zip(*scenes, strict=True))
+    whole = evaluate_labelling(true, said, model.classes)
+    return ScenesEvaluation(
+        scores=whole.scores,
+        detections=whole.detections,
+        scenes=[
+            SceneScores(
+                seed=options.seed + number,
+                macro_f1=one.scores.macro_f1,
+                event_f1=one.detections.event_based.macro_f1 or 0.0,
+                false_alarms_per_hour=alarms_per_hour(one.detections),
+            )
+            for number, one in enumerate(each)
+        ],
+        coughs=_single_coughs(singles, silence) if singles else None,
+        evaluated_seconds=whole.evaluated_seconds,
+        sounds=sounds,
+        clips=len(laid),
+        sources=len({clip.source_group for clip in laid}),
+        sources_learned=_sources_learned(model, laid, scenario),
+        lacking=tuple(name for name in wanted if name not in used),
+        skipped=skipped,
+        left_out=left_out,
+        truth=scenes[0][0],
+        found=scenes[0][1],
+    )
+
+
+def alarms_per_hour(detections: Detections) -> float:
+    """Return the false alarms of all classes in an hour."""
+    return sum(detections.false_alarms_per_day.values()) / _HOURS_A_DAY
+
+
+def _usable(
+    clips: Sequence[LabelledClip], scenario: Scenario
+) -> tuple[Clips, dict[str, int], list[SkippedClip]]:
+    """Return the clips that are laid, by label, how many others there are, and which are faulty."""
+    chosen: Clips = {}
+    left_out: list[SkippedClip] = []
+    skipped: Counter[str] = Counter()
+    silence = scenario.find(SILENCE)
+    for clip in clips:
+        name = scenario.find(clip.label)
+        if name is None:
+            skipped[f"label {clip.label} is not in the scenario"] += 1
+        elif name in {UNKNOWN, silence}:
+            skipped[f"class {name} is not laid"] += 1
+        elif fault := _fault(clip):
+            skipped[UNREADABLE] += 1
+            left_out.append(SkippedClip(UNREADABLE, fault))
+        elif min(audio_seconds(clip.path), clip.end) - clip.start < FRAME_SECONDS:
+            skipped[f"shorter than a frame of {1000 * FRAME_SECONDS:g} ms"] += 1
+        else:
+            chosen.setdefault(clip.label, []).append(clip)
+    return chosen, dict(sorted(skipped.items())), left_out
+
+
+def _fault(clip: LabelledClip) -> str:
+    """Say why the part of a clip that is laid cannot be read; empty if it can."""
+    faults: list[str] = []
+    end = min(clip.end, clip.start + _MOST_SECONDS)
+    try:
+        for _ in read_audio(clip.path, clip.start, end, incomplete=faults.append):
+            pass
+    except SourceError as error:
+        return str(error)
+    return faults[0] if faults else ""
+
+
+def _read(clip: LabelledClip) -> Float32:
+    blocks, length = [], 0
+    for block in read_audio(clip.path, clip.start, clip.end):
+        blocks.append(np.nan_to_num(block))
+        length += len(block)
+        if length >= _MOST_SECONDS * SAMPLE_RATE:
+            break
+    return np.concatenate(blocks)
+
+
+def _sources_learned(model: Model, clips: Sequence[LabelledClip], scenario: Scenario) -> int:
+    """Count the source groups of which a model has learned from a segment."""
+    features = feature_set(model.description.feature_set)
+    recordings = clip_recordings(clips, scenario, ignore_progress, features)
+    return len(learned_groups(model, cut_recordings(recordings, scenario, features)))
+
+
+class _Recorder:
+    """Records scenes with one model, and reports how much of all of them is done."""
+
+    def __init__(self, watch: ModelWatch, progress: Progress, scenes: int) -> None:
+        self._watch = watch
+        self._progress = progress
+        self._scenes = scenes
+        self._done = 0
+
+    def record(self, scene: Scene) -> tuple[list[Span], Labelling]:
+        """Return the truth of a scene, and what is labelled in it, in ns from its start."""
+
+        def report(share: float) -> None:
+            self._progress((self._done + share) / self._scenes)
+
+        with tempfile.TemporaryDirectory(prefix="hearthlog-scene-") as folder:
+            sound, logs = Path(folder) / "scene.wav", Path(folder) / "logs"
+            _write(sound, scene.samples)
+            asked = {"output": logs, "keep_audio": "off", "feature_set": ""}
+            settings = load_settings(None, asked, {})
+            source = FileSource([sound], _START, progress=report)
+            microphone = settings.microphone[0].name
+            models = {microphone: LabellingModels(self._watch)}
+            recording = RecordingSession(settings, {microphone: source}, models)
+            try:
+                for event in source.events(Flag()):
+                    recording.add(microphone, event)
+            finally:
+                recording.finish()
+            found = read_labelling(logs).labelling
+        self._done += 1
+        return scene.truth, _moved(found, -_START)
+
+
+def _write(path: Path, samples: Float32) -> None:
+    with wave.open(str(path), "wb") as file:
+        file.setparams((1, 2, SAMPLE_RATE, len(samples), "NONE", ""))
+        for start in range(0, len(samples), _WRITTEN_AT_ONCE):
+            part = samples[start : start + _WRITTEN_AT_ONCE]
+            file.writeframes(np.rint(part * np.float32(32767)).astype("<i2").tobytes())
+
+
+def _without_silence(spans: Sequence[Span]) -> list[Span]:
+    return [span for span in spans if span.label != SILENCE]
+
+
+def _labelling(spans: Sequence[Span]) -> Labelling:
+    times = np.array([(start, end) for start, end, _ in spans])
+    starts, ends = np.rint(times * NANOSECONDS).astype(np.int64).T
+    return Labelling(starts, ends, np.array([label for _, _, label in spans], object))
+
+
+def _moved(labelling: Labelling, by: int) -> Labelling:
+    return replace(labelling, starts=labelling.starts + by, ends=labelling.ends + by)
+
+
+def _apart(labellings: Sequence[Labelling]) -> Labelling:
+    """Make one labelling of those of several scenes, which have no time in common."""
+    moved = [_moved(one, number * _APART) for number, one in enumerate(labellings)]
+    starts, ends, labels = (
+        np.concatenate([getattr(one, name) for one in moved])
+        for name in ("starts", "ends", "labels")
+    )
+    return Labelling(starts, ends, labels)
+
+
+def _single_coughs(scenes: Sequence[tuple[list[Span], Labelling]], silence: str) -> SingleCoughs:
+    """Look for single coughs in what was labelled."""
+    count, others, lengths = 0, 0, []
+    for spans, found in scenes:
+        coughs = _without_silence(spans)
+        same = found.labels == COUGHING
+        starts, ends = found.starts[same] / NANOSECONDS, found.ends[same] / NANOSECONDS
+        for begin, end, _ in coughs:
+            heard = np.flatnonzero((starts < end) & (ends > begin))
+            lengths += (ends - starts)[heard[:1]].tolist()
+        count += len(coughs)
+        others += int((~same & (found.labels != silence)).sum())
+    return SingleCoughs(
+        coughs=count,
+        found=len(lengths) / count,
+        median_seconds=float(np.median(lengths)) if lengths else None,
+        others=others / count,
+    )

@@ -1,1 +1,1 @@
-"""What a model would change in a home before it labels there, and whether that is damage."""
+"""Gate: the changes a model would make in a home, checked for damage before it labels there."""

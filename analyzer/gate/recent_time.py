@@ -1,31 +1,35 @@
-"""The recent time of a home that a model has not learned from, and parts of it to judge it by."""
+"""Recent time of a home: the part a model has not learned from, and its sounds of known label."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS
+from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labellings, find_labellings
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, without
-from hearthlog.models.classes import SILENCE
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, remains, without
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import LIVE, parse_topic
+from hearthlog.schemas.messages.topics import LIVE, parse_topic, relabelling
 
 _DAY = 86_400 * NANOSECONDS
 _RECENT = 14 * _DAY
 _LOUD = 36, 75 * NANOSECONDS  # number of spans that are labelled, and their length
 _QUIET = 16, 120 * NANOSECONDS
 _AROUND = 10 * NANOSECONDS  # a sound
-_SHORTEST = 30 * NANOSECONDS  # time that is worth a look into a log
+_SHORTEST_PART = 30 * NANOSECONDS  # time that is worth a look into a log
 _SEED = 7
 
 
@@ -37,7 +41,7 @@ class RecentLog(NamedTuple):
     end: int
 
 
-class Part(NamedTuple):
+class LogSpan(NamedTuple):
     """A span of a log, in nanoseconds of UTC."""
 
     log: Path
@@ -49,7 +53,7 @@ class Part(NamedTuple):
 class WeightedPart(NamedTuple):
     """A part that stands for more time like it."""
 
-    part: Part
+    part: LogSpan
     weight: float  # how much more
 
 
@@ -100,22 +104,22 @@ def learned_time(model: Model, marked: Spans) -> Spans:
     return marked if any(amount.segments for amount in training.home.values()) else NONE
 
 
-def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[Part]:
+def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     """Return the time of logs that nothing was learned from, in the order of the logs."""
     parts = []
     for log in logs:
         whole = Spans(np.array([log.start]), np.array([log.end]))
         rest = without(whole, cut(learned, log.start, log.end))
         times = zip(rest.starts.tolist(), rest.ends.tolist(), strict=True)
-        parts += [Part(log.path, *span) for span in times if span[1] - span[0] >= _SHORTEST]
+        parts += [LogSpan(log.path, *span) for span in times if span[1] - span[0] >= _SHORTEST_PART]
     return parts
 
 
-def choose(parts: Sequence[Part], sounding: Spans, seed: int = _SEED) -> list[WeightedPart]:
+def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list[WeightedPart]:
     """Choose parts of the time to judge by: 45 minutes with sound at most, and 32 without."""
     near = joined(sounding.starts - _AROUND, sounding.ends + _AROUND, _AROUND)
-    loud: list[Part] = []
-    quiet: list[Part] = []
+    loud: list[LogSpan] = []
+    quiet: list[LogSpan] = []
     for part in parts:
         whole = Spans(np.array([part.start]), np.array([part.end]))
         inside = cut(near, part.start, part.end)
@@ -125,7 +129,7 @@ def choose(parts: Sequence[Part], sounding: Spans, seed: int = _SEED) -> list[We
     return [*_weighted(loud, *_LOUD, seed), *_weighted(quiet, *_QUIET, seed)]
 
 
-def sample(parts: Sequence[Part], count: int, longest: int, seed: int = _SEED) -> list[Part]:
+def sample(parts: Sequence[LogSpan], count: int, longest: int, seed: int = _SEED) -> list[LogSpan]:
     """Choose spans of time, so many at most.
 
     One begins in each of as many equal shares of the time, at a moment that is drawn: so they are
@@ -153,7 +157,7 @@ def sample(parts: Sequence[Part], count: int, longest: int, seed: int = _SEED) -
     return chosen
 
 
-def _weighted(parts: Sequence[Part], count: int, longest: int, seed: int) -> list[WeightedPart]:
+def _weighted(parts: Sequence[LogSpan], count: int, longest: int, seed: int) -> list[WeightedPart]:
     chosen = sample(parts, count, longest, seed)
     whole, sampled = (sum(part.end - part.start for part in some) for some in (parts, chosen))
     return [WeightedPart(part, whole / sampled) for part in chosen]
@@ -172,3 +176,126 @@ def minutes_a_day(logs: Sequence[RecentLog]) -> float | None:
     days = {log.start // _DAY for log in logs} | {(log.end - 1) // _DAY for log in logs}
     total, day = recorded_minutes(logs), _DAY / (60 * NANOSECONDS)
     return None if total < day else min(total / len(days), day)
+
+
+_SHORTEST_SOUND = NANOSECONDS // 2  # sound that counts
+_REMAINS = 2 * NANOSECONDS  # what is shorter beside a mark is the marked sound, not cut exactly
+_FOLLOWING = 3  # logs: a segment is in the one in which it ends
+
+
+class KnownSound(NamedTuple):
+    """A sound whose label is known.
+
+    Attributes
+    ----------
+    random : bool
+        Whether it is of time that was drawn at random, and not chosen.
+    """
+
+    start: int
+    end: int
+    label: str
+    random: bool
+    microphone: str
+
+
+def reference(log: Path, following: Sequence[Path] = ()) -> list[KnownSound]:
+    """Return the sounds of a log whose labels are known.
+
+    Returns
+    -------
+    list of KnownSound
+        Of half a second or more, by the start; first those of time that was drawn at random.
+
+    Raises
+    ------
+    LogError
+        If its review layer is damaged, or what was looked at has gone.
+    """
+    marks, drawn = read_marks(log), _drawn(read_reviewed(log))
+    labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
+    inside = [sound for span in drawn for sound in _true(labellings, span, marks)]
+    others = [
+        KnownSound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
+        for mark in marks
+        if class_name(mark.label) != UNKNOWN  # whoever marked it could not tell
+        and not any(_inside(mark, span) for span in drawn)
+    ]
+    return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST_SOUND]
+
+
+def left_alone(log: Path) -> list[KnownSound]:
+    """Return the sounds of a log that a person looked at, not by chance, and did not mark.
+
+    Returns
+    -------
+    list of KnownSound
+        Of half a second or more, and of two beside a mark; none of what cannot be read.
+    """
+    sounds: list[KnownSound] = []
+    with suppress(DataError, LogError):
+        marks = read_marks(log)
+        spans = [span for span in read_reviewed(log) if span.chosen != RANDOM]
+        labellings = find_labellings(log) if spans else Labellings([])
+        for span in spans:
+            with suppress(DataError, LogError):
+                marked = {(mark.start, mark.end) for mark in marks}
+                edges = {edge for mark in marked for edge in mark}
+                sounds += [
+                    sound._replace(random=False)
+                    for sound in _parts(labellings, span, marks)
+                    if (sound.start, sound.end) not in marked
+                    and sound.end - sound.start >= _least(sound, edges)
+                ]
+    return sounds
+
+
+def _least(sound: KnownSound, edges: AbstractSet[int]) -> int:
+    """Return how long a sound has to be to count."""
+    return _SHORTEST_SOUND if edges.isdisjoint((sound.start, sound.end)) else _REMAINS
+
+
+def _true(
+    labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]
+) -> Iterator[KnownSound]:
+    """Yield what is true of a reviewed span: the labelling, and the marks over it.
+
+    What touches and has one label is one sound, however it was marked.
+    """
+    parts: dict[str, list[KnownSound]] = {}
+    for part in _parts(labellings, span, marks):
+        parts.setdefault(class_name(part.label), []).append(part)
+    for same in parts.values():
+        spans = spans_of([(part.start, part.end) for part in same])
+        for start, end in zip(*(edge.tolist() for edge in spans), strict=True):
+            yield same[0]._replace(start=start, end=end)
+
+
+def _parts(
+    labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]
+) -> Iterator[KnownSound]:
+    known = partial(KnownSound, random=True, microphone=span.microphone)
+    own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
+    for mark in own:
+        if class_name(mark.label) != UNKNOWN:
+            yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
+    corrects = LIVE if span.corrects == LIVE else relabelling(span.corrects)
+    name = labellings.find(span.microphone, corrects)
+    labels = labellings.read(span.microphone, name, span.start, span.end).labelling
+    rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))
+    for start, end, label in zip(rest.starts, rest.ends, labels.labels[row], strict=True):
+        yield known(int(start), int(end), str(label))
+
+
+def _drawn(reviewed: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:
+    return [span for span in reviewed if span.chosen == RANDOM]
+
+
+def _inside(mark: Mark, span: ReviewedSpan) -> bool:
+    return mark.start < span.end and mark.end > span.start
+
+
+def spans_of(times: Sequence[tuple[int, int]], pause: int = 0) -> Spans:
+    """Join spans of time that overlap or are no more than a pause apart."""
+    array = np.array(times, np.int64).reshape(-1, 2)
+    return joined(array[:, 0], array[:, 1], pause)

@@ -8,12 +8,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.accuracy.events import MINUTE
+from hearthlog.analyzer.accuracy.event_counts import MINUTE
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, lengths, one
 from hearthlog.analyzer.report.home_metrics import HomeMetrics
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
-from hearthlog.analyzer.routine.activity import longest_quiet, stretches
+from hearthlog.analyzer.routine.day_profile import longest_quiet, stretches
 from hearthlog.schemas.arrays import Int64
 
 _RISING = 4  # of the clock: what is heard before is of the night

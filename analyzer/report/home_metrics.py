@@ -7,13 +7,12 @@ from itertools import chain
 import numpy as np
 
 from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.count_range import CheckedRates
-from hearthlog.analyzer.accuracy.events import events_of
+from hearthlog.analyzer.accuracy.event_counts import CheckedRates, events_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, without
 from hearthlog.analyzer.report.home_minutes import HomeMinutes, checked_rates_of, home_minutes
 from hearthlog.analyzer.report.read_home import HomeData
-from hearthlog.analyzer.routine.day_profile import HomeSound
+from hearthlog.analyzer.routine.day_profile import HomeSegments
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 
@@ -107,9 +106,9 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
     return HomeMetrics(classes, everything, listened, sound, spans, events, minutes, rates)
 
 
-def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSound:
+def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
     """Return what routines are learned from: the labels of all microphones."""
-    return HomeSound(_together(data.segments.values()), metrics.listened)
+    return HomeSegments(_together(data.segments.values()), metrics.listened)
 
 
 def _together(parts: Iterable[Labelling]) -> Labelling:

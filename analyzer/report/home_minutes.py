@@ -7,12 +7,13 @@ from functools import reduce
 import numpy as np
 
 from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.count_range import CheckedRates, strata_of
-from hearthlog.analyzer.accuracy.events import (
+from hearthlog.analyzer.accuracy.event_counts import (
     MINUTE,
     SET_APART,
+    CheckedRates,
     events_of,
     sounding_minutes,
+    strata_of,
     television_minutes,
 )
 from hearthlog.analyzer.logs.labelling import Labelling

@@ -21,7 +21,7 @@ from hearthlog.analyzer.report.read_home import HomeData, read_home
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes, read_scenario_minutes
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
-from hearthlog.analyzer.routine.compare import Routines
+from hearthlog.analyzer.routine.day_anomaly import Routines
 from hearthlog.analyzer.routine.day_profile import Profiles
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.messages.topics import LIVE

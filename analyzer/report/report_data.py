@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from datetime import date, tzinfo
 
 from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.count_range import FEWEST as FEWEST_CHECKED
+from hearthlog.analyzer.accuracy.event_counts import FEWEST as FEWEST_CHECKED
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes
 from hearthlog.analyzer.report.sections import Figure
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
-from hearthlog.analyzer.routine.compare import Judgement
+from hearthlog.analyzer.routine.day_anomaly import DayAnomaly
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.errors import listed
 
@@ -37,7 +37,7 @@ class Account:
     days: Sequence[Day]  # one, or seven
     before: Sequence[Day]  # the days before them that belong to what is asked about three days
     earlier: Sequence[Day]  # those that they are compared with
-    judged: Mapping[date, Judgement | None]  # of `days`: how unusual each was, if that is known
+    judged: Mapping[date, DayAnomaly | None]  # of `days`: how unusual each was, if that is known
     beside: Mapping[date, int]  # of `days`: how many days there are to say so by
     unheard: Mapping[str, float]  # by microphone: hours in which it heard nothing
     gaps: Sequence[Trouble]

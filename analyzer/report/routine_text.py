@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from hearthlog.analyzer.report.class_words import several_in_words
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, whole
-from hearthlog.analyzer.routine.compare import FEWEST, LONGEST, Difference, Judgement
+from hearthlog.analyzer.routine.day_anomaly import FEWEST, LONGEST, DayAnomaly, FigureDifference
 from hearthlog.analyzer.routine.day_profile import (
     CLOCK,
     COUNT,
@@ -13,7 +13,7 @@ from hearthlog.analyzer.routine.day_profile import (
     QUIET,
     SOUND,
     STRETCHES,
-    Figure,
+    DayFigure,
 )
 from hearthlog.models.classes import in_words
 
@@ -27,7 +27,7 @@ _BUSY = {FIRST: "first busy half hour from", LAST: "last busy half hour until"}
 _NAMES = {STRETCHES: "times with sound", SOUND: "sound", QUIET: "longest quiet stretch"}
 
 
-def judgement_text(judged: Judgement) -> str:
+def judgement_text(judged: DayAnomaly) -> str:
     """Say how unusual a day was, and what was unlike other days."""
     compared = f"{judged.days} earlier days"
     if judged.once_in < WEEK:
@@ -48,14 +48,14 @@ def too_few_text(days: int) -> str:
     )
 
 
-def rarity_text(judged: Judgement) -> str:
+def rarity_text(judged: DayAnomaly) -> str:
     """Say how often a day is expected that is as unlike others: `one such day in 40`."""
     if judged.once_in >= LONGEST:
         return "less than one such day in a year"
     return f"one such day in {whole(judged.once_in)}"
 
 
-def differences_text(judged: Judgement) -> str:
+def differences_text(judged: DayAnomaly) -> str:
     """Say what was unlike other days, what differs most first."""
     more = len(judged.differences) - _SHOWN
     texts = [difference_text(each) for each in judged.differences[:_SHOWN]]
@@ -63,7 +63,7 @@ def differences_text(judged: Judgement) -> str:
     return f"typical of the last {judged.span} days: {text}" if judged.span > 1 else text
 
 
-def difference_text(difference: Difference) -> str:
+def difference_text(difference: FigureDifference) -> str:
     """Say what a figure was, and what it is on eight of ten days."""
     figure, value = difference.figure, difference.value
     name = _name(figure)
@@ -79,7 +79,7 @@ def difference_text(difference: Difference) -> str:
     return f"{_lasting(figure, value)}, usually {_range(low, high)}"
 
 
-def _sentence(judged: Judgement) -> str:
+def _sentence(judged: DayAnomaly) -> str:
     text = differences_text(judged)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
@@ -96,14 +96,14 @@ def _range(low: str, high: str) -> str:
     return f"{low} to {high}"
 
 
-def _lasting(figure: Figure, minutes: float) -> str:
+def _lasting(figure: DayFigure, minutes: float) -> str:
     name, text = _name(figure), Minutes.show(minutes)
     if figure.what == QUIET:
         return f"{name} {text}"
     return f"{name} for {text}" if minutes >= _HEARD else f"no {name}"
 
 
-def _name(figure: Figure) -> str:
+def _name(figure: DayFigure) -> str:
     if figure.kind == CLOCK:
         return _BUSY[figure.what]
     name = _NAMES.get(figure.what)

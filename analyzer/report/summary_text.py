@@ -16,7 +16,7 @@ from hearthlog.analyzer.report.daily_metrics import HOUR, MOST, Day
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.routine_text import WEEK, judgement_text, too_few_text
 from hearthlog.analyzer.report.values import Minutes
-from hearthlog.analyzer.routine.compare import FEWEST
+from hearthlog.analyzer.routine.day_anomaly import FEWEST
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
 from hearthlog.schemas.errors import listed
 

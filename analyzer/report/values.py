@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self
 
-from hearthlog.analyzer.accuracy.count_range import NO_MINUTES, CheckedRates, Strata
+from hearthlog.analyzer.accuracy.event_counts import NO_MINUTES, CheckedRates, Strata
 
 _MIN = " min"
 

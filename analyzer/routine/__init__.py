@@ -1,1 +1,1 @@
-"""The routines of a home, learned from its own weeks, and how unlike them a day was."""
+"""Routines of a home over its weeks, and the anomaly of a day."""

@@ -1,4 +1,4 @@
-"""A day as figures: when it began, how often and how long each class was heard, and when."""
+"""Profile of a day: its start, its longest quiet span, and events and minutes of each class."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.events import (
+from hearthlog.analyzer.accuracy.event_counts import (
     MINUTE,
     SET_APART,
     events_of,
@@ -18,13 +18,13 @@ from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import (
     NONE,
     Spans,
+    common,
     cut,
     joined,
     lengths,
     one,
     without,
 )
-from hearthlog.analyzer.routine.activity import longest_quiet, stretches
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,
@@ -38,6 +38,41 @@ from hearthlog.models.classes import (
 )
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
+
+_QUIET_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
+
+
+def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spans:
+    """Find the longest quiet span from 07:00 to 22:00.
+
+    Returns
+    -------
+    Spans
+        A single one; none if nothing was heard then.
+    """
+    waking = one(at_hour(day, MORNING, zone), at_hour(day, EVENING, zone))
+    quiet = without(common(coverage, waking), sound)
+    if not len(quiet.starts):
+        return NONE
+    longest = int((quiet.ends - quiet.starts).argmax())
+    return Spans(*(edge[longest : longest + 1] for edge in quiet))
+
+
+def stretches(sound: Spans, night: Spans) -> int:
+    """Count the stretches of sound in a night, with ten quiet minutes between them.
+
+    Returns
+    -------
+    int
+        Number of those with at least half a minute of sound.
+    """
+    inside = common(sound, night)
+    found = joined(*inside, _QUIET_PAUSE)
+    if not len(found.starts):
+        return 0
+    edges = np.append(found.starts, found.ends[-1:])
+    return int((lengths(inside, edges) >= _STRETCH).sum())
+
 
 COUNT, LENGTH, CLOCK = "count", "minutes", "clock"
 STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "quiet"
@@ -53,7 +88,7 @@ _BUSY, _HALF_HOUR = 5, 30 * MINUTE  # so many sounds begin in half an hour that 
 _PAUSE = 10 * NANOSECONDS
 
 
-class Figure(NamedTuple):
+class DayFigure(NamedTuple):
     """One figure of a day.
 
     Attributes
@@ -73,7 +108,7 @@ class Figure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class HomeSound:
+class HomeSegments:
     """What was heard in a home.
 
     Attributes
@@ -119,13 +154,13 @@ class Profiles:
 
     Attributes
     ----------
-    figures : list of Figure
+    figures : list of DayFigure
         Of each day.
     classes : list of str
         Whose half hours are counted.
     """
 
-    def __init__(self, home: HomeSound, zone: tzinfo, *, night_after: bool) -> None:
+    def __init__(self, home: HomeSegments, zone: tzinfo, *, night_after: bool) -> None:
         labels = home.labels
         self._zone = zone
         self._night_ends = _ONE if night_after else timedelta(0)
@@ -159,7 +194,7 @@ class Profiles:
         minutes = lengths(self._spans[name], edges) / MINUTE
         return np.where(heard >= _LEAST * np.maximum(widths, 1), minutes, np.nan)
 
-    def _value(self, figure: Figure, day: date) -> float:
+    def _value(self, figure: DayFigure, day: date) -> float:
         if figure.kind == CLOCK:
             return self._busy(day, last=figure.what == LAST)
         start, end = self._part(figure, day)
@@ -167,7 +202,7 @@ class Profiles:
         share = cut(listened, start, end).length / (end - start)
         return np.nan if share < _LEAST else self._amount(figure, day, (start, end), share)
 
-    def _amount(self, figure: Figure, day: date, part: tuple[int, int], share: float) -> float:
+    def _amount(self, figure: DayFigure, day: date, part: tuple[int, int], share: float) -> float:
         if figure.what == QUIET:
             quiet = longest_quiet(self._sound, self._coverage, day, self._zone)
             return quiet.length / MINUTE
@@ -179,7 +214,7 @@ class Profiles:
         spans = self._sound if figure.what == SOUND else self._spans[figure.what]
         return cut(spans, *part).length / MINUTE / share
 
-    def _part(self, figure: Figure, day: date) -> tuple[int, int]:
+    def _part(self, figure: DayFigure, day: date) -> tuple[int, int]:
         if not figure.night:
             return at_hour(day, MORNING, self._zone), at_hour(day, EVENING, self._zone)
         ends = day + self._night_ends
@@ -206,20 +241,20 @@ class Profiles:
         return 60.0 * local.hour + local.minute + 1440.0 * (local.date() - day).days
 
 
-def _figures(names: list[str]) -> Iterator[Figure]:
+def _figures(names: list[str]) -> Iterator[DayFigure]:
     """List the figures of a day, what matters most first."""
-    yield Figure(STRETCHES, COUNT, night=True)
-    yield Figure(SOUND, LENGTH, night=True)
+    yield DayFigure(STRETCHES, COUNT, night=True)
+    yield DayFigure(SOUND, LENGTH, night=True)
     for name in _AT_NIGHT:
         if name in names:
-            yield Figure(name, COUNT, night=True)
-    yield Figure(FIRST, CLOCK)
-    yield Figure(LAST, CLOCK)
-    yield Figure(QUIET, LENGTH)
-    yield Figure(SOUND, LENGTH)
+            yield DayFigure(name, COUNT, night=True)
+    yield DayFigure(FIRST, CLOCK)
+    yield DayFigure(LAST, CLOCK)
+    yield DayFigure(QUIET, LENGTH)
+    yield DayFigure(SOUND, LENGTH)
     for name in names:
         row = find_class(name)
-        yield Figure(name, COUNT if row is not None and row.several else LENGTH)
+        yield DayFigure(name, COUNT if row is not None and row.several else LENGTH)
 
 
 def _television(labels: Labelling) -> Spans:

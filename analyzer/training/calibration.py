@@ -1,17 +1,81 @@
-"""Calibration: how sure a classifier may be, by segments that it has not learned from."""
+"""Cross-validation and calibration: probabilities from segments outside the training set."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
+from itertools import product
+from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
-from hearthlog.analyzer.training.cross_validation import Fold, softmax
 from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.training.scores import calibration_error, score
+from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.model import Elsewhere
 from hearthlog.schemas.arrays import Bool, Float64, Indices
+from hearthlog.schemas.errors import Progress
+
+Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
+
+
+def cross_validate(
+    methods: Sequence[Method],
+    examples: Examples,
+    classes: int,
+    folds: Iterable[Fold],
+    progress: Progress,
+) -> Float64:
+    """Classify segments by classifiers that have not seen them.
+
+    Parameters
+    ----------
+    progress : callable
+        Is told the share of the fits that is done, 0 to 1.
+
+    Returns
+    -------
+    np.ndarray [shape=(len(methods), n, C)], float64
+        Decision values; -inf for a class that was not learned, NaN for segments that no fold tests.
+    """
+    from joblib import delayed  # noqa: PLC0415  part of the extra `headless`
+
+    folds = list(folds)
+    decisions = np.full((len(methods), len(examples.target), classes), np.nan)
+    tasks = list(product(range(len(methods)), folds))
+    calls = (
+        delayed(_decide_unseen)(methods[number], classes, fold, *examples) for number, fold in tasks
+    )
+    for done, decided in enumerate(in_parallel(calls)):
+        number, (_, unseen) = tasks[done]
+        decisions[number, unseen] = decided
+        progress((done + 1) / len(tasks))
+    return decisions
+
+
+def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Float64:
+    """Classify the test segments of a fold; joblib sends each array, an argument, once."""
+    examples, (seen, unseen) = Examples(*arrays), fold
+    learned = method.fit(examples, seen)
+    return examples.decide(learned, unseen, classes)
+
+
+def softmax(values: Float64) -> Float64:
+    """Turn decision values into probabilities.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, C)], float64
+        Decision values; -inf is allowed, but not for a whole row.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+        Every row sums up to 1; 0 where the decision value is -inf.
+    """
+    grown = np.exp(values - values.max(axis=1, keepdims=True))
+    return grown / grown.sum(axis=1, keepdims=True)
+
 
 KNOWN_LOST = 0.05  # share of known segments that may be labelled `unknown`
 _FEWEST_COLLECTIONS = 3
@@ -219,6 +283,8 @@ def inverse_temperature(decisions: Float64, target: Indices) -> float:
     def loss(logarithm: float) -> float:
         probabilities = softmax(np.exp(logarithm) * decisions)[np.arange(len(target)), target]
         return float(-np.log(np.maximum(probabilities, 1e-300)).mean())
+
+    from scipy.optimize import minimize_scalar  # noqa: PLC0415  applying one does without scipy
 
     result = minimize_scalar(loss, bounds=(-5.0, 5.0), method="bounded", options={"xatol": 1e-6})
     return float(np.exp(result.x))

@@ -1,4 +1,4 @@
-"""From labelled sound to the windows of one second that classifiers learn from."""
+"""Datasets: windows of one second for training, cut from labelled sound."""
 
 import hashlib
 from collections import Counter
@@ -10,20 +10,22 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_embeddings import (
+from hearthlog.analyzer.training.clips import (
     AS_IT_IS,
+    NO_NUMBERS,
     SHORT,
     SHORT_PARTS,
     ClipEmbedder,
     ClipEmbeddings,
+    ClipSound,
+    RoomCopy,
+    in_room,
+    read_clip,
 )
-from hearthlog.analyzer.training.clip_sound import NO_NUMBERS, ClipSound, read_clip
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
-from hearthlog.analyzer.training.rooms import RoomCopy, in_room
-from hearthlog.analyzer.training.scenario import Scenario
-from hearthlog.analyzer.training.sightings import Sighting
+from hearthlog.analyzer.training.direction_samples import DirectionSample
+from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip
 from hearthlog.models.classes import SILENCE, class_name
-from hearthlog.models.classifiers.model import Amount
+from hearthlog.models.classifiers.model import Amount, Model
 from hearthlog.models.embedding.projection import Int8
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
@@ -75,7 +77,7 @@ class Recording(NamedTuple):
     copies: Sequence[RoomCopy] = ()
     most: int | None = None
     span: tuple[int, int] | None = None
-    sighting: Sighting | None = None
+    sighting: DirectionSample | None = None
     fault: str = ""
     breaks: Sequence[int] = ()
     hole: str = ""
@@ -152,7 +154,7 @@ class Dataset:
         Starts and ends of the recordings that were used, in nanoseconds of UTC, if they are known.
     sightings : sequence of (Sighting or None)
         Whence the recording of each segment came, if that is known; empty if it is of none.
-    left_out : sequence of LeftOut
+    left_out : sequence of SkippedClip
         Recordings that could not be read, which `skipped` counts too, and parts of others.
     embedded : np.ndarray [shape=(n, W)], int8
         The segments as a network hears them; W is 0 without a network.
@@ -174,8 +176,8 @@ class Dataset:
     collections: Mapping[tuple[str, str], int]
     skipped: Mapping[str, int]
     spans: Int64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    sightings: Sequence[Sighting | None] = ()
-    left_out: Sequence[LeftOut] = ()
+    sightings: Sequence[DirectionSample | None] = ()
+    left_out: Sequence[SkippedClip] = ()
     embedded: Int8 = field(default_factory=lambda: np.empty((0, 0), np.int8))
     is_embedded: Bool = field(default_factory=lambda: np.empty(0, bool))
     embedding_windows: EmbeddingWindows = NO_WINDOWS
@@ -334,7 +336,7 @@ def cut_recordings(
     used: Counter[tuple[str, str]] = Counter()
     skipped: Counter[str] = Counter()
     seconds: dict[str, float] = {}
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     chosen: list[_Chosen] = []
     embedded_recordings: list[tuple[Recording, Indices]] = []
     spans: list[tuple[int, int]] = []
@@ -347,9 +349,9 @@ def cut_recordings(
             continue
         reason, starts = _segments(item, features)
         if item.fault:
-            left_out.append(LeftOut(reason, item.fault))
+            left_out.append(SkippedClip(reason, item.fault))
         if item.hole:
-            left_out.append(LeftOut(f"parts of clips, in which {NO_NUMBERS}", item.hole))
+            left_out.append(SkippedClip(f"parts of clips, in which {NO_NUMBERS}", item.hole))
         skipped[reason] += bool(reason)
         if reason and item.embedded is None:
             continue
@@ -536,3 +538,61 @@ def _thinned(key: Indices, weight: Float64) -> Indices:
         rows = np.flatnonzero(key == value)
         kept.append(spread(rows, int(SEGMENTS_PER_GROUP * weight[rows[0]])))
     return np.sort(np.concatenate(kept))
+
+
+_DIGEST_BYTES = 8
+
+
+def segment_digests(windows: Float32) -> Int64:
+    """Return the digests of segments, without those of digital silence, which are all alike.
+
+    Parameters
+    ----------
+    windows : np.ndarray [shape=(n, window_frames, d)], float32
+        Features of the segments.
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], int64
+        Sorted, each once.
+    """
+    return np.unique(_digests(windows)[_told_apart(windows)])
+
+
+def learned_digests(model: Model) -> Int64:
+    """Return the digests of what a model has learned from; older models have kept the segments.
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], int64
+    """
+    if len(model.training_digests):
+        return model.training_digests
+    return segment_digests(model.training_windows)
+
+
+def learned_groups(model: Model, data: Dataset) -> Indices:
+    """Return the source groups of which a model has learned from a segment.
+
+    Returns
+    -------
+    np.ndarray [shape=(g,)], intp
+        Numbers of the groups.
+    """
+    learned = np.isin(_digests(data.windows), learned_digests(model))
+    return np.unique(data.group[learned & _told_apart(data.windows)])
+
+
+def _digests(windows: Float32) -> Int64:
+    with np.errstate(over="ignore"):
+        rows = windows.astype("<f2")  # the last bits of features differ between machines
+    whole = b"".join(
+        hashlib.blake2b(row.tobytes(), digest_size=_DIGEST_BYTES).digest() for row in rows
+    )
+    return np.frombuffer(whole, "<i8").astype(np.int64)
+
+
+def _told_apart(windows: Float32) -> Bool:
+    """Tell in which segments the features change."""
+    changing: Bool = (windows != windows[:, :1]).any(axis=(1, 2))
+    return changing

@@ -1,19 +1,21 @@
-"""Linear heads on what a network hears, learned by ridge regression.
-
-Classes of few sources decide it: a logistic head separates nine coughs by whatever they have in
-common, ridge regression weighs by what varies in all windows.
-"""
+"""Linear heads on embeddings, and their mixture with a classifier."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
+from sklearn.metrics import f1_score
 
-from hearthlog.analyzer.training.calibration import inverse_temperature
-from hearthlog.analyzer.training.dataset import EmbeddingWindows
-from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT
+from hearthlog.analyzer.training.calibration import Fold, inverse_temperature
+from hearthlog.analyzer.training.dataset import Dataset, EmbeddingWindows
+from hearthlog.analyzer.training.manifest import BUILTIN
+from hearthlog.models.classes import FLUSHING_WATER, OTHER, SILENCE, UNKNOWN
+from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT, EmbeddingHeads, mixed, sounds_of
+from hearthlog.models.classifiers.model import EmbeddingMix, NamesHead
+from hearthlog.models.embedding.networks import NETWORKS
+from hearthlog.models.embedding.projection import read_projection
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
 _ALPHA = 30.0  # of inputs of one standard deviation, whatever their number
@@ -46,6 +48,9 @@ def learn_heads(
     seen: Bool | None = None,
 ) -> LinearHeads:
     """Learn heads, each with the temperature that holds in collections left out.
+
+    By ridge regression, for classes of few sources: a logistic head separates nine coughs by
+    whatever they have in common, ridge regression weighs by what varies in all windows.
 
     Parameters
     ----------
@@ -201,3 +206,344 @@ class _Sums:
         root /= np.bincount(pairs[0], root)[pairs[0]]
         weights: Float64 = (root / together)[of_pair] * count / (number.max() + 1)
         return weights
+
+
+HEAD_WEIGHT = 1.0
+MACHINE_WEIGHT = 0.75
+_SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tried
+CLASS_EXPONENT = 0.2
+_NAMES_BESIDE = 0.5  # weight of names beside both heads
+_NAMES_WEIGHT, _NAMES_SLOPE = 1.25, 0.2  # of a step of a quarter of a logit
+_NAMES_BIAS = {FLUSHING_WATER: 2.5, OTHER: 1.5}  # which names alone miss
+_FOR_NAMES = 0.02  # of F1: folds share recordists and rooms with what is learned, not with names
+_REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
+_OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
+
+
+@dataclass(frozen=True)
+class HeadInputs:
+    """The values of an embedding that the linear heads of a model are learned on."""
+
+    network: str
+    projection_sha256: str
+    names: tuple[str, ...]
+    inputs: tuple[slice, ...]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups, which the last of the heads takes."""
+        return self.names[self.inputs[-1]]
+
+
+def head_inputs_of(network: str) -> HeadInputs:
+    """Return the values of the embeddings of a network that linear heads are learned on.
+
+    Raise `ModelError` if it is not known, or its projection is damaged.
+    """
+    projection = read_projection(NETWORKS.get(network).projection)
+    components = projection.components.shape[1]
+    groups = projection.names.index("outside") + 1
+    return HeadInputs(
+        network,
+        projection.sha256,
+        projection.names,
+        (slice(0, components), slice(components, groups)),
+    )
+
+
+def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
+    """Return which of the windows for heads must not be learned from, as segments are left out.
+
+    Parameters
+    ----------
+    unseen : np.ndarray [shape=(k,)], intp
+        Segments that are left out: with them go the sources and collections of which all segments
+        are.
+    """
+    seen = np.setdiff1d(np.arange(len(data)), unseen)
+    lost = np.zeros(len(data.embedding_windows.target), bool)
+    for of_segments, of_windows in (
+        (data.group, data.embedding_windows.group),
+        (data.collection, data.embedding_windows.collection),
+    ):
+        lost |= np.isin(of_windows, np.setdiff1d(of_segments[unseen], of_segments[seen]))
+    return lost
+
+
+def cross_validated_heads(
+    data: Dataset, mix: EmbeddingMix, inputs: Sequence[slice], folds: Sequence[Fold]
+) -> Float64:
+    """Return what heads say of segments that they have not learned from.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+        As `EmbeddingHeads.log_probabilities`; NaN of segments without an embedding, or in no fold.
+    """
+    by_heads = np.full((len(data), len(data.classes)), np.nan)
+    for _, unseen in folds:
+        seen = ~unseen_windows(data, unseen)
+        learned = learn_heads(data.embedding_windows, data.classes, inputs, seen)
+        heads = EmbeddingHeads(mix, *learned, data.classes)
+        heard = unseen[data.is_embedded[unseen]]
+        by_heads[heard] = heads.log_probabilities(data.embedded[heard])
+    return by_heads
+
+
+def can_learn_heads(data: Dataset) -> bool:
+    """Return whether heads can be learned: from two classes of sound, of some sources each."""
+    sources = _sources(data)[sounds_of(data.classes)]
+    return int((sources >= FEWEST_SOURCES).sum()) > 1
+
+
+class Tried(NamedTuple):
+    """A way of leaving out, with what a classifier says of what was left out.
+
+    Attributes
+    ----------
+    decisions : np.ndarray [shape=(n, C)], float64
+        Of the classifier, times its inverse temperature.
+    used : np.ndarray [shape=(n,)], bool
+        By which segments it is found how sure the mix may be.
+    """
+
+    folds: Sequence[Fold]
+    decisions: Float64
+    used: Bool
+
+
+class Mixture(NamedTuple):
+    """What was learned.
+
+    Attributes
+    ----------
+    of_sources, of_collections : np.ndarray [shape=(n, C)], float64
+        Logarithms of the probabilities of segments left out, with what the others say of how sure
+        the mix may be.
+    """
+
+    mix: EmbeddingMix
+    heads: LinearHeads
+    of_sources: Float64
+    of_collections: Float64 | None
+
+
+class BestMix(NamedTuple):
+    """The best one of the ways to mix.
+
+    Attributes
+    ----------
+    by_heads : list of np.ndarray [shape=(n, C)], float64
+        What heads say of segments, for each way of leaving out.
+    left_out : list of np.ndarray [shape=(n, C)], float64
+        Logarithms of the probabilities of segments, as sure as the others allow.
+    """
+
+    mix: EmbeddingMix
+    inputs: tuple[slice, ...]
+    by_heads: list[Float64]
+    left_out: list[Float64]
+
+
+def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix:
+    """Try heads and a classifier together, with and without the names of the network as they are.
+
+    Names say what is of no class of the scenario. Where the classes are a few sounds among all
+    others, such as those of water, names may say of which class a sound is, instead of the head
+    that is learned from them. The mix that tells segments left out best is taken; such names may be
+    worse by a little.
+
+    Parameters
+    ----------
+    ways : sequence of Tried
+        At least one.
+    """
+    single = _plain(taken, taken.inputs[:1])
+    by_head = [
+        [cross_validated_heads(data, single, [columns], way.folds) for way in ways]
+        for columns in taken.inputs
+    ]
+    tried, scores = [], []
+    for inputs, names, advantage in _candidates(data, taken):
+        mix = _plain(taken, inputs)
+        by_heads = [sum(each) for each in zip(*by_head[: len(inputs)], strict=True)]
+        if names:
+            mix = mix.model_copy(update={"names": names})
+            of_names = _of_names_alone(data, mix)
+            by_heads = [one + of_names for one in by_heads]
+        left_out = _left_out(data, mix, ways, by_heads)
+        tried.append(BestMix(mix, inputs, by_heads, left_out))
+        scores.append(_right(data, left_out) + advantage)
+    return tried[int(np.argmax(scores))]
+
+
+class _Candidate(NamedTuple):
+    """Linear heads and names that may be mixed; `inputs` are those of the heads."""
+
+    inputs: tuple[slice, ...]
+    names: list[NamesHead]
+    advantage: float = 0.0
+
+
+def _candidates(data: Dataset, taken: HeadInputs) -> list[_Candidate]:
+    """Return the ways to mix; a class of hardly any source cannot be measured without its names."""
+    every = taken.inputs
+    rejecting = rejecting_head(taken, data.classes)
+    names = names_head(taken, data.classes)
+    by_rejecting = [] if rejecting is None else [rejecting]
+    known = [n for n, name in enumerate(data.classes) if name not in {SILENCE, UNKNOWN}]
+    if names is not None and (_sources(data)[known] < FEWEST_SOURCES).any():
+        beside = names.model_copy(update={"weight": _NAMES_BESIDE})
+        found = [_Candidate(every, [*by_rejecting, beside])]
+    else:
+        found = [_Candidate(every, [])]
+        found += [_Candidate(every, by_rejecting)] if by_rejecting else []
+    if names is not None and OTHER in data.classes:
+        found.append(_Candidate(every[:1], [*by_rejecting, names], _FOR_NAMES))
+    return found
+
+
+def _sources(data: Dataset) -> Indices:
+    """Return the number of sources of the windows for heads, by class."""
+    windows = data.embedding_windows
+    pairs = np.unique(np.stack([windows.target, windows.group]), axis=1)
+    return np.bincount(pairs[0], minlength=len(data.classes))
+
+
+def learn_mixture(
+    data: Dataset, taken: HeadInputs, sources: Tried, collections: Tried | None
+) -> Mixture:
+    """Learn heads, and how sure they and a classifier may be together.
+
+    Parameters
+    ----------
+    collections : Tried or None
+        None if there are too few of them.
+    """
+    ways = [sources] if collections is None else [sources, collections]
+    best = best_mix(data, taken, ways)
+    everything = np.ones(len(data), bool)
+    inverse = _inverse_temperature(data, best.mix, ways[-1], best.by_heads[-1], everything)
+    mix = best.mix.model_copy(update={"inverse_temperature": inverse})
+    heads = learn_heads(data.embedding_windows, data.classes, best.inputs)
+    return Mixture(mix, heads, best.left_out[0], None if collections is None else best.left_out[1])
+
+
+def _left_out(
+    data: Dataset, mix: EmbeddingMix, ways: Sequence[Tried], by_heads: Sequence[Float64]
+) -> list[Float64]:
+    return [_nested(data, mix, way, one) for way, one in zip(ways, by_heads, strict=True)]
+
+
+def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
+    return EmbeddingMix(
+        network=taken.network,
+        projection_sha256=taken.projection_sha256,
+        values=len(taken.names),
+        head_weights=[HEAD_WEIGHT] * len(inputs),
+        machine_weight=MACHINE_WEIGHT,
+        inverse_temperature=1.0,
+    )
+
+
+def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
+    """Return what the names of a network say of whether a sound is of any known class.
+
+    Returns
+    -------
+    NamesHead or None
+        None where there is no class `unknown`, or no known one has a name.
+    """
+    first, groups = taken.inputs[-1].start, taken.groups
+    known = [name for name in classes if name not in {SILENCE, UNKNOWN}]
+    named = {group for name in known for group in _groups_of(name)} & set(groups)
+    others = set(groups) - named - {SILENCE}
+    if UNKNOWN not in classes or not named or not others:
+        return None
+    inside = [first + number for number, group in enumerate(groups) if group in named]
+    outside = [first + number for number, group in enumerate(groups) if group in others]
+    return NamesHead(
+        weight=_REJECTING_WEIGHT,
+        slope=_NAMES_SLOPE,
+        classes={**dict.fromkeys(known, inside), UNKNOWN: outside},
+        bias={UNKNOWN: _REJECTING_BIAS},
+    )
+
+
+def names_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
+    """Return what the names of a network say of some classes; None if one of them has no name."""
+    first, groups = taken.inputs[-1].start, taken.groups
+    named = {name: _groups_of(name) for name in classes if name != SILENCE}
+    if len(named) < 2 or not all(one in groups for same in named.values() for one in same):
+        return None
+    numbers = {name: [first + groups.index(one) for one in same] for name, same in named.items()}
+    bias = {name: value for name, value in _NAMES_BIAS.items() if name in numbers}
+    return NamesHead(weight=_NAMES_WEIGHT, slope=_NAMES_SLOPE, classes=numbers, bias=bias)
+
+
+def _groups_of(name: str) -> list[str]:
+    """Return the groups of names that mean a class."""
+    return {UNKNOWN: ["outside"], OTHER: sorted(_OF_GENERAL)}.get(name, [name])
+
+
+def _of_names_alone(data: Dataset, mix: EmbeddingMix) -> Float64:
+    """Return what names alone say of all segments; they have not learned from any."""
+    by_heads = np.zeros((len(data), len(data.classes)))
+    nothing = np.zeros((0, mix.values, len(data.classes)), np.int32)
+    alone = mix.model_copy(update={"head_weights": []})
+    heads = EmbeddingHeads(alone, nothing, nothing[:, 0], data.classes)
+    if data.is_embedded.any():
+        by_heads[data.is_embedded] = heads.log_probabilities(data.embedded[data.is_embedded])
+    return by_heads
+
+
+def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64) -> Float64:
+    """Mix what is said of segments left out, those of each fold as sure as the others allow."""
+    result = way.decisions - _log_sum(way.decisions)
+    for _, unseen in way.folds:
+        others = np.ones(len(data), bool)
+        others[unseen] = False
+        inverse = _inverse_temperature(data, mix, way, by_heads, others)
+        heard = unseen[~np.isnan(by_heads[unseen]).any(axis=1)]
+        surer = mix.model_copy(update={"inverse_temperature": inverse})
+        result[heard] = mixed(way.decisions[heard], by_heads[heard], surer, data.classes)
+    return result
+
+
+def _inverse_temperature(
+    data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64, chosen: Bool
+) -> float:
+    """Find how sure the mix may be of which sound it is, by some of the segments."""
+    sounds = sounds_of(data.classes)
+    used = chosen & way.used & np.isin(data.target, sounds) & ~np.isnan(by_heads).any(axis=1)
+    if not used.any():
+        return 1.0
+    plain = mix.model_copy(update={"inverse_temperature": 1.0})
+    decisions = mixed(way.decisions[used], by_heads[used], plain, data.classes)[:, sounds]
+    found = inverse_temperature(decisions, np.searchsorted(sounds, data.target[used]))
+    return min(found, _SUREST)
+
+
+def _right(data: Dataset, results: Sequence[Float64]) -> float:
+    """Return the mean macro F1 of ways of leaving out."""
+    numbers = np.unique(data.target)
+    return float(
+        np.mean(
+            [
+                f1_score(
+                    data.target,
+                    one.argmax(axis=1),
+                    labels=numbers,
+                    average="macro",
+                    zero_division=0,
+                )
+                for one in results
+            ]
+        )
+    )
+
+
+def _log_sum(values: Float64) -> Float64:
+    highest = values.max(axis=1, keepdims=True)
+    total: Float64 = np.log(np.exp(values - highest).sum(axis=1, keepdims=True)) + highest
+    return total

@@ -1,4 +1,4 @@
-"""Windows that a classifier is learned from: chosen, weighted, rounded and scaled."""
+"""Training windows of a classifier: chosen, weighted, rounded and scaled."""
 
 from typing import Any
 

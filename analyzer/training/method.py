@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.clips import empty_room
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.rooms import empty_room
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set

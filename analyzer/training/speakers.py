@@ -9,11 +9,15 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Recording
-from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
-from hearthlog.analyzer.training.learned_inputs import kept_inputs
-from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
+from hearthlog.analyzer.training.home_recordings import (
+    HOME,
+    HomeSound,
+    marked_recordings,
+    read_reviewed_sound,
+    teaching,
+)
+from hearthlog.analyzer.training.manifest import LABELS, Scenario
 from hearthlog.analyzer.training.method import Method
-from hearthlog.analyzer.training.scenario import LABELS, Scenario
 from hearthlog.models.classes import OTHER, SILENCE, SPEECH, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
@@ -33,7 +37,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
 
     Enrolled spans of logs are one source where they are less than half an hour apart.
 
-    Raise `LogError, DataError` as of `hearthlog.analyzer.training.home_data.home_recordings`.
+    Raise `LogError, DataError` as of `hearthlog.analyzer.training.home_recordings.home_recordings`.
     """
     cut: list[Recording] = []
     for folder in folders:
@@ -121,6 +125,10 @@ def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32
         If it has not kept what it learned from as inputs of the method.
     """
     description = model.description
+    from hearthlog.analyzer.training.learned_inputs import (  # noqa: PLC0415  needs scikit-learn
+        kept_inputs,
+    )
+
     kept = kept_inputs(model)
     if kept is None or (method.feature_set, method.inputs) != (
         description.feature_set,

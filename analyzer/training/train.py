@@ -1,9 +1,10 @@
-"""Training: a model is learned from segments, and measured on sources it has not learned from."""
+"""Training: learns a model by an installed method, and scores it on held-out sources."""
 
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -12,40 +13,37 @@ from sklearn.model_selection import StratifiedGroupKFold
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import (
+    Fold,
     calibrate_elsewhere,
     collection_folds,
+    cross_validate,
     inverse_temperature,
     scores_elsewhere,
+    softmax,
     taught_elsewhere,
     unknown_bias,
 )
-from hearthlog.analyzer.training.cross_validation import Fold, cross_validate, softmax
-from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.heads import scaler_of
-from hearthlog.analyzer.training.home_spans import merged_spans
-from hearthlog.analyzer.training.installed import DEFAULT
-from hearthlog.analyzer.training.learned_segments import segment_digests
-from hearthlog.analyzer.training.method import Learned, Method, prepare
-from hearthlog.analyzer.training.mixture import (
+from hearthlog.analyzer.training.clips import ClipEmbedder, network_embedder
+from hearthlog.analyzer.training.dataset import Dataset, segment_digests
+from hearthlog.analyzer.training.direction_samples import with_directions
+from hearthlog.analyzer.training.heads import (
     Mixture,
     Tried,
     can_learn_heads,
     head_inputs_of,
     learn_mixture,
+    scaler_of,
 )
-from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, ROOM21
+from hearthlog.analyzer.training.manifest import Scenario
+from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.scores import calibration_error
-from hearthlog.analyzer.training.sightings import with_directions
-from hearthlog.analyzer.training.transitions import (
-    LAG_SECONDS,
-    REACH_SECONDS,
-    SHORTEST_SECONDS,
-    default_transitions,
-)
-from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.analyzer.training.svm_method import BANDS, PAPER, SVM, network_method
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_EMBEDDINGS,
+    MOST_SPANS,
     MOST_WEIGHT,
     ClassMetrics,
     Description,
@@ -55,9 +53,141 @@ from hearthlog.models.classifiers.model import (
     Smoothing,
     TrainingData,
 )
-from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog.models.embedding.networks import find_network
+from hearthlog.models.extensions import Extensions
+from hearthlog.models.features.installed import is_network
+from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.errors import Progress
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
+
+DEFAULT: Method = ROOM
+_INSTALLED = [ROOM, EMBEDDING, ROOM21, BANDS, PAPER, SVM]
+_METHODS = Extensions("hearthlog.methods", Method, "method", _INSTALLED, DataError)  # type: ignore[type-abstract]
+
+
+def default_method() -> Method:
+    """Return the method that is best with what is installed: with a network where there is one."""
+    runtime = find_spec("ai_edge_litert") is not None
+    return EMBEDDING if runtime and find_network(EMBEDDING.network) is not None else DEFAULT
+
+
+def clip_embedder(method: Method) -> ClipEmbedder | None:
+    """Return what hears the clips that a method learns from; None if it takes no embeddings.
+
+    Parameters
+    ----------
+    method : Method
+
+    Raises
+    ------
+    ModelError
+        If its network is not known, not there, another file, or cannot be used.
+    """
+    return network_embedder(method.network, method.seed) if method.network else None
+
+
+def method_named(name: str) -> Method:
+    """Return the method of a name.
+
+    Parameters
+    ----------
+    name : str
+        `embedding`, `room`, `room21`, `bands`, `paper`, `svm`, the name of an entry point in the
+        group `hearthlog.methods`, or that of a network that has a card.
+
+    Raises
+    ------
+    DataError
+        If there is no method of this name, or a network and a method of this name.
+    ModelError
+        If the entry point cannot be imported, or is no method of this name, or if the card says
+        what cannot be.
+    """
+    if is_network(name):
+        if _METHODS.has(name):
+            raise DataError(f"{name} is a method, and a network: give its card another name")
+        return network_method(name)
+    return _METHODS.get(name)
+
+
+LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real clips; 1 s does not
+REACH_SECONDS = 0.3
+SHORTEST_SECONDS = 0.25
+
+_SOUND_AFTER_SOUND = 0.007  # times as likely as it were if all classes were equally likely
+_DURATION_SECONDS = 10.0  # expected duration of a class that is not in the table of classes
+
+
+def default_transitions(classes: Sequence[str]) -> Float64:
+    """Return the transition probabilities of classes by their expected durations.
+
+    A sound is mostly followed by silence, if that is a class, and seldom by another sound: most
+    changes from one sound to another are mistakes in the middle of one of them.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names of the C classes, at least two; one that `hearthlog.models.classes` does not know
+        lasts 10 s.
+
+    Returns
+    -------
+    np.ndarray [shape=(C, C)], float64
+        Probability that a frame of the row's class is followed by one of the column's class.
+    """
+    leave = 1.0 / np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
+    is_sound = np.array([class_name(name) != SILENCE for name in classes])
+    following = np.where(np.outer(is_sound, is_sound), _SOUND_AFTER_SOUND, 1.0)
+    np.fill_diagonal(following, 0.0)
+    transitions: Float64 = following * (leave / following.sum(axis=1))[:, np.newaxis]
+    np.fill_diagonal(transitions, 1.0 - leave)
+    return transitions
+
+
+def expected_durations(classes: Sequence[str]) -> Float64:
+    """Return the expected durations of classes.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 10 s.
+
+    Returns
+    -------
+    np.ndarray [shape=(C,)], float64
+        In seconds.
+    """
+    rows = map(find_class, classes)
+    return np.array([_DURATION_SECONDS if row is None else row.seconds for row in rows])
+
+
+_MERGED_WITHIN = 60 * NANOSECONDS
+
+
+def merged_spans(spans: Int64) -> list[list[int]]:
+    """Join spans of time that are less than a minute apart.
+
+    Parameters
+    ----------
+    spans : np.ndarray [shape=(n, 2)], int64
+        Start and end of each, in nanoseconds of UTC, in any order.
+
+    Returns
+    -------
+    list of [start, end]
+        In order; not more than a description holds, for which the nearest are joined, too.
+    """
+    if not len(spans):
+        return []
+    ordered = spans[np.argsort(spans[:, 0], kind="stable")]
+    ends = np.maximum.accumulate(ordered[:, 1])
+    apart = ordered[1:, 0] - ends[:-1]
+    widest = np.argsort(-apart, kind="stable")[: MOST_SPANS - 1]
+    breaks = np.sort(widest[apart[widest] >= _MERGED_WITHIN])
+    starts = ordered[np.concatenate([[0], breaks + 1]), 0]
+    merged: list[list[int]] = np.stack([starts, ends[np.append(breaks, -1)]], axis=1).tolist()
+    return merged
+
 
 MOST_FOLDS = 5
 SMOOTHINGS = ("hmm", "merge")

@@ -11,7 +11,7 @@ from clusters import two_threads_in
 from spliced import run, run_function
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
+from hearthlog.analyzer.evaluation.method_scores import evaluate_method
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.workers.parallel import fits_on

@@ -8,9 +8,8 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

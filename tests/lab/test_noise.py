@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.rooms import level_of, steady_noise
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
+from hearthlog.analyzer.training.clips import clip_frames, level_of, steady_noise
+from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
 from hearthlog.analyzer.training.scores import F1Difference
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.schemas.frames import SAMPLE_RATE

@@ -8,10 +8,9 @@ import pytest
 from spliced import run_function
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
+from hearthlog.analyzer.evaluation.method_scores import evaluate_method
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
+from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set

@@ -10,9 +10,8 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 pytest.importorskip("pocketsphinx")
 pytest.importorskip("pystoi")
 
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.home33 import HOME33

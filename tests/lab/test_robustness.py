@@ -7,9 +7,8 @@ import pytest
 from scipy.signal import welch
 from spliced import run_function
 
-from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import scenario_of
+from hearthlog.analyzer.evaluation.model_scores import evaluate_model
+from hearthlog.analyzer.training.manifest import read_manifest, scenario_of
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import ignore_progress

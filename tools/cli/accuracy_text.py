@@ -6,11 +6,11 @@ from hearthlog.analyzer.accuracy.checked_minutes import (
     CheckedMinutes,
     ClassCheck,
     checked_minutes,
+    count_unchanged,
+    quiet_weight,
+    read_reviewed_labels,
 )
-from hearthlog.analyzer.accuracy.count_range import FEWEST
-from hearthlog.analyzer.accuracy.events import SET_APART
-from hearthlog.analyzer.accuracy.minute_kinds import quiet_weight
-from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged, read_reviewed_labels
+from hearthlog.analyzer.accuracy.event_counts import FEWEST, SET_APART
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.models.classes import UNKNOWN, in_words
 from hearthlog.schemas.errors import listed

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 from hearthlog.tools.cli.table import print_table
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.gate.changes import Changes
+    from hearthlog.analyzer.gate.paired_labels import LabelChanges
 
 _SHOWN = 8  # changes
 
 
-def print_changes(changes: "Changes", before: str, after: str) -> None:
+def print_changes(changes: "LabelChanges", before: str, after: str) -> None:
     """Print the longest changes, and the minutes of each class."""
-    from hearthlog.analyzer.gate.changes import time_words
+    from hearthlog.analyzer.gate.paired_labels import time_words
 
     for change in changes.pairs()[:_SHOWN]:
         print(f"  {change}")

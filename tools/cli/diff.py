@@ -104,7 +104,7 @@ class _Result(NamedTuple):
 
 
 def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
-    from hearthlog.analyzer.evaluation.difference import compare_labellings
+    from hearthlog.analyzer.evaluation.event_scores import compare_labellings
     from hearthlog.analyzer.review.queue.review_list import disagreements
 
     difference = compare_labellings(*sides)

@@ -9,13 +9,13 @@ from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 from hearthlog.tools.cli.text import moment
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.difference import Amounts, Difference
+    from hearthlog.analyzer.evaluation.event_scores import Amounts, LabellingDifference
     from hearthlog.analyzer.review.queue.ranking import ReviewQueue
 
 _AMOUNTS = "minutes a", "minutes b", "both", "events a", "events b", "agreement", "kappa"
 
 
-def print_difference(difference: "Difference", spans: int) -> None:
+def print_difference(difference: "LabellingDifference", spans: int) -> None:
     """Print agreement, amounts and confusion, and where the longest disagreements are."""
     a, b, days = difference.a, difference.b, list(difference.days)
     span = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
@@ -56,7 +56,7 @@ def _amounts(title: str, amounts: "Amounts") -> Iterator[tuple[str, ...]]:
         yield f"  {shortened(name, NAME_WIDTH - 2)}", *minutes, *events, "", ""
 
 
-def _print_disagreements(difference: "Difference", spans: int) -> None:
+def _print_disagreements(difference: "LabellingDifference", spans: int) -> None:
     count = len(difference.disagreements.starts)
     if not count:
         print("they never disagree")

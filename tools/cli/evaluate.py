@@ -38,10 +38,10 @@ from hearthlog.tools.cli.text import (
 )
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
-    from hearthlog.analyzer.evaluation.evaluate_model import ModelEvaluation
+    from hearthlog.analyzer.evaluation.method_scores import CrossValidation
+    from hearthlog.analyzer.evaluation.model_scores import ModelEvaluation
     from hearthlog.analyzer.training.dataset import Dataset
-    from hearthlog.analyzer.training.manifest import LeftOut
+    from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
     from hearthlog.schemas.errors import Progress
@@ -109,7 +109,7 @@ def evaluate_log(
     from hearthlog.analyzer.extras import require
 
     require("scipy", "matplotlib")
-    from hearthlog.analyzer.evaluation.evaluate_log import (
+    from hearthlog.analyzer.evaluation.log_scores import (
         evaluate_labelling,
         read_labelling,
         read_reference,
@@ -166,9 +166,8 @@ def evaluate_model(
     from hearthlog.analyzer.extras import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
-    from hearthlog.analyzer.evaluation import evaluate_model as evaluation
-    from hearthlog.analyzer.training.manifest import left_out_lines
-    from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+    from hearthlog.analyzer.evaluation import model_scores as evaluation
+    from hearthlog.analyzer.training.manifest import left_out_lines, load_scenario, scenario_of
     from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile.modelfile import load_model
 
@@ -177,7 +176,7 @@ def evaluate_model(
     seconds = feature_set(loaded.description.feature_set).window_seconds
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     evaluation.check_classes(loaded, classes)
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     clips = labelled_clips([data], classes.labels, left_out)
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         result = evaluation.evaluate_model(loaded, clips, classes, report)
@@ -225,7 +224,7 @@ def evaluate_method(
     from hearthlog.analyzer.extras import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
-    from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method as cross_validate
+    from hearthlog.analyzer.evaluation.method_scores import evaluate_method as cross_validate
 
     check_output("--plot", plot, ".png", "a picture")
     with learning(method, data, scenario, scheduler) as (chosen, segments, progress):
@@ -257,14 +256,14 @@ def learning(
 ) -> "Iterator[tuple[Method, Dataset, Progress]]":
     """Cut the clips into segments; what learns from them in the block runs on the cluster."""
     from hearthlog.analyzer.training.dataset import build_dataset
-    from hearthlog.analyzer.training.installed import clip_embedder
-    from hearthlog.analyzer.training.scenario import load_scenario
+    from hearthlog.analyzer.training.manifest import load_scenario
+    from hearthlog.analyzer.training.train import clip_embedder
     from hearthlog.analyzer.workers.parallel import fits_on
 
     method = chosen_method(name)
     with fits_on(scheduler):
         classes = load_scenario(scenario)
-        left_out: list[LeftOut] = []
+        left_out: list[SkippedClip] = []
         clips = labelled_clips([data], classes.labels, left_out)
         classes = classes.with_unknown((clip.label, clip.source_group) for clip in clips)
         with share_done(f"listening to {len(clips)} clips", announce=True) as progress:
@@ -281,7 +280,7 @@ def learning(
             yield method, segments, progress
 
 
-def end_with_left_out(left_out: "Sequence[LeftOut]") -> None:
+def end_with_left_out(left_out: "Sequence[SkippedClip]") -> None:
     """Tell which clips were left out, and end with exit status 3 if any was."""
     from hearthlog.analyzer.training.manifest import left_out_lines
 
@@ -304,7 +303,7 @@ def _unknown_text(seconds_of: Any) -> str:
 
 
 def _save_plot(path: Path | None, title: str, scores: "Scores", bins: "Sequence[Bin]" = ()) -> None:
-    from hearthlog.analyzer.evaluation.plot import save_plot
+    from hearthlog.analyzer.evaluation.plots import save_plot
 
     if path is not None:
         save_plot(path, title, scores, bins)

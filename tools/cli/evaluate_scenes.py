@@ -25,8 +25,7 @@ from hearthlog.tools.cli.scores import (
 from hearthlog.tools.cli.text import end_with_warnings, number, print_json
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
-    from hearthlog.analyzer.training.scenario import Scenario
+    from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip
     from hearthlog.models.classifiers.model import Model
 
 ModelFile = Annotated[Path, typer.Argument(help="Model file.")]
@@ -58,7 +57,7 @@ def scenes(
     from hearthlog.analyzer.extras import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
-    from hearthlog.analyzer.evaluation.evaluate_scenes import (
+    from hearthlog.analyzer.evaluation.scenes import (
         SceneOptions,
         alarms_per_hour,
         evaluate_scenes,
@@ -72,7 +71,7 @@ def scenes(
         found = evaluate_scenes(model, loaded, clips, classes, options, report)
     where = f"{colour} noise at {floor:g} dBFS"
     if plot is not None:
-        from hearthlog.analyzer.evaluation.plot_scenes import save_scenes
+        from hearthlog.analyzer.evaluation.plots import save_scenes
 
         save_scenes(plot, f"{loaded.name} on scenes of {data} over {where}", found)
     if as_json:
@@ -125,12 +124,12 @@ def learned_lines(learned: int, sources: int) -> list[str]:
 
 def read_model_and_clips(
     model: Path, data: Path, scenario: str | None
-) -> "tuple[Model, list[LabelledClip], Scenario, list[LeftOut]]":
+) -> "tuple[Model, list[LabelledClip], Scenario, list[SkippedClip]]":
     """Read a model, its scenario unless another one is named, and clips; some are of no use."""
-    from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+    from hearthlog.analyzer.training.manifest import load_scenario, scenario_of
     from hearthlog.models.modelfile.modelfile import load_model
 
     loaded = load_model(starter_here(model))
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     return loaded, labelled_clips([data], classes.labels, left_out), classes, left_out

@@ -13,7 +13,7 @@ from hearthlog.tools.cli.text import end_with_warnings, number, print_lines, tel
 if TYPE_CHECKING:
     from collections import Counter
 
-    from hearthlog.analyzer.collections.make_manifest import Summary
+    from hearthlog.analyzer.collections.manifest_writer import ManifestSummary
 
 _SHOWN = 12
 
@@ -48,9 +48,8 @@ def manifest(
 
     Exit status 3: some audio files of the collection are not there.
     """
-    from hearthlog.analyzer.collections.installed import FOLDER, NAMES, find_collection
-    from hearthlog.analyzer.collections.label_map import shipped_map
-    from hearthlog.analyzer.collections.make_manifest import make_manifest
+    from hearthlog.analyzer.collections.manifest_writer import make_manifest, shipped_map
+    from hearthlog.analyzer.collections.readers import FOLDER, NAMES, find_collection
 
     chosen = find_collection(collection)
     if chosen is None:
@@ -79,7 +78,7 @@ def manifest(
         end_with_warnings([f"{folder}: {lost}; left out"])
 
 
-def _print(made: "Summary") -> None:
+def _print(made: "ManifestSummary") -> None:
     rows = [
         (label, f"{count:,}", f"{len(made.groups[label]):,}")
         for label, count in sorted(made.clips.items())

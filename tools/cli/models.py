@@ -22,10 +22,9 @@ from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong
 from hearthlog.tools.cli.verdict import print_verdict, refusal
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.compare_models import Comparison
+    from hearthlog.analyzer.evaluation.model_scores import Comparison
     from hearthlog.analyzer.training.dataset import Recording
-    from hearthlog.analyzer.training.manifest import LeftOut
-    from hearthlog.analyzer.training.scenario import Scenario
+    from hearthlog.analyzer.training.manifest import Scenario, SkippedClip
     from hearthlog.models.classifiers.model import Model
     from hearthlog.models.modelfile.registry import ModelEntry
 
@@ -113,9 +112,8 @@ def compare(
     some clips cannot be read. Of logs it is also said how much of a day each model gives to each
     class.
     """
-    from hearthlog.analyzer.evaluation.compare_models import check_features, compare_models
-    from hearthlog.analyzer.training.manifest import left_out_lines
-    from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+    from hearthlog.analyzer.evaluation.model_scores import check_features, compare_models
+    from hearthlog.analyzer.training.manifest import left_out_lines, load_scenario, scenario_of
 
     if live:
         if data or scenario or (a, b) != ("champion", "candidate"):
@@ -128,7 +126,7 @@ def compare(
     first, second = _named(place, a), _named(place, b)
     check_features(first, second)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     heard = next((one for one in (first, second) if one.description.embedding), first)
     recordings = _recordings(data, logs, chosen, heard, left_out)
     if logs is not None and not recordings:
@@ -210,7 +208,7 @@ def rollback(folder: _Folder = None) -> None:
 
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
     """End with a line if a model was judged to do harm; judge it first if it was not."""
-    from hearthlog.analyzer.gate.judge import judge, judged_against
+    from hearthlog.analyzer.gate.promotion_check import judge, judged_against
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
@@ -271,7 +269,7 @@ def _check_beside_champion(folder: Path, name: str) -> None:
 
 
 def _compare_live(logs: Path, *, as_json: bool) -> None:
-    from hearthlog.analyzer.gate.on_trial import compare_on_trial
+    from hearthlog.analyzer.gate.comparison import compare_on_trial
     from hearthlog.tools.cli.trial import print_trial, trial_as_json
 
     trial = compare_on_trial([logs])
@@ -293,12 +291,12 @@ def _recordings(
     logs: Path | None,
     scenario: "Scenario",
     model: "Model",
-    left_out: "list[LeftOut]",
+    left_out: "list[SkippedClip]",
 ) -> "list[Recording]":
-    from hearthlog.analyzer.training.clip_embeddings import model_embedder
+    from hearthlog.analyzer.training.clips import model_embedder
     from hearthlog.analyzer.training.dataset import UNREADABLE, clip_recordings
-    from hearthlog.analyzer.training.home_data import home_recordings
-    from hearthlog.analyzer.training.manifest import LeftOut
+    from hearthlog.analyzer.training.home_recordings import home_recordings
+    from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.models.features.installed import feature_set
     from hearthlog.tools.cli.progress import share_done
 
@@ -311,7 +309,7 @@ def _recordings(
         recordings = list(
             clip_recordings(clips, scenario, report, features, embedder=model_embedder(model))
         )
-    left_out += [LeftOut(UNREADABLE, each.fault) for each in recordings if each.fault]
+    left_out += [SkippedClip(UNREADABLE, each.fault) for each in recordings if each.fault]
     return recordings
 
 
@@ -342,8 +340,8 @@ def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
 
 def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
     """Return how many minutes of a mean day each model gives to each class, where that is seen."""
-    from hearthlog.analyzer.gate.changes import time_words
-    from hearthlog.analyzer.gate.evidence import gather_evidence
+    from hearthlog.analyzer.gate.comparison import gather_evidence
+    from hearthlog.analyzer.gate.paired_labels import time_words
     from hearthlog.analyzer.gate.recent_time import recent_logs
     from hearthlog.tools.cli.progress import share_done
 

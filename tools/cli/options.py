@@ -12,7 +12,7 @@ from hearthlog.tools.cli.text import wrong_use
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
-    from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut
+    from hearthlog.analyzer.training.manifest import LabelledClip, SkippedClip
     from hearthlog.analyzer.training.method import Method
 
 _LAST = (1 << 63) - 1  # log time
@@ -165,7 +165,7 @@ def manifest_path(path: Path) -> Path:
 
 
 def labelled_clips(
-    data: "Sequence[Path]", labels: "Collection[str]", left_out: "list[LeftOut]"
+    data: "Sequence[Path]", labels: "Collection[str]", left_out: "list[SkippedClip]"
 ) -> "list[LabelledClip]":
     """Read manifests, or the folders of them; take what is of no use in them apart."""
     from hearthlog.analyzer.training.manifest import read_manifest
@@ -272,7 +272,7 @@ def scenario_files(given: list[str] | None) -> dict[str, Path]:
 def chosen_method(name: str | None, **parameters: float | None) -> "Method":
     """Return a way to learn, with other parameters where they are given; by default the best."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.training.installed import method_named
+    from hearthlog.analyzer.training.train import method_named
 
     chosen = {key: value for key, value in parameters.items() if value is not None}
     for key, value in chosen.items():
@@ -287,7 +287,7 @@ def chosen_method(name: str | None, **parameters: float | None) -> "Method":
 
 def _best_method() -> "Method":
     """Return the default way to learn; a home whose recorder wants no network needs none."""
-    from hearthlog.analyzer.training.installed import DEFAULT, default_method
+    from hearthlog.analyzer.training.train import DEFAULT, default_method
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
 

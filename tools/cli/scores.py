@@ -7,8 +7,8 @@ from hearthlog.schemas.errors import shortened
 from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.evaluate_scenes import SceneScores, SingleCoughs
     from hearthlog.analyzer.evaluation.event_scores import Detections
+    from hearthlog.analyzer.evaluation.scenes import SceneScores, SingleCoughs
     from hearthlog.analyzer.training.scores import Bin, Interval, Scores
 
 _CLASS = ("class", "support", "precision", "recall", "F1", "95 %")

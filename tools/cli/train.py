@@ -28,9 +28,9 @@ from hearthlog.tools.cli.text import tell, wrong_use
 from hearthlog.tools.cli.verdict import print_verdict, refusal
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.gate.judge import Verdict
+    from hearthlog.analyzer.gate.promotion_check import Verdict
     from hearthlog.analyzer.training.dataset import Dataset
-    from hearthlog.analyzer.training.manifest import LeftOut
+    from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.analyzer.training.method import Method
     from hearthlog.models.classifiers.model import Amount, Model
 
@@ -97,7 +97,7 @@ def train(
     from hearthlog.schemas.messages.topics import check_scenario_name
 
     require("sklearn", "scipy", "joblib")
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     speakers = scenario == _SPEAKERS
     if speakers or data:
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
@@ -118,7 +118,7 @@ def train(
         model, segments = _adapted(base, home, scenario or "")
     else:
         assert scenario is not None
-        from hearthlog.analyzer.training.installed import DEFAULT
+        from hearthlog.analyzer.training.train import DEFAULT
         from hearthlog.analyzer.workers.parallel import fits_on
 
         if speakers and method is None:
@@ -155,7 +155,7 @@ def _print_json(
     output: Path,
     segments: "Dataset",
     verdict: "Verdict | None",
-    left_out: "Sequence[LeftOut]",
+    left_out: "Sequence[SkippedClip]",
 ) -> None:
     result: dict[str, Any] = {
         "model": str(output),
@@ -170,7 +170,7 @@ def _print_json(
 
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
-    from hearthlog.analyzer.gate.judge import judge
+    from hearthlog.analyzer.gate.promotion_check import judge
     from hearthlog.models.errors import ModelError
 
     try:
@@ -237,13 +237,12 @@ def _learned(
     home: list[Path],
     method: "Method",
     smoothing: str,
-    left_out: "list[LeftOut]",
+    left_out: "list[SkippedClip]",
 ) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import build_dataset
-    from hearthlog.analyzer.training.home_data import lesson_recordings
-    from hearthlog.analyzer.training.installed import clip_embedder
-    from hearthlog.analyzer.training.scenario import load_scenario
-    from hearthlog.analyzer.training.train import train_model
+    from hearthlog.analyzer.training.home_recordings import lesson_recordings
+    from hearthlog.analyzer.training.manifest import load_scenario
+    from hearthlog.analyzer.training.train import clip_embedder, train_model
     from hearthlog.models.classes import UNKNOWN
 
     _check_smoothing(smoothing)
@@ -297,7 +296,7 @@ def _check_use(
         wrong_use("--data goes with --scenario and --output, and without --base")
 
 
-def _tell_left_out(left_out: "Sequence[LeftOut]") -> None:
+def _tell_left_out(left_out: "Sequence[SkippedClip]") -> None:
     from hearthlog.analyzer.training.manifest import left_out_lines
 
     for line in left_out_lines(left_out):
@@ -316,7 +315,7 @@ def _learned_voices(
     home: list[Path],
     method: "Method",
     smoothing: str,
-    left_out: "list[LeftOut]",
+    left_out: "list[SkippedClip]",
 ) -> tuple["Model", "Dataset"]:
     """Learn who of those that are enrolled speaks."""
     from hearthlog.analyzer.discover.enrolled_voices import check_voices
@@ -353,9 +352,8 @@ def _learned_voices(
 
 def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.training.adapt import adapt_model
-    from hearthlog.analyzer.training.home_landmarks import is_moved
-    from hearthlog.analyzer.training.home_lessons import home_lessons
+    from hearthlog.analyzer.training.adaptation import adapt_model, is_moved
+    from hearthlog.analyzer.training.home_training_set import home_lessons
     from hearthlog.models.modelfile.modelfile import load_model
 
     model = load_model(base)

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from hearthlog.analyzer.gate.changes import time_words
-from hearthlog.analyzer.gate.on_trial import Trial, gain_interval
+from hearthlog.analyzer.gate.comparison import Trial, gain_interval
+from hearthlog.analyzer.gate.paired_labels import time_words
 from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.changes_table import print_changes
 

@@ -10,8 +10,8 @@ from hearthlog.tools.cli.changes_table import print_changes
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.gate.evidence import Evidence, Right
-    from hearthlog.analyzer.gate.judge import Verdict
+    from hearthlog.analyzer.gate.comparison import HomeComparison, PairedAccuracy
+    from hearthlog.analyzer.gate.promotion_check import Verdict
     from hearthlog.models.modelfile.registry import Judgement
 
 _WHOLE_DAY = 0.95 * 24 * 60  # minutes
@@ -49,8 +49,8 @@ def refusal(judgement: "Judgement", name: str) -> str:
     )
 
 
-def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
-    from hearthlog.analyzer.gate.changes import time_words
+def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> None:
+    from hearthlog.analyzer.gate.paired_labels import time_words
 
     changes = evidence.changes
     much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")
@@ -65,7 +65,7 @@ def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
     print_changes(changes, champion, model)
 
 
-def _print_right(what: str, right: "Right", verdict: "Verdict") -> None:
+def _print_right(what: str, right: "PairedAccuracy", verdict: "Verdict") -> None:
     if right.sounds:
         print(
             f"of {right.sounds} {what} {verdict.model} is right about {right.after}, "

@@ -15,12 +15,12 @@ from joblib import delayed
 from sklearn.metrics import f1_score
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.confirmed import MOST_CONFIRMED
+from hearthlog.analyzer.training.adaptation import HomeLandmarks
 from hearthlog.analyzer.training.dataset import Dataset, spread
-from hearthlog.analyzer.training.home_data import HOME_WEIGHT
-from hearthlog.analyzer.training.home_landmarks import HomeLandmarks
+from hearthlog.analyzer.training.home_recordings import HOME_WEIGHT
 from hearthlog.analyzer.training.landmark_method import LandmarkMethod
 from hearthlog.analyzer.training.method import Examples, Method, prepare
+from hearthlog.analyzer.training.pseudo_labels import MOST_CONFIRMED
 from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64, Indices

@@ -29,16 +29,18 @@ from numpy.typing import NDArray
 from sklearn.model_selection import StratifiedGroupKFold
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.calibration import collection_folds, nested_probabilities
-from hearthlog.analyzer.training.cross_validation import Fold, cross_validate
+from hearthlog.analyzer.training.calibration import (
+    Fold,
+    collection_folds,
+    cross_validate,
+    nested_probabilities,
+)
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
-from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.manifest import load_scenario, read_manifest
 from hearthlog.analyzer.training.method import Examples, Method, prepare
-from hearthlog.analyzer.training.scenario import load_scenario
 from hearthlog.analyzer.training.scores import Scores, calibration_error, difference, score
-from hearthlog.analyzer.training.train import MOST_FOLDS
+from hearthlog.analyzer.training.train import MOST_FOLDS, method_named
 from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.model import Description, Model

@@ -14,13 +14,13 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.count_range import strata_of
-from hearthlog.analyzer.accuracy.events import (
+from hearthlog.analyzer.accuracy.event_counts import (
     MINUTE,
     SET_APART,
     events_by_minute,
     events_of,
     sounding_minutes,
+    strata_of,
     television_minutes,
 )
 from hearthlog.analyzer.errors import DataError

@@ -19,9 +19,8 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.recorder.stream.directions import DirectionFinder, array_geometry

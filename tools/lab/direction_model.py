@@ -27,11 +27,10 @@ import typer
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.adaptation import adapt_model
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.manifest import LABELS, LabelledClip, read_manifest
 from hearthlog.models.classes import COUGHING, MUSIC, SILENCE, SPEECH
 from hearthlog.models.classifiers.evidence import SECTORS
 from hearthlog.models.classifiers.model import FORMAT, Model

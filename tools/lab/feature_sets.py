@@ -17,11 +17,15 @@ import numpy as np
 import soundfile
 import typer
 
-from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation, evaluate_method
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.evaluation.method_scores import CrossValidation, evaluate_method
+from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import Scenario, load_scenario
+from hearthlog.analyzer.training.manifest import (
+    LabelledClip,
+    Scenario,
+    load_scenario,
+    read_manifest,
+)
 from hearthlog.analyzer.training.svm_method import SvmMethod
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.features.feature_set import FeatureSet

@@ -18,7 +18,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.gate.judge import Verdict, judge
+from hearthlog.analyzer.gate.paired_labels import TwoModels, joined_frames
+from hearthlog.analyzer.gate.promotion_check import Verdict, judge
 from hearthlog.analyzer.gate.recent_time import (
     RecentLog,
     choose,
@@ -26,12 +27,11 @@ from hearthlog.analyzer.gate.recent_time import (
     sounding_time,
     unlearned_time,
 )
-from hearthlog.analyzer.gate.two_models import TwoModels, joined_frames
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.home_lessons import home_lessons
+from hearthlog.analyzer.training.adaptation import adapt_model
+from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model

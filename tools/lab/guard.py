@@ -16,10 +16,8 @@ import typer
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.scenes import background
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import SIZE_LIMIT, LabelledClip, read_manifest
-from hearthlog.analyzer.training.rooms import reverberated
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames, reverberated
+from hearthlog.analyzer.training.manifest import LABELS, SIZE_LIMIT, LabelledClip, read_manifest
 from hearthlog.models.classes import MUSIC, SILENCE, SPEECH
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder

@@ -22,7 +22,7 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.evaluation.scenes import background
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.models.embedding.networks import YAMNET, Embedder
 from hearthlog.models.embedding.projection import HOP_FRAMES, NO_EMBEDDINGS, Embeddings, Projection

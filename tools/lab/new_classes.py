@@ -18,15 +18,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.gate.judge import judge
+from hearthlog.analyzer.gate.promotion_check import judge
 from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS, scenario_of
+from hearthlog.analyzer.training.adaptation import adapt_model
+from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest, scenario_of
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file

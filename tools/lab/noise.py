@@ -14,12 +14,12 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.evaluation.evaluate_method import Kind, divide
+from hearthlog.analyzer.evaluation.method_scores import Kind, divide
+from hearthlog.analyzer.training.clips import RoomCopy
 from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
 from hearthlog.analyzer.training.landmark_method import ROOM
+from hearthlog.analyzer.training.manifest import BUILTIN, Scenario
 from hearthlog.analyzer.training.method import Learned, Method, prepare
-from hearthlog.analyzer.training.rooms import RoomCopy
-from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.training.scores import F1Difference, Scores, difference, score
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.models.features.feature_set import FeatureSet

@@ -13,10 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.rooms import level_of, other_room, steady_noise
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
+from hearthlog.analyzer.training.clips import clip_frames, level_of, other_room, steady_noise
+from hearthlog.analyzer.training.manifest import (
+    BUILTIN,
+    LABELS,
+    LabelledClip,
+    Scenario,
+    read_manifest,
+)
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_method import (
+from hearthlog.analyzer.evaluation.method_scores import (
     KINDS,
     CrossValidation,
     Kind,
@@ -23,12 +23,17 @@ from hearthlog.analyzer.evaluation.evaluate_method import (
     evaluate_method,
 )
 from hearthlog.analyzer.training.dataset import Dataset, Recording, build_dataset, clip_recordings
-from hearthlog.analyzer.training.installed import DEFAULT
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, left_out_lines
+from hearthlog.analyzer.training.manifest import (
+    BUILTIN,
+    LABELS,
+    LabelledClip,
+    Scenario,
+    SkippedClip,
+    left_out_lines,
+)
 from hearthlog.analyzer.training.method import Method
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.analyzer.training.train import check_varied
+from hearthlog.analyzer.training.train import DEFAULT, check_varied
 from hearthlog.schemas.errors import Progress, ignore_progress, shortened
 from hearthlog.tools.cli.options import Clips, Json, labelled_clips
 from hearthlog.tools.cli.progress import share_done
@@ -93,7 +98,7 @@ class Reproduction:
         By method and by what is never on both sides of a fold.
     skipped : mapping of str to int
         Number of clips that gave no segment, by the reason.
-    left_out : sequence of LeftOut
+    left_out : sequence of SkippedClip
         Clips that could not be read.
     """
 
@@ -104,7 +109,7 @@ class Reproduction:
     collections: int
     results: Mapping[tuple[str, Kind], CrossValidation]
     skipped: Mapping[str, int]
-    left_out: Sequence[LeftOut]
+    left_out: Sequence[SkippedClip]
 
 
 def reproduce(
@@ -220,7 +225,7 @@ def main(
     as_json: Json = False,
 ) -> None:
     """Put the figures of the paper beside those of its method and of ours, on these clips."""
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     clips = labelled_clips([data], LABELS, left_out)
     scenarios = [scenario] if scenario else list(PAPER_F1)
     with share_done(f"learning from {number(len(clips), 'clip')}", announce=True) as progress:

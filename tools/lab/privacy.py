@@ -19,9 +19,8 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import LABELS, LabelledClip, read_manifest
 from hearthlog.models.classes import SPEECH
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
 from hearthlog.models.embedding.projection import WINDOW_FRAMES

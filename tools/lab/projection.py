@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 from ai_edge_litert.interpreter import Interpreter
 
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.model import may_be_shipped
 from hearthlog.models.embedding.networks import YAMNET

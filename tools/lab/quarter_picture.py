@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from hearthlog.analyzer.evaluation.plot import new_figure, save_figure
+from hearthlog.analyzer.evaluation.plots import new_figure, save_figure
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file

@@ -23,10 +23,9 @@ from hearthlog.analyzer.logs.spans import NONE, rows_at
 from hearthlog.analyzer.review.queue.judgeable_spans import judgeable_spans
 from hearthlog.analyzer.review.queue.ranking import USEFUL, make_queue
 from hearthlog.analyzer.review.session.session import ReviewItem
-from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import BUILTIN
+from hearthlog.analyzer.training.adaptation import adapt_model
+from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.manifest import BUILTIN, LabelledClip, read_manifest
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model

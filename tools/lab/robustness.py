@@ -13,23 +13,32 @@ import numpy as np
 from joblib import delayed
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_model import fitted, segment_probabilities
-from hearthlog.analyzer.evaluation.plot import new_figure, plot_names, save_figure
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
-from hearthlog.analyzer.training.learned_segments import learned_groups
-from hearthlog.analyzer.training.manifest import LabelledClip, LeftOut, example_of, left_out_lines
-from hearthlog.analyzer.training.rooms import (
+from hearthlog.analyzer.evaluation.model_scores import fitted, segment_probabilities
+from hearthlog.analyzer.evaluation.plots import new_figure, plot_names, save_figure
+from hearthlog.analyzer.training.clips import (
     RoomCopy,
     band_limits,
     captured,
+    clip_frames,
     filtered,
     in_noise,
     level_of,
     octaves_of,
     reverberated,
 )
-from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.dataset import (
+    Recording,
+    clip_recordings,
+    cut_recordings,
+    learned_groups,
+)
+from hearthlog.analyzer.training.manifest import (
+    LabelledClip,
+    Scenario,
+    SkippedClip,
+    example_of,
+    left_out_lines,
+)
 from hearthlog.analyzer.training.scores import F1Difference, Scores, difference, score
 from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classes import SILENCE, class_name
@@ -137,7 +146,7 @@ class Robustness:
         Why clips gave no segment, and how many.
     sources_learned : int
         Sources of which the model has learned from a segment.
-    left_out : sequence of LeftOut
+    left_out : sequence of SkippedClip
         Clips that could not be read, which `skipped` counts too.
     """
 
@@ -145,7 +154,7 @@ class Robustness:
     changed: Mapping[str, Changed]
     skipped: Mapping[str, int]
     sources_learned: int
-    left_out: Sequence[LeftOut]
+    left_out: Sequence[SkippedClip]
 
 
 def robustness(
@@ -185,7 +194,7 @@ def robustness(
     group_numbers: list[Indices] = []
     predictions: list[Indices] = []
     skipped: Counter[str] = Counter()
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     batches = list(_batches(clips))
     results = in_parallel(delayed(_judge)(one, model, scenario, conditions) for one in batches)
     for batch, judged in zip(batches, results, strict=True):
@@ -228,7 +237,7 @@ class _Judged(NamedTuple):
     predicted: Indices  # shape (1 + conditions, n)
     skipped: Mapping[str, int]
     sources_learned: int
-    left_out: Sequence[LeftOut]
+    left_out: Sequence[SkippedClip]
 
 
 def _batches(clips: Sequence[LabelledClip]) -> Iterator[list[tuple[int, LabelledClip]]]:

@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.routine.compare import (
+from hearthlog.analyzer.routine.day_anomaly import (
     DAYS,
     FEWEST,
     SPAN,

@@ -13,7 +13,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, joined, without
-from hearthlog.analyzer.routine.day_profile import HomeSound
+from hearthlog.analyzer.routine.day_profile import HomeSegments
 from hearthlog.models.classes import (
     COUGHING,
     FLUSHING_WATER,
@@ -266,7 +266,7 @@ def gaps(days: int, rng: Rng) -> Spans:
 
 def heard(
     sounds: Sounds, days: tuple[int, int], hearing: Hearing, missing: Spans, rng: Rng
-) -> HomeSound:
+) -> HomeSegments:
     """Label the sounds of some days.
 
     Parameters
@@ -298,7 +298,7 @@ def heard(
         for name in ("starts", "ends", "labels")
     )
     order = np.argsort(starts, kind="stable")
-    return HomeSound(Labelling(starts[order], ends[order], labels[order]), listened)
+    return HomeSegments(Labelling(starts[order], ends[order], labels[order]), listened)
 
 
 def _labelled(name: str, spans: Spans) -> Labelling:

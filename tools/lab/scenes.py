@@ -16,11 +16,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.evaluation.evaluate_log import LogEvaluation, evaluate_labelling
+from hearthlog.analyzer.evaluation.log_scores import LogEvaluation, evaluate_labelling
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
+from hearthlog.analyzer.training.clips import clip_frames
+from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, LabelledClip, read_manifest
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder

@@ -21,9 +21,8 @@ from hearthlog.analyzer.discover.enrolled_voices import is_of_two
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.training.dataset import cut_recordings
-from hearthlog.analyzer.training.installed import DEFAULT
 from hearthlog.analyzer.training.speakers import others_of, speaker_recordings, speakers_scenario
-from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.train import DEFAULT, train_model
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.starter import GENERAL, starter_file

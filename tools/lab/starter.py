@@ -20,16 +20,20 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import soundfile
 
-from hearthlog.analyzer.training.clip_sound import clip_frames
+from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.dataset import Dataset, clip_recordings, cut_recordings
-from hearthlog.analyzer.training.installed import clip_embedder
+from hearthlog.analyzer.training.heads import head_inputs_of
 from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, LandmarkMethod
 from hearthlog.analyzer.training.learned_inputs import kept_inputs
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
+from hearthlog.analyzer.training.manifest import (
+    BUILTIN,
+    LABELS,
+    LabelledClip,
+    Scenario,
+    read_manifest,
+)
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.mixture import head_inputs_of
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
-from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.train import clip_embedder, train_model
 from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING, SILENCE
 from hearthlog.models.classifiers.evidence import UNTAUGHT
 from hearthlog.models.classifiers.model import SIMULATED, Model, may_be_shipped

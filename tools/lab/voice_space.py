@@ -14,10 +14,8 @@ from safetensors.numpy import save_file
 from scipy.linalg import eigh
 
 from hearthlog.analyzer.discover.voice_space import VoiceSpace, describe_speech
-from hearthlog.analyzer.training.clip_sound import clip_frames
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.rooms import in_room
-from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.analyzer.training.clips import clip_frames, in_room
+from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.tools.lab.command import run

@@ -12,7 +12,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     unknown_microphone,
 )
 from hearthlog.analyzer.report.baseline import FEWEST as FEWEST_USUAL
-from hearthlog.analyzer.routine.compare import FEWEST as FEWEST_ROUTINE
+from hearthlog.analyzer.routine.day_anomaly import FEWEST as FEWEST_ROUTINE
 from hearthlog.recorder.config import Settings
 
 _JUDGED_AND_TODAY = 2  # days, besides those that a day is compared with

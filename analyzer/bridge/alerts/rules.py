@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_duration
 from hearthlog.analyzer.bridge.listeners import microphone_of_listener
-from hearthlog.analyzer.routine.compare import LONGEST
+from hearthlog.analyzer.routine.day_anomaly import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.models.classifiers.names import AUDIOSET
 from hearthlog.models.embedding.sound_names import audioset_names

@@ -12,8 +12,8 @@ from hearthlog.analyzer.bridge.listeners import is_of_scenario
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.report.class_words import short_day
 from hearthlog.analyzer.report.routine_text import differences_text, rarity_text
-from hearthlog.analyzer.routine.compare import Routines
-from hearthlog.analyzer.routine.day_profile import HomeSound, Profiles
+from hearthlog.analyzer.routine.day_anomaly import Routines
+from hearthlog.analyzer.routine.day_profile import HomeSegments, Profiles
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 
@@ -43,7 +43,7 @@ def unusual_alarms(
     return alarms
 
 
-def home_sound(heard: HomeHeard) -> HomeSound:
+def home_sound(heard: HomeHeard) -> HomeSegments:
     """Return what routines are learned from."""
     coverage = heard.listened(ANY_SOUND, "")
     parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
@@ -55,7 +55,7 @@ def home_sound(heard: HomeHeard) -> HomeSound:
     order = np.argsort(starts, kind="stable")
     of_home = [own for name, own in heard.classes.items() if not is_of_scenario(name)]
     known = dict.fromkeys(sorted(set(heard.sounds).union(*of_home)))
-    return HomeSound(
+    return HomeSegments(
         Labelling(starts[order], ends[order], labels[order]),
         {name: heard.listened(name, "") for name in known},
     )

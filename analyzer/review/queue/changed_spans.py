@@ -6,8 +6,8 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, events_of
-from hearthlog.analyzer.gate.changed_time import ChangedTime, find_changed_time
-from hearthlog.analyzer.gate.judge import find_champion, other_features
+from hearthlog.analyzer.gate.paired_labels import ChangedTime, find_changed_time
+from hearthlog.analyzer.gate.promotion_check import find_champion, other_features
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import overlay

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.difference import DAY
-from hearthlog.analyzer.evaluation.event_scores import events_of
+from hearthlog.analyzer.evaluation.event_scores import DAY, events_of
 from hearthlog.analyzer.logs.labelling import LABEL_FIELDS, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import Spans, pieces
 from hearthlog.analyzer.review.queue.coverage import cover, sample

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.difference import Difference
+from hearthlog.analyzer.evaluation.event_scores import LabellingDifference
 from hearthlog.analyzer.logs.labelling import NamedLabelling
 from hearthlog.analyzer.logs.spans import Spans, one, pieces
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
@@ -64,7 +64,7 @@ class ReviewSpan(NamedTuple):
         return self._asdict() | {"start": time_text(self.start), "end": time_text(self.end)}
 
 
-def disagreements(difference: Difference, microphone: str) -> list[ReviewSpan]:
+def disagreements(difference: LabellingDifference, microphone: str) -> list[ReviewSpan]:
     """List where two labellings differ.
 
     Returns

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.gate.changes import A_DAY, class_words, time_words
+from hearthlog.analyzer.gate.paired_labels import A_DAY, class_words, time_words
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, joined
 from hearthlog.analyzer.marks.marks import RANDOM

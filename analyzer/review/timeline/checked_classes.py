@@ -2,8 +2,11 @@
 
 from collections.abc import Mapping
 
-from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, checked_minutes
-from hearthlog.analyzer.accuracy.reviewed_labels import read_reviewed_labels
+from hearthlog.analyzer.accuracy.checked_minutes import (
+    ClassCheck,
+    checked_minutes,
+    read_reviewed_labels,
+)
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.timeline.model import Timeline

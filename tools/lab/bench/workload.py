@@ -10,8 +10,7 @@ import numpy as np
 import soundfile
 
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
-from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
+from hearthlog.analyzer.training.manifest import BUILTIN, Scenario, read_manifest
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import save_model

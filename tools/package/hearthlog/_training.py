@@ -3,13 +3,22 @@
 import warnings
 from pathlib import Path
 
-from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
-from hearthlog.analyzer.training.clip_embeddings import model_embedder
+from hearthlog.analyzer.evaluation.model_scores import Comparison, compare_models
+from hearthlog.analyzer.training.clips import model_embedder
 from hearthlog.analyzer.training.dataset import UNREADABLE, build_dataset, clip_recordings
-from hearthlog.analyzer.training.installed import clip_embedder, default_method, method_named
-from hearthlog.analyzer.training.manifest import LeftOut, left_out_lines, read_manifest
-from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
-from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.manifest import (
+    SkippedClip,
+    left_out_lines,
+    load_scenario,
+    read_manifest,
+    scenario_of,
+)
+from hearthlog.analyzer.training.train import (
+    clip_embedder,
+    default_method,
+    method_named,
+    train_model,
+)
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import ignore_progress
@@ -60,7 +69,7 @@ def train(
     """
     chosen = load_scenario(scenario)
     way = default_method() if method is None else method_named(method)
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     clips = read_manifest(Path(manifest), chosen.labels, left_out)
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
     data = build_dataset(
@@ -108,12 +117,12 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
     False
     """
     scenario = scenario_of(a)
-    left_out: list[LeftOut] = []
+    left_out: list[SkippedClip] = []
     clips = read_manifest(Path(manifest), scenario.labels, left_out)
     features = feature_set(a.description.feature_set)
     heard = model_embedder(a) or model_embedder(b)
     recordings = list(clip_recordings(clips, scenario, ignore_progress, features, embedder=heard))
-    left_out += [LeftOut(UNREADABLE, each.fault) for each in recordings if each.fault]
+    left_out += [SkippedClip(UNREADABLE, each.fault) for each in recordings if each.fault]
     for line in left_out_lines(left_out):
         warnings.warn(line, stacklevel=2)
     return compare_models(a, b, recordings, scenario)

@@ -1,0 +1,264 @@
+"""Events in labels, and the range of their true count from checked minutes."""
+
+from dataclasses import dataclass
+from math import exp, lgamma, log, log1p
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import Spans, joined, lengths
+from hearthlog.models.classes import COUGHING, CRYING, LAUGHING, SILENCE, YELLING
+from hearthlog.schemas.arrays import Bool, Float64, Int64
+from hearthlog.schemas.frames import NANOSECONDS
+
+MINUTE = 60 * NANOSECONDS
+SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which a television has, too
+AROUND = 10  # minutes before and after one, in which a television would be heard
+_PAUSE = 10 * NANOSECONDS
+_ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # a person who cries for long is no television
+_SHARE = 0.1  # of the time
+_CHANGES = 2  # in a minute
+
+
+def events_of(labels: Labelling, name: str) -> Spans:
+    """Return the events of a class: its spans, joined across pauses of at most ten seconds."""
+    own = labels.labels == name
+    return joined(labels.starts[own], labels.ends[own], _PAUSE)
+
+
+def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
+    """Tell in which minutes there is anything but silence.
+
+    Parameters
+    ----------
+    edges : np.ndarray [shape=(n + 1,)], int64
+        Of the minutes.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
+    loud = labels.labels != SILENCE
+    return lengths(joined(labels.starts[loud], labels.ends[loud]), edges) > 0
+
+
+def television_minutes(labels: Labelling, edges: Int64) -> Bool:
+    """Tell in which minutes something sounds like a television, a radio or company.
+
+    That is where, in the ten minutes before and after, two sounds a minute begin, and where those
+    that are neither coughing nor crying nor shouting fill a tenth of the time. Which ones they are
+    does not matter, for a model may take a television for anything.
+
+    Parameters
+    ----------
+    edges : np.ndarray [shape=(n + 1,)], int64
+        Of successive minutes.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
+    others = ~np.isin(labels.labels, _ALONE)
+    filled = lengths(joined(labels.starts[others], labels.ends[others]), edges)
+    begun = np.diff(np.searchsorted(labels.starts[labels.labels != SILENCE], edges))
+    minutes = 2 * AROUND + 1
+    much = _around(filled) > _SHARE * minutes * MINUTE
+    television: Bool = much & (_around(begun) > _CHANGES * minutes)
+    return television
+
+
+def _around(amounts: Int64) -> Int64:
+    """Sum up the amounts of each minute and of those around it."""
+    return np.convolve(amounts, np.ones(2 * AROUND + 1, np.int64))[AROUND : AROUND + len(amounts)]
+
+
+def events_by_minute(events: Spans, edges: Int64) -> Int64:
+    """Count the events that begin in each minute.
+
+    Parameters
+    ----------
+    edges : np.ndarray [shape=(n + 1,)], int64
+        Of the minutes.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], int64
+    """
+    places = np.searchsorted(events.starts, edges)
+    return np.diff(places)
+
+
+def overlapping(events: Spans, others: Spans) -> Bool:
+    """Tell which events have a part in common with one of others.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
+    after = np.searchsorted(others.ends, events.starts, side="right")
+    begins = np.append(others.starts, np.iinfo(np.int64).max)[after]
+    overlaps: Bool = begins < events.ends
+    return overlaps
+
+
+FEWEST = 5  # minutes
+_DRAWS = 2000
+_SEED = 20_261_123
+_ENDS = (5.0, 95.0)  # percentiles: nine times in ten the count is between them
+# Events, and minutes or labelled events, that are added to what was checked, so that few minutes
+# promise little.
+_MISSED_IN_QUIET = (0.5, 60.0)  # of all classes together
+_MISSED_IN_SOUND = (1.0, 5.0)  # of all classes together
+_RIGHT, _WRONG = 0.3, 0.7
+_PRECISION = 1e-15  # of a share of a beta distribution
+
+
+class Strata(NamedTuple):
+    """What labels say of a class, in minutes of two kinds.
+
+    Attributes
+    ----------
+    quiet, sounding : int
+        Minutes in which nothing sounds, and in which anything does.
+    """
+
+    quiet: int = 0
+    sounding: int = 0
+    labelled: int = 0
+
+    def plus(self, other: Self) -> "Strata":
+        """Return the sums."""
+        return Strata(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+NO_MINUTES = Strata()
+
+
+def strata_of(labelled: Int64, sounding: Bool) -> Strata:
+    """Count minutes of both kinds, and the events in them.
+
+    Parameters
+    ----------
+    labelled : np.ndarray [shape=(n,)], int64
+        Labelled events of a class.
+    sounding : np.ndarray [shape=(n,)], bool
+        Whether anything sounds.
+    """
+    return Strata(int((~sounding).sum()), int(sounding.sum()), int(labelled.sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedRates:
+    """How many labelled events of a class are true, and how many are missed in a minute.
+
+    Attributes
+    ----------
+    right : np.ndarray [shape=(draws,)], float64
+        Share of labelled events, drawn from its distribution.
+    missed : np.ndarray [shape=(draws, 2)], float64
+        True events without a labelled one, in a quiet minute and in one that sounds.
+    """
+
+    right: Float64
+    missed: Float64
+    minutes: int
+    occurs: bool
+
+    def range_of(self, strata: Strata) -> tuple[int, int]:
+        """Return the range that the number of events lies in nine times in ten.
+
+        Parameters
+        ----------
+        strata : Strata
+            Of minutes that were not checked.
+        """
+        rng = np.random.default_rng(_SEED)
+        minutes = np.array([strata.quiet, strata.sounding], np.float64)
+        totals = rng.binomial(strata.labelled, self.right) + rng.poisson(self.missed @ minutes)
+        low, high = np.percentile(totals, _ENDS)
+        return int(np.floor(low)) if self.occurs else 0, int(np.ceil(high))
+
+
+def checked_rates(
+    labelled: Int64, true: Int64, sounding: Bool, share: float
+) -> CheckedRates | None:
+    """Draw rates of a class, given minutes that a person went through.
+
+    A hot deck with a Bayesian prior: minutes are drawn again with replacement, for events come in
+    bouts; then the share of right events is drawn from a beta distribution, and rates of missed
+    ones from gamma distributions. Of quiet and of sounding minutes each, those that were checked
+    must be drawn at random, but not the same share of both.
+
+    Parameters
+    ----------
+    labelled, true : np.ndarray [shape=(n,)], int64
+        Labelled and true events that begin in each checked minute.
+    sounding : np.ndarray [shape=(n,)], bool
+        Whether labels say that anything sounds.
+    share : float
+        Of the class among all labelled events, 0 to 1.
+
+    Returns
+    -------
+    CheckedRates or None
+        None of fewer than five minutes.
+    """
+    if len(labelled) < FEWEST:
+        return None
+    rng = np.random.default_rng(_SEED)
+    drawn = rng.integers(0, len(labelled), (_DRAWS, len(labelled)))
+    matched = np.minimum(labelled, true)
+
+    def total(counts: Int64) -> Int64:
+        sums: Int64 = counts[drawn].sum(axis=1)
+        return sums
+
+    missed = np.empty((_DRAWS, 2))
+    kinds = (~sounding, _MISSED_IN_QUIET), (sounding, _MISSED_IN_SOUND)
+    for each, (own, (events, minutes)) in enumerate(kinds):
+        unlabelled, checked = total((true - matched) * own), total(own.astype(np.int64))
+        missed[:, each] = rng.gamma(unlabelled + events * share) / (checked + minutes)
+    right = rng.beta(total(matched) + _RIGHT, total(labelled - matched) + _WRONG)
+    return CheckedRates(right, missed, len(labelled), bool(true.any()))
+
+
+def beta_quantile(a: float, b: float, share: float) -> float:
+    """Return a quantile of a beta distribution, as `scipy.special.betaincinv` does.
+
+    The recorder's machine reads how right its labels are, and has no scipy.
+
+    Parameters
+    ----------
+    a, b : float
+        Of the distribution, more than 0.
+    share : float
+        Of the distribution below the quantile, 0 to 1.
+    """
+    low, high = 0.0, 1.0
+    while low < (middle := (low + high) / 2) < high:
+        if _beta_share(a, b, middle) < share:
+            low = middle
+        else:
+            high = middle
+    return middle
+
+
+def _beta_share(a: float, b: float, x: float) -> float:
+    """Return the share of a beta distribution below x, between 0 and 1 (the continued fraction)."""
+    if x > (a + 1) / (a + b + 2):  # where it converges slowly
+        return 1 - _beta_share(b, a, 1 - x)
+    density = exp(lgamma(a + b) - lgamma(a) - lgamma(b) + a * log(x) + b * log1p(-x))
+    numerator, denominator = 1.0, 1 / (1 - (a + b) * x / (a + 1))
+    fraction, step, m = denominator, 0.0, 0
+    while abs(step - 1) > _PRECISION:
+        m += 1
+        for term in (
+            m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
+            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1)),
+        ):
+            denominator = 1 / (1 + term * denominator)
+            numerator = 1 + term / numerator
+            step = numerator * denominator
+            fraction *= step
+    return density * fraction / a

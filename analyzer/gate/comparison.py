@@ -1,0 +1,409 @@
+"""Comparison of two models in a home: over its recent time, and of a candidate on trial."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.accuracy.event_counts import beta_quantile
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.event_scores import compare_labellings
+from hearthlog.analyzer.gate.paired_labels import (
+    KnownSounds,
+    LabelChanges,
+    PairedFrames,
+    TwoModels,
+    changes_of_labellings,
+    changes_of_sample,
+    joined_frames,
+    known_sounds,
+    label_parts,
+    learned_by,
+    unlearned_sample,
+)
+from hearthlog.analyzer.gate.recent_time import (
+    KnownSound,
+    LogSpan,
+    RecentLog,
+    WeightedPart,
+    left_alone,
+    recorded_minutes,
+    reference,
+    spans_of,
+)
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
+from hearthlog.analyzer.logs.spans import Spans, joined, lengths, rows_at
+from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name, translation
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Bool, Float64, Int64
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.metadata import read_provenance
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.topics import CANDIDATE, LIVE
+
+SURE = 0.9  # probability
+_REFERENCE_SECONDS = 3_600.0
+_LEARNED_SECONDS = 900.0  # of the marks that a new class is from, and of what was left alone
+_NEAR = 60 * NANOSECONDS
+_MOST = 0.5  # of a sound
+
+
+class PairedAccuracy(NamedTuple):
+    """Known sounds, and how many of them each model gives the right label for most of their time.
+
+    Attributes
+    ----------
+    before, after : int
+        Right in the first model, in the second.
+    gained, lost : int
+        Right in the second alone, in the first alone.
+    """
+
+    sounds: int = 0
+    before: int = 0
+    after: int = 0
+    gained: int = 0
+    lost: int = 0
+
+    def plus(self, other: "PairedAccuracy") -> "PairedAccuracy":
+        """Return the sums."""
+        return PairedAccuracy(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+NOTHING_KNOWN = PairedAccuracy()
+
+
+@dataclass(frozen=True, eq=False)
+class HomeComparison:
+    """Two models on the same recent time of a home.
+
+    Attributes
+    ----------
+    recorded : float
+        Minutes that there are in all.
+    changes : LabelChanges
+        From the first model to the second, in a mean day, or in all if less than a day is recorded.
+    sure : np.ndarray [shape=(C, C)], float64
+        As `changes.minutes`, of the time in which the first model is sure.
+    random, marks : PairedAccuracy
+        Sounds of the minutes that were drawn at random; of other marks that neither has learned
+        from.
+    quiet : PairedAccuracy
+        The silences of the minutes that were drawn at random.
+    taught : frozenset of str
+        Classes that the second model has from marks of the home, and the first has not.
+    known : mapping of (str, str, str) to int
+        Known sounds, also those that were learned from, by the class that a person gives them, and
+        those of the first and of the second model; empty if the second has not learned here.
+    """
+
+    minutes: float
+    recorded: float
+    changes: LabelChanges
+    sure: Float64
+    random: PairedAccuracy
+    marks: PairedAccuracy
+    losses: list[str]
+    quiet: PairedAccuracy = NOTHING_KNOWN
+    taught: frozenset[str] = frozenset()
+    known: Mapping[tuple[str, str, str], int] = field(default_factory=dict)
+
+
+def gather_evidence(
+    before: Model,
+    after: Model,
+    logs: Sequence[RecentLog],
+    progress: Progress = ignore_progress,
+) -> HomeComparison:
+    """Run two models over a sample of the recent time of a home, and over its known sounds.
+
+    Parameters
+    ----------
+    before, after : Model
+        Of the same feature set; the second would take the place of the first.
+    progress : callable, optional
+        Is told the share of the sound that is done, 0 to 1.
+
+    Raises
+    ------
+    ModelError
+        If the feature set of the models, or a kind of classifier, is not installed.
+    """
+    losses: list[str] = []
+    known = known_sounds(logs, losses)
+    learned = learned_by(before, after, known)
+    chosen = unlearned_sample(logs, learned)
+    unlearned = [[s for s in own if s.random or not _is_in(learned, s)] for _, own in known]
+    places = _places([(log, own) for (log, _), own in zip(known, unlearned, strict=True)])
+    models = TwoModels(before, after)
+    taught = _taught(models, after)
+    count = len(chosen) + len(places)
+    of_home = any(one.segments for one in after.description.training_data.home.values())
+    if of_home:
+        rest = [
+            (log, [*left_alone(log.path), *(s for s in own if s not in new)])
+            for (log, own), new in zip(known, unlearned, strict=True)
+        ]
+        places += _places(rest, _LEARNED_SECONDS)
+    parts = [*chosen, *(WeightedPart(part, 1.0) for part, _ in places)]
+    labelled = list(label_parts(models, parts, losses, progress))
+    frames = joined_frames(labelled[: len(chosen)])
+    outcomes = [
+        list(_outcomes(sounds, own, models.classes))
+        for (_, sounds), own in zip(places, labelled[len(chosen) :], strict=True)
+    ]
+    right = [one for each in outcomes[: count - len(chosen)] for one in each]
+    return HomeComparison(
+        minutes=len(frames.stamps) * FRAME_SECONDS / 60,
+        recorded=recorded_minutes(logs),
+        changes=changes_of_sample(models.classes, frames, logs),
+        sure=changes_of_sample(models.classes, frames, logs, SURE).minutes,
+        random=_right(one for one in right if one.random and one.label != SILENCE),
+        marks=_right(one for one in right if not one.random and one.label != SILENCE),
+        losses=losses,
+        quiet=_right(one for one in right if one.random and one.label == SILENCE),
+        taught=taught,
+        known=Counter(one[1:] for each in outcomes for one in each) if of_home else {},
+    )
+
+
+def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> PairedAccuracy:
+    """Run two models over the sounds of the minutes that were drawn at random alone.
+
+    Raise `ModelError` as `gather_evidence`.
+    """
+    losses: list[str] = []
+    known = known_sounds(logs, losses)
+    places = _places([(log, [sound for sound in own if sound.random]) for log, own in known])
+    models = TwoModels(before, after)
+    parts = [WeightedPart(part, 1.0) for part, _ in places]
+    labelled = label_parts(models, parts, losses, ignore_progress)
+    return _right(
+        one
+        for (_, sounds), own in zip(places, labelled, strict=True)
+        for one in _outcomes(sounds, own, models.classes)
+        if one.label != SILENCE
+    )
+
+
+def _taught(models: TwoModels, after: Model) -> frozenset[str]:
+    """Name the classes that the second model has from marks of the home, and the first has not."""
+    training = after.description.training_data
+    of_home, elsewhere = (
+        {name for name, amount in amounts.items() if amount.segments}
+        for amounts in (training.home, training.classes)
+    )
+    return frozenset((of_home - elsewhere) & set(models.classes[models.before :]))
+
+
+def _is_in(spans: Spans, sound: KnownSound) -> bool:
+    return bool(rows_at(spans, np.array([(sound.start + sound.end) // 2]))[0] >= 0)
+
+
+def _places(
+    known: KnownSounds, most: float = _REFERENCE_SECONDS
+) -> list[tuple[LogSpan, list[KnownSound]]]:
+    """Join sounds that are near each other, so that they are labelled at once; the latest ones."""
+    places: list[tuple[LogSpan, list[KnownSound]]] = []
+    by_microphone = (
+        (log.path, name, [sound for sound in sounds if sound.microphone == name])
+        for log, sounds in known
+        for name in sorted({sound.microphone for sound in sounds})
+    )
+    for log, microphone, sounds in by_microphone:
+        times = spans_of([(s.start, s.end) for s in sounds], _NEAR)
+        rows = rows_at(times, np.array([s.start for s in sounds], np.int64))
+        for row, (start, end) in enumerate(zip(*(edge.tolist() for edge in times), strict=True)):
+            inside = [sound for sound, own in zip(sounds, rows, strict=True) if own == row]
+            places.append((LogSpan(log, start, end, microphone), inside))
+    # What was drawn at random goes first, then the latest.
+    places.sort(key=lambda place: (any(s.random for s in place[1]), place[0].start), reverse=True)
+    seconds = np.cumsum([(part.end - part.start) / NANOSECONDS for part, _ in places])
+    return places[: int(np.searchsorted(seconds, most, side="right"))]
+
+
+class _Outcome(NamedTuple):
+    """A known sound: its class, and the one that each model gives it for most of its time."""
+
+    random: bool
+    label: str
+    before: str
+    after: str
+
+
+def _outcomes(
+    sounds: Sequence[KnownSound], frames: PairedFrames, classes: Sequence[str]
+) -> Iterator[_Outcome]:
+    """Yield what two models make of known sounds that were labelled; classes are `classes`' names.
+
+    A name is empty where no class has most of the sound.
+    """
+    names = translation({sound.label for sound in sounds}, classes)
+    for sound in sounds:
+        first, last = np.searchsorted(frames.stamps, [sound.start, sound.end])
+        if last > first:
+            name = names[sound.label]
+            if class_name(name) == OTHER_NEGATIVE and UNKNOWN in classes:
+                name = UNKNOWN
+            counts = (
+                np.bincount(labels[first:last], minlength=len(classes)) / (last - first)
+                for labels in (frames.before, frames.after)
+            )
+            most = (classes[c.argmax()] if c.max() > _MOST else "" for c in counts)
+            yield _Outcome(sound.random, name, *most)
+
+
+def _right(outcomes: Iterable[_Outcome]) -> PairedAccuracy:
+    """Count the sounds that each model is right about."""
+    pairs = [(one.before == one.label, one.after == one.label) for one in outcomes]
+    return PairedAccuracy(
+        len(pairs),
+        sum(a for a, _ in pairs),
+        sum(b for _, b in pairs),
+        sum(b > a for a, b in pairs),
+        sum(a > b for a, b in pairs),
+    )
+
+
+_ENDS = (0.025, 0.975)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A champion and a candidate on the same time of a home.
+
+    Attributes
+    ----------
+    random, marks : PairedAccuracy
+        Known sounds of the minutes that were drawn at random, and other marks.
+    quiet : PairedAccuracy
+        The silences of the minutes that were drawn at random.
+    """
+
+    champion: str
+    candidate: str
+    candidate_sha256: str
+    minutes: float
+    changes: LabelChanges
+    random: PairedAccuracy
+    marks: PairedAccuracy
+    losses: list[str]
+    quiet: PairedAccuracy = NOTHING_KNOWN
+
+
+def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> Trial:
+    """Compare the latest candidate with the champion beside which it labelled last.
+
+    Raise `DataError` if no candidate labelled in these logs, or both models not long enough for
+    a segment, or there are several microphones. Raise `LogError` if there is no log.
+    """
+    losses: list[str] = []
+    records = list(_records(folders, losses))
+    tried = [(log, record) for log, record in records if record.get("candidate_sha256")]
+    if not tried:
+        raise DataError(
+            "no candidate labelled in these logs: `hearthlog models promote NAME --to candidate` "
+            "lets a model label beside the champion of a running recorder"
+        )
+    last = tried[-1][1]
+    key = ("model_sha256", "candidate_sha256")
+    logs = [log for log, one in tried if all(one.get(k) == last.get(k) for k in key)]
+    sources = find_labellings(*logs)
+    name = sources.microphone(microphone)
+    try:
+        live, candidate = (sources.read(name, each) for each in (LIVE, CANDIDATE))
+    except LogError as error:
+        names = f"{last.get('candidate', '')} with {last.get('model', '')}"
+        raise DataError(f"nothing to compare {names} by yet: {error}") from error
+    difference = compare_labellings(live, candidate)
+    known: list[KnownSound] = []
+    for place, log in enumerate(logs, 1):
+        try:
+            sounds = reference(log, logs[place:])
+            known += [sound for sound in sounds if sound.microphone == name]
+        except LogError as error:
+            losses.append(str(error))
+    sounding = [sound for sound in known if class_name(sound.label) != SILENCE]
+    sides = [unified(side.labelling) for side in (live, candidate)]
+    return Trial(
+        champion=last.get("model", ""),
+        candidate=last.get("candidate", ""),
+        candidate_sha256=last.get("candidate_sha256", ""),
+        minutes=difference.total.minutes,
+        changes=changes_of_labellings(difference),
+        random=_right_on_trial([one for one in sounding if one.random], *sides),
+        marks=_right_on_trial([one for one in sounding if not one.random], *sides),
+        losses=[*sources.losses, *losses],
+        quiet=_right_on_trial([one for one in known if one.random and one not in sounding], *sides),
+    )
+
+
+def gain_interval(right: PairedAccuracy) -> tuple[float, float]:
+    """Return the 95 % interval of how often the second model is the one that is right.
+
+    Of the sounds on which one model alone is right; by a beta distribution with the prior of
+    Jeffreys. 0.5 is no difference.
+    """
+    low, high = (beta_quantile(right.gained + 0.5, right.lost + 0.5, share) for share in _ENDS)
+    return low, high
+
+
+def _records(folders: Sequence[Path], losses: list[str]) -> Iterable[tuple[Path, dict[str, str]]]:
+    for folder in folders:
+        for log in find_logs(folder):
+            if is_layer(log):
+                continue
+            try:
+                with LogFile(log) as file:
+                    for record in read_provenance(file):
+                        yield log, dict(record)
+            except LogError as error:
+                losses.append(str(error))
+
+
+def _right_on_trial(
+    sounds: Sequence[KnownSound], before: Labelling, after: Labelling
+) -> PairedAccuracy:
+    """Count the sounds whose label a model gives to most of their time, as far as it labelled."""
+    first, second = (_agrees(sounds, labels) for labels in (before, after))
+    both = _labelled(sounds, before) & _labelled(sounds, after)
+    first, second = first[both], second[both]
+    return PairedAccuracy(
+        int(both.sum()),
+        int(first.sum()),
+        int(second.sum()),
+        int((second & ~first).sum()),
+        int((first & ~second).sum()),
+    )
+
+
+def _agrees(sounds: Sequence[KnownSound], labels: Labelling) -> Bool:
+    agrees = np.zeros(len(sounds), bool)
+    names = np.array([class_name(sound.label) for sound in sounds], object)
+    for name in set(names):
+        own = labels.labels == name
+        rows = np.flatnonzero(names == name).tolist()
+        agrees[rows] = _mostly([sounds[row] for row in rows], labels.starts[own], labels.ends[own])
+    return agrees
+
+
+def _labelled(sounds: Sequence[KnownSound], labels: Labelling) -> Bool:
+    names = [class_name(sound.label) != UNKNOWN for sound in sounds]
+    return _mostly(sounds, labels.starts, labels.ends) & np.array(names, bool)
+
+
+def _mostly(sounds: Sequence[KnownSound], starts: Int64, ends: Int64) -> Bool:
+    """Tell whether spans cover more than half of each sound."""
+    spans = joined(starts, ends)
+    covered = [
+        int(lengths(spans, np.array([sound.start, sound.end]))[0]) if len(spans.starts) else 0
+        for sound in sounds
+    ]
+    whole = [sound.end - sound.start for sound in sounds]
+    mostly: Bool = 2 * np.array(covered, np.int64) > np.array(whole, np.int64)
+    return mostly

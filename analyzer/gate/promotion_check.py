@@ -1,0 +1,407 @@
+"""Promotion check: a candidate against the champion of a home, and the rules for damage."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hearthlog.analyzer.gate.comparison import (
+    HomeComparison,
+    PairedAccuracy,
+    gather_evidence,
+    right_at_random,
+)
+from hearthlog.analyzer.gate.paired_labels import class_words, time_words
+from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import (
+    CHAMPION,
+    Judgement,
+    find_model,
+    load,
+    read_judgement,
+    write_judgement,
+)
+from hearthlog.schemas.arrays import Float64
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+
+LEAST_MINUTES = 10.0  # of sound to judge by
+_SILENCE_FALLS = 0.10  # of the time
+_MUCH = 0.01  # of the time: a class that is worth a rule
+_MUCH_OF_SOUND = 0.10  # of the time that is not silence
+_KEPT = 0.75  # of what the champion is sure of
+_SOUND_LEFT = 0.5  # of the time that is not silence
+_MANY = 0.05  # of the time: a class that has become many times as much
+_TIMES = 4.0
+_CHANGED = 0.20  # of the time that is not silence
+_CHANGED_MINUTES = 10.0
+_SILENCE_OF_NEW = 0.5  # of the time of a new class
+_ROOM = 0.5  # of the time: a new class that is more is the room
+_MARKS_ALONE = 3  # that say a class was wrong, where no sound of that class is known
+
+
+def damages(evidence: HomeComparison, champion: str) -> list[str]:
+    """Say what a model would spoil.
+
+    Returns
+    -------
+    list of str
+        A sentence for each damage, or that there is too little sound to tell; empty if there is no
+        damage.
+    """
+    if evidence.minutes < LEAST_MINUTES:
+        loss = f" ({evidence.losses[0]})" if evidence.losses else ""
+        missing = math.ceil(LEAST_MINUTES - evidence.minutes)
+        text = (
+            f"of the last two weeks only {time_words(evidence.minutes)} are recorded and not "
+            f"learned from, and it takes {time_words(LEAST_MINUTES)} to judge it{loss}: record "
+            f"{missing} more minute{'s' * (missing > 1)}, then promote it"
+        )
+        return [text]
+    reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
+    right = evidence.random
+    better = clearly_better(right.plus(evidence.quiet))
+    if not (better and right.sounds and right.gained >= right.lost):  # silence alone is too little
+        reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
+        reasons += _swallowed(evidence, champion)
+    return reasons
+
+
+def clearly_better(right: PairedAccuracy) -> bool:
+    """Tell whether the second model is right about more sounds, and chance hardly can be why."""
+    return right.gained - right.lost > 2 * np.sqrt(right.gained + right.lost)
+
+
+def is_worse(right: PairedAccuracy) -> bool:
+    """Tell whether the second model is right about fewer sounds, by more than a standard error."""
+    return bool(right.lost - right.gained > np.sqrt(right.gained + right.lost))
+
+
+def less_right(right: PairedAccuracy, name: str) -> str:
+    """Say about how many sounds a model is right, and the one that it is compared with.
+
+    Parameters
+    ----------
+    right : PairedAccuracy
+        Of the sounds of minutes that were drawn at random.
+    """
+    return (
+        f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
+        f"{right.after}, {name} about {right.before}"
+    )
+
+
+def _silence_lost(evidence: HomeComparison) -> Iterator[str]:
+    changes = evidence.changes
+    if SILENCE in changes.classes:
+        i = changes.classes.index(SILENCE)
+        before, after = float(changes.before[i]), float(changes.after[i])
+        if before - after > _SILENCE_FALLS * changes.minutes.sum():
+            yield f"silence falls from {changes.words(before)} to {time_words(after)}"
+
+
+def _not_better(evidence: HomeComparison, champion: str) -> Iterator[str]:
+    """See whether it is right about fewer sounds, or about no more though it changes much."""
+    right, changes = evidence.random, evidence.changes
+    known, both = less_right(right, champion), right.plus(evidence.quiet)
+    changed = changes.minutes.sum() - np.trace(changes.minutes)
+    much = max(_CHANGED * _sound(evidence), _CHANGED_MINUTES)
+    if is_worse(right):
+        yield known
+    elif is_worse(evidence.quiet):
+        quiet = evidence.quiet
+        yield (
+            f"of {quiet.sounds} silences of the minutes that were drawn at random it leaves "
+            f"{quiet.after} silent, {champion} {quiet.before}"
+        )
+    elif both.sounds and both.lost >= both.gained and changed > much:
+        known = known if right.sounds else "nothing sounds in the minutes drawn at random"
+        yield (
+            f"{known}, and {changes.words(changed)} would change: `hearthlog review logs --queue` "
+            "asks for more such minutes, then promote it again"
+        )
+
+
+def _sound(evidence: HomeComparison) -> float:
+    """Return the minutes that are not silence for both models."""
+    changes = evidence.changes
+    silent = [changes.minutes[i, i] for i, name in enumerate(changes.classes) if name == SILENCE]
+    return float(changes.minutes.sum() - sum(silent))
+
+
+def _sure_lost(evidence: HomeComparison, champion: str) -> Iterator[str]:
+    changes = evidence.changes
+    total, sound = changes.minutes.sum(), _without_silence(changes.before, changes.classes)
+    for i, name in enumerate(changes.classes):
+        sure, kept = float(evidence.sure[i].sum()), float(evidence.sure[i, i])
+        much = sure >= min(_MUCH * total, _MUCH_OF_SOUND * sound)
+        others = evidence.sure[i].copy()
+        others[i] = 0
+        corrected = sum(
+            float(others[j])
+            for j, new in enumerate(changes.classes)
+            if _is_correction(evidence, name, new)
+        )
+        if sure and much and kept + corrected < _KEPT * sure:
+            most = class_words(changes.classes[int(others.argmax())])
+            yield (
+                f"of {changes.words(sure)} of {class_words(name)} of which {champion} is sure "
+                f"{time_words(kept)} are left, most becomes {most}"
+            )
+
+
+def _is_correction(evidence: HomeComparison, name: str, new: str) -> bool:
+    """See whether marks say that a class was wrong where it becomes another one.
+
+    None may say that it was right. What another old class takes is harder to tell from wrong marks:
+    there sounds have to be known that the first model calls so rightly, and the second too.
+    """
+    wrong = sum(n for (true, old, _), n in evidence.known.items() if (true, old) == (new, name))
+    of_home = new in evidence.taught
+    own = [
+        (after, n)
+        for (true, old, after), n in evidence.known.items()
+        if true == name and (of_home or old == name)
+    ]
+    count, lost = sum(n for _, n in own), sum(n for after, n in own if after == new)
+    enough = wrong >= (1 if own else _MARKS_ALONE) if of_home else min(wrong, count) >= _MARKS_ALONE
+    return enough and lost <= (1.0 - _KEPT) * count
+
+
+def _swallowed(evidence: HomeComparison, champion: str) -> Iterator[str]:
+    """See whether a new class takes what a person left as it was, mostly silence, or all day."""
+    changes = evidence.changes
+    for new in sorted(evidence.taught):
+        name, column = class_words(new), changes.minutes[:, changes.classes.index(new)]
+        for what, whole, taken in _taken(evidence, new):
+            if taken >= _MARKS_ALONE and taken > (1.0 - _KEPT) * whole:
+                yield (
+                    f"{name} takes {taken} of {whole} {what} that {champion} had right: hear its "
+                    "marks, delete wrong ones, and mark what sounds like it as what it is"
+                )
+                break
+        if changes.each and column.sum() > _ROOM * changes.minutes.sum():
+            yield (
+                f"{name} is {changes.words(column.sum())}, more than half of the time: if that is "
+                "the sound of the room, delete its marks"
+            )
+        elif _takes_silence(evidence, new):
+            silence = float(column[changes.classes.index(SILENCE)])
+            yield (
+                f"{changes.words(silence)} of {name} is silence for {champion}: if that is the "
+                "sound of the room, delete its marks; else go through some real silence in "
+                "`hearthlog review --queue`, leave it as it is, and train again"
+            )
+
+
+def _takes_silence(evidence: HomeComparison, new: str) -> bool:
+    """See whether a new class is mostly silence, and no silence that was left is known to stay."""
+    changes = evidence.changes
+    if SILENCE not in changes.classes:
+        return False
+    column = changes.minutes[:, changes.classes.index(new)]
+    silence = column[changes.classes.index(SILENCE)]
+    much = silence > _SILENCE_OF_NEW * column.sum() and silence >= _MUCH * changes.minutes.sum()
+    known = any(true == before == SILENCE for true, before, _ in evidence.known)
+    return bool(much) and not (known and _is_correction(evidence, SILENCE, new))
+
+
+def _taken(evidence: HomeComparison, new: str) -> Iterator[tuple[str, int, int]]:
+    """Count what the first model had right, and what of it is a new class, of all and by class."""
+    right = {
+        name: Counter(
+            {
+                after: number
+                for (true, before, after), number in evidence.known.items()
+                if true == before == name
+            }
+        )
+        for name in sorted({true for true, _, _ in evidence.known} - {new, UNKNOWN})
+    }
+    sounds = [counts for name, counts in right.items() if name != SILENCE]
+    yield "sounds of other classes", sum(c.total() for c in sounds), sum(c[new] for c in sounds)
+    for name, counts in right.items():
+        what = "silences" if name == SILENCE else f"sounds of {class_words(name)}"
+        yield what, counts.total(), counts[new]
+
+
+def _out_of_proportion(evidence: HomeComparison) -> Iterator[str]:
+    """Find a class that becomes many times as much, and sound that becomes much less."""
+    changes = evidence.changes
+    total = changes.minutes.sum()
+    for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True):
+        if after >= _MANY * total and 0 < before < after / _TIMES:
+            times = f"from {changes.words(before)} to {time_words(after)}"
+            yield f"{class_words(name)} rises {times}"
+    before, after = (
+        _without_silence(each, changes.classes) for each in (changes.before, changes.after)
+    )
+    if before >= _MUCH * total and after < _SOUND_LEFT * before:
+        yield f"what is not silence falls from {changes.words(before)} to {time_words(after)}"
+
+
+def _without_silence(minutes: Float64, classes: Sequence[str]) -> float:
+    return float(sum(m for m, name in zip(minutes, classes, strict=True) if name != SILENCE))
+
+
+_LONGEST = 400  # characters of a reason
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The judgement of a model, and what it rests on.
+
+    Attributes
+    ----------
+    model, champion : str
+        Names; that of the champion is empty if nothing labels yet.
+    evidence : HomeComparison or None
+        None if there is nothing to compare, or with.
+    """
+
+    judgement: Judgement
+    model: str
+    champion: str
+    evidence: HomeComparison | None
+
+
+def judge(
+    folder: Path, model: Model, home: Sequence[Path], progress: Progress = ignore_progress
+) -> Verdict:
+    """Compare a model with the one that labels a home now, and keep the judgement.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model; its champion labels now, or else the model that labelled the latest logs.
+    progress : callable, optional
+        Is told the share that is done, 0 to 1.
+
+    Raises
+    ------
+    ModelError
+        If the model that labels now cannot be found or used, a feature set is not installed, or the
+        judgement cannot be written.
+    """
+    champion = find_champion(folder, home, model)
+    evidence, reasons = None, list[str]()
+    if champion is None:
+        reasons = [f"there are no labels in {_names(home)} to compare its own with"]
+    elif other := other_features(champion, model):
+        reasons = [other]
+    elif champion.sha256 != model.sha256:
+        logs = recent_logs(home)
+        evidence = gather_evidence(champion, model, logs, progress)
+        reasons = damages(evidence, champion.name) or _worse_than_at_first(
+            folder, model, champion, home, logs
+        )
+    judgement = Judgement(
+        model=model.sha256,
+        champion="" if champion is None else champion.sha256,
+        judged=time.time_ns(),
+        reasons=tuple(reason[:_LONGEST] for reason in reasons),
+    )
+    write_judgement(folder, judgement)
+    return Verdict(judgement, model.name, "" if champion is None else champion.name, evidence)
+
+
+def other_features(champion: Model, model: Model) -> str:
+    """Say that two models cannot be compared, if they are of different feature sets."""
+    mine, theirs = (one.description.feature_set for one in (model, champion))
+    if mine == theirs:
+        return ""
+    text = f"it is for feature set {mine}, and {champion.name}, which labels now, for {theirs}"
+    return f"{text}: they cannot be compared on the same logs"
+
+
+def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | None:
+    """Find the model that labels a home now.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of models, whose champion it is, unless that is the model that is judged or is gone.
+    home : sequence of Path
+        Folders of logs, the latest of which it else has labelled; of several such models the one
+        that the model was adapted from goes first.
+
+    Returns
+    -------
+    Model or None
+        None if there are no logs with labels.
+
+    Raises
+    ------
+    ModelError
+        If the model that labelled the latest log is gone.
+    """
+    with suppress(ModelError):
+        champion = load(folder, CHAMPION)
+        if champion.sha256 != model.sha256:
+            return champion
+    with suppress(LogError):
+        named = [one for one in find_home_logs(home).latest_models() if one.model]
+        base = model.description.training_data.base_sha256
+        for name, labelled_by in sorted(named, key=lambda one: one.model_sha256 != base)[:1]:
+            path = find_model(folder, labelled_by)
+            if path is None:
+                raise ModelError(
+                    f"{name} ({labelled_by[:12]}), which labels now, is neither in {folder} "
+                    "nor a starter model of this version: put its file there to compare with "
+                    f"it, or insist: `hearthlog models promote {model.name} --anyway`"
+                )
+            return load_model(path)
+    return None
+
+
+def _worse_than_at_first(
+    folder: Path, model: Model, champion: Model, home: Sequence[Path], logs: Sequence[RecentLog]
+) -> list[str]:
+    """See whether models that each lost a little have lost what the first one of the home had."""
+    first = _first_model(folder, home)
+    if first is None or first.sha256 in {model.sha256, champion.sha256}:
+        return []
+    if first.description.feature_set != model.description.feature_set:
+        return []
+    right = right_at_random(first, model, logs)
+    return [less_right(right, first.name)] if is_worse(right) else []
+
+
+def _first_model(folder: Path, home: Sequence[Path]) -> Model | None:
+    """Find the model that labelled the first log of a home; None if it is gone."""
+    with suppress(LogError, ModelError):
+        path = find_model(folder, find_home_logs(home).first_model())
+        return None if path is None else load_model(path)
+    return None
+
+
+def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgement | None:
+    """Return the judgement that lets a model label, if it still holds.
+
+    It does if the model labels now, or was compared with the model that does. A refusal does not:
+    there may be more to judge by since.
+
+    Raise `ModelError` as `find_champion`.
+    """
+    judgement = read_judgement(folder, model.sha256)
+    if judgement is None or not judgement.may_label:
+        return None
+    with suppress(ModelError):
+        if load(folder, CHAMPION).sha256 == model.sha256:
+            return judgement
+    champion = find_champion(folder, home, model)
+    sha256 = "" if champion is None else champion.sha256
+    return judgement if judgement.champion == sha256 else None
+
+
+def _names(home: Sequence[Path]) -> str:
+    return ", ".join(map(str, home))

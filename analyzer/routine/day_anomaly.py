@@ -1,0 +1,540 @@
+"""Anomaly of a day: its figures and routines against the weeks before it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import date, timedelta
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from hearthlog.analyzer.routine.day_profile import (
+    BINS,
+    CLOCK,
+    COUNT,
+    FIRST,
+    LAST,
+    LENGTH,
+    QUIET,
+    DayFigure,
+    DayProfile,
+    Profiles,
+)
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    FLUSHING_WATER,
+    OBJECTS_ACTIVITY,
+    SHOWER,
+    TAP_WATER,
+    YELLING,
+)
+from hearthlog.schemas.arrays import Bool, Float64, Int64
+
+_LOW, _HIGH = 0.1, 0.9  # of the days: the edges
+_PRIOR_DAYS = 7  # of which what is assumed of a figure counts as much as one day each
+# Assumed from the middle to an edge: so much, and a share of the middle.
+_ASSUMED = {CLOCK: (45.0, 0.0), COUNT: (0.7, 0.0), LENGTH: (0.3, 0.2)}
+_FEWEST_OF_KIND = 6
+_SPREAD = 1.86  # error of a median for a median deviation of 1, times the root of the number
+_TINY = 1e-9
+_HEARD = 0.1  # minutes in half an hour, of a class that is heard then
+_REGULAR = 0.9  # of the days on which it is
+_SHORTEST, _LONGEST, _MOST_HOURS = 2, 6, 3
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What is usual, each array of shape (..., f), float64.
+
+    Attributes
+    ----------
+    low, middle, high : np.ndarray
+        On one day in ten a figure is below the low edge, on one above the high one.
+    below, above : np.ndarray
+        From the middle to the edges, never quite 0.
+    """
+
+    low: Float64
+    middle: Float64
+    high: Float64
+    below: Float64
+    above: Float64
+    weekend: Float64
+
+    def deviations(self, row: Float64, weekend: Bool) -> Float64:
+        """Measure how far the figures of a day are from the middle, in widths to the edge.
+
+        Parameters
+        ----------
+        row : np.ndarray [shape=(..., f)], float64
+            As of `rooted`.
+        weekend : np.ndarray [shape=(...)], bool
+
+        Returns
+        -------
+        np.ndarray [shape=(..., f)], float64
+            Above 0 for more, or later; NaN for what is not known.
+        """
+        away = row - self.middle - weekend[..., np.newaxis] * self.weekend
+        return away / np.where(away > 0, self.above, self.below)
+
+
+def fit_baseline(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) -> Baseline:
+    """Learn what is usual.
+
+    Parameters
+    ----------
+    table : np.ndarray [shape=(..., n, f)], float64
+        Figures of n days, as of `rooted`; NaN for what is not known.
+    weekend : np.ndarray [shape=(..., n)], bool
+        Which of the days are of a weekend.
+    """
+    weekend = weekend[..., np.newaxis]
+    offset = _weekend(table, weekend)
+    even = table - weekend * offset[..., np.newaxis, :]
+    low, middle, high = (quantile(even, share) for share in (_LOW, 0.5, _HIGH))
+    days = np.isfinite(even).sum(axis=-2)
+    base, share = np.array([_ASSUMED[figure.kind] for figure in figures]).reshape(-1, 2).T
+    assumed = base + share * middle
+
+    def edge(away: Float64) -> Float64:
+        squares = days * away**2 + _PRIOR_DAYS * assumed**2
+        return np.sqrt(squares / (days + _PRIOR_DAYS))
+
+    return Baseline(low, middle, high, edge(middle - low), edge(high - middle), offset)
+
+
+def _weekend(table: Float64, weekend: Bool) -> Float64:
+    """Return by how much more figures are at a weekend, less where that may be chance."""
+    at, apart = (_middle(np.where(own, table, np.nan)) for own in (weekend, ~weekend))
+    more = at[0] - apart[0]
+    sure = np.clip(1 - (at[1] + apart[1]) / np.maximum(more**2, _TINY), 0, 1)
+    enough = np.minimum(at[2], apart[2]) >= _FEWEST_OF_KIND
+    return np.where(enough, more * sure, 0.0)
+
+
+def _middle(table: Float64) -> tuple[Float64, Float64, Int64]:
+    """Return the median of the days, the square of its error, and the number of days."""
+    days = np.isfinite(table).sum(axis=-2)
+    middle = quantile(table, 0.5)
+    spread = quantile(np.abs(table - middle[..., np.newaxis, :]), 0.5)
+    return middle, (_SPREAD * spread) ** 2 / np.maximum(days, 1), days
+
+
+def quantile(table: Float64, share: float) -> Float64:
+    """Return a quantile over the days of what is known.
+
+    Parameters
+    ----------
+    table : np.ndarray [shape=(..., n, f)], float64
+    share : float
+        0 to 1.
+
+    Returns
+    -------
+    np.ndarray [shape=(..., f)], float64
+        NaN where nothing is known.
+    """
+    ascending = np.sort(table, axis=-2)  # NaN last
+    days = np.isfinite(table).sum(axis=-2, keepdims=True)
+    place = share * np.maximum(days - 1, 0)
+    below = np.floor(place).astype(np.int64)
+    above = np.minimum(below + 1, np.maximum(days - 1, 0))
+    low, high = (np.take_along_axis(ascending, each, axis=-2) for each in (below, above))
+    return (low + (place - below) * (high - low))[..., 0, :]
+
+
+def regular_hours(days: Sequence[DayProfile], classes: Sequence[str]) -> list[DayFigure]:
+    """Find hours of the day in which a class is heard on nine of ten days.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Of their half hours.
+
+    Returns
+    -------
+    list of DayFigure
+        At most three for each class, with half an hour before and after.
+    """
+    found = []
+    for row, name in enumerate(classes):
+        heard = np.array([day.half_hours[row] for day in days])
+        found += [DayFigure(name, LENGTH, hours=hours) for hours in _hours(heard)]
+    return found
+
+
+def _hours(minutes: Float64) -> list[tuple[int, int]]:
+    """Find the shortest spans of half hours that are regular; of shape (days, 48)."""
+    free = np.ones(BINS, bool)
+    found: list[tuple[int, int]] = []
+    for width in range(_SHORTEST, _LONGEST + 1):
+        shares, amounts = _regular(minutes, width)
+        for first in np.lexsort((-amounts, -shares)).tolist():
+            if shares[first] < _REGULAR or len(found) == _MOST_HOURS:
+                break
+            if free[first : first + width].all():
+                hours = _widened(free, first, first + width)
+                free[slice(*hours)] = False
+                found.append(hours)
+    return found
+
+
+def _widened(free: Bool, first: int, last: int) -> tuple[int, int]:
+    """Add half an hour before and after, where no other span has it."""
+    before = first > 0 and free[first - 1]
+    after = last < BINS and free[last]
+    return first - int(before), last + int(after)
+
+
+def _regular(minutes: Float64, width: int) -> tuple[Float64, Float64]:
+    """Return on which share of the days each span of a width has sound, and how long on average."""
+    sums = sliding_window_view(minutes, width, axis=1).sum(axis=-1)
+    known = np.maximum(np.isfinite(sums).sum(axis=0), 1)
+    amounts = np.nan_to_num(sums)
+    return (amounts >= _HEARD).sum(axis=0) / known, amounts.sum(axis=0) / known
+
+
+def figure_table(
+    days: Sequence[DayProfile], classes: Sequence[str], hours: Sequence[DayFigure]
+) -> Float64:
+    """Return the figures of days as rows: those of each profile, then those of regular hours.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Of their half hours.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, f)], float64
+        NaN for what is not known.
+    """
+    places = [(classes.index(each.what), *(each.hours or (0, BINS))) for each in hours]
+    return np.array(
+        [[*day.values, *(day.half_hours[row, a:b].sum() for row, a, b in places)] for day in days]
+    )
+
+
+def rooted(table: Float64, figures: Sequence[DayFigure]) -> Float64:
+    """Take the square root of counts and lengths.
+
+    Parameters
+    ----------
+    table : np.ndarray [shape=(n, f)], float64
+    """
+    clocks = np.array([figure.kind == CLOCK for figure in figures])
+    return np.where(clocks, table, np.sqrt(np.where(clocks, 0, table)))
+
+
+NIGHT, MORNING, EVENING, WATER = "night", "morning", "evening", "water"
+HOUSEHOLD, COUGHS, DISTRESS, COMPANY = "household", "coughs", "distress", "company"
+_ROUTINES = (NIGHT, MORNING, EVENING, WATER, HOUSEHOLD, COUGHS, DISTRESS, COMPANY)
+_BY_CLASS = {
+    COUGHING: COUGHS,
+    CRYING: DISTRESS,
+    YELLING: DISTRESS,
+    FLUSHING_WATER: WATER,
+    TAP_WATER: WATER,
+    SHOWER: WATER,
+    OBJECTS_ACTIVITY: HOUSEHOLD,
+}
+_MORNING_ENDS = 19  # half hours of the day
+_MOST = 6.0  # that the deviation of one figure counts
+_NARROWEST = 0.35
+_TOP = 3  # routines that make the score
+
+
+def routine_of(figure: DayFigure) -> str:
+    """Return the routine that a figure tells of."""
+    by_class = _BY_CLASS.get(figure.what, COMPANY)
+    if by_class in {COUGHS, DISTRESS}:
+        return by_class
+    if figure.night:
+        return NIGHT
+    if figure.what == LAST:
+        return EVENING
+    is_early = figure.hours is not None and figure.hours[0] < _MORNING_ENDS
+    return MORNING if is_early or figure.what == FIRST else by_class
+
+
+def routine_scores(
+    own: Float64, others: Float64, figures: Sequence[DayFigure]
+) -> tuple[float, Float64]:
+    """Score how far a day is from what is usual: the mean of its three farthest routines.
+
+    Parameters
+    ----------
+    own : np.ndarray [shape=(f,)], float64
+        Deviations of the figures of a day; NaN for what is not known.
+    others : np.ndarray [shape=(n, f)], float64
+        Those of other days, by which the widths of routines are measured.
+
+    Returns
+    -------
+    score : float
+        Of the day.
+    scores : np.ndarray [shape=(n,)], float64
+        Of the other days.
+    """
+    groups = _groups(figures)
+    means = np.array([_mean(np.vstack([others, own])[:, rows] * sign) for rows, sign in groups]).T
+    low, middle, high = np.quantile(means[:-1], (_LOW, 0.5, _HIGH), axis=0)
+    away = means - middle
+    widths = np.where(away > 0, high - middle, middle - low)
+    far = np.sort(np.abs(away) / np.maximum(widths, _NARROWEST), axis=1)
+    scores = far[:, -_TOP:].mean(axis=1)
+    return float(scores[-1]), scores[:-1]
+
+
+def _groups(figures: Sequence[DayFigure]) -> list[tuple[Int64, Float64]]:
+    """Return the places of the figures of each routine, and which way they point."""
+    names = np.array([routine_of(figure) for figure in figures])
+    signs = np.array([_sign(figure) for figure in figures])
+    places = [np.flatnonzero(names == name) for name in _ROUTINES]
+    return [(rows, signs[rows]) for rows in places if len(rows)]
+
+
+def _sign(figure: DayFigure) -> float:
+    """Return -1 for a figure that is less where the others of its routine are more."""
+    is_less = figure.what == QUIET or (routine_of(figure) == MORNING and figure.what != FIRST)
+    return -1.0 if is_less else 1.0
+
+
+def _mean(deviations: Float64) -> Float64:
+    """Average the deviations of a routine; what is not known counts as usual."""
+    return np.clip(np.nan_to_num(deviations), -_MOST, _MOST).mean(axis=1)
+
+
+DAYS = 28  # that a day is compared with, at most
+FEWEST = 14
+SPAN = 3  # days that are judged together, too: what lasts is sooner seen so
+LONGEST = 365.0  # days: what comes more rarely cannot be told apart in four weeks
+_TAIL = 0.3  # share of the days by which the rare ones are judged
+_TAIL_PRIOR_DAYS, _PRIOR_SHARE = (
+    4,
+    0.15,
+)  # of the tail: days, and their excess as a share of its edge
+# By how much the tail of days to come is longer than that of days that are left out, which lie
+# between those they are compared with; more where there are fewer than 28 of these. Fitted to
+# the false alarms of simulated homes, seeds 0 to 9 of `tools/lab/routine.py`.
+_LONGER = {1: 1.8, SPAN: 2.7}
+_DIFFERS = {1: 1.5, SPAN: 1.0}
+
+
+class FigureDifference(NamedTuple):
+    """A figure that was not as usual.
+
+    Attributes
+    ----------
+    value : float
+        Of the day, or the median of three: a number of events, minutes, or those since midnight.
+    low, middle, high : float
+        On one day in ten it is below `low`, on one above `high`.
+    deviation : float
+        From the middle, in widths from there to the edge; above 0 for more, or later.
+    """
+
+    figure: DayFigure
+    value: float
+    low: float
+    middle: float
+    high: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class DayAnomaly:
+    """How unusual a day was.
+
+    Attributes
+    ----------
+    once_in : float
+        Days in which one is expected that is as far from the usual, 1 to 365.
+    span : int
+        Days of which the differences are typical: the day by itself, 1, or with the two before, 3.
+    days : int
+        How many days it is compared with.
+    """
+
+    day: date
+    once_in: float
+    span: int
+    differences: Sequence[FigureDifference]
+    days: int
+
+
+class Routines:
+    """Judges days of a home by the weeks before each."""
+
+    def __init__(self, profiles: Profiles) -> None:
+        self._profiles = profiles
+        self._known: dict[date, DayProfile | None] = {}
+
+    def judge(self, day: date) -> DayAnomaly | None:
+        """Judge a day.
+
+        Returns
+        -------
+        DayAnomaly or None
+            None if less than half of its figures are known, or there are fewer than 14 days to
+            compare with of which that many are.
+        """
+        span = self._between(day, SPAN - 1, 0)
+        earlier = self.earlier(day)
+        if self._of(day) is None or len(earlier) < FEWEST:
+            return None
+        compared = compare(span, earlier, self._profiles.figures, self._profiles.classes)
+        return judge(compared, day)
+
+    def earlier(self, day: date) -> list[DayProfile]:
+        """Return the days to compare a day with: four weeks, up to the third day before."""
+        return self._between(day, DAYS + SPAN - 1, SPAN)
+
+    def _between(self, day: date, first: int, last: int) -> list[DayProfile]:
+        days = [self._of(day - timedelta(days=ago)) for ago in range(first, last - 1, -1)]
+        return [each for each in days if each is not None]
+
+    def _of(self, day: date) -> DayProfile | None:
+        if day not in self._known:
+            profile = self._profiles.of(day)
+            self._known[day] = profile if profile.is_known else None
+        return self._known[day]
+
+
+class Compared(NamedTuple):
+    """Days beside what is usual.
+
+    Attributes
+    ----------
+    figures : sequence of DayFigure
+        That are known on half of the earlier days at least.
+    rows : np.ndarray [shape=(k, f)], float64
+        Of the days, as of `rooted`; NaN for what is not known.
+    weekend : np.ndarray [shape=(k,)], bool
+    own : np.ndarray [shape=(k, f)], float64
+        Their deviations.
+    others : np.ndarray [shape=(n, f)], float64
+        Those of each earlier day from the other ones.
+    """
+
+    figures: Sequence[DayFigure]
+    usual: Baseline
+    rows: Float64
+    weekend: Bool
+    own: Float64
+    others: Float64
+
+
+def compare(
+    span: Sequence[DayProfile],
+    earlier: Sequence[DayProfile],
+    figures: Sequence[DayFigure],
+    classes: Sequence[str],
+) -> Compared:
+    """Lay days beside earlier ones.
+
+    Parameters
+    ----------
+    span : sequence of DayProfile
+        One at least.
+    earlier : sequence of DayProfile
+        14 at least.
+    classes : sequence of str
+        Of their half hours.
+    """
+    hours = regular_hours(earlier, classes)
+    every = [*figures, *hours]
+    table = rooted(figure_table([*earlier, *span], classes, hours), every)
+    weekend = np.array([day.day.weekday() >= 5 for day in (*earlier, *span)])
+    days = len(earlier)
+    often = np.isfinite(table[:days]).sum(axis=0) >= days / 2
+    kept = [figure for figure, is_known in zip(every, often, strict=True) if is_known]
+    before, rows = table[:days, often], table[days:, often]
+    usual = fit_baseline(before, weekend[:days], kept)
+    own = usual.deviations(rows, weekend[days:])
+    return Compared(kept, usual, rows, weekend[days:], own, _left_out(before, weekend[:days], kept))
+
+
+def judge(compared: Compared, day: date) -> DayAnomaly:
+    """Say how unusual the last of some days was.
+
+    Parameters
+    ----------
+    compared : Compared
+        The day, and those just before it.
+    """
+    # Halved, for either may be rare by chance.
+    alone, together = (
+        float(np.clip(rarity(own, compared) / 2, 1, LONGEST))
+        for own in (compared.own[-1:], compared.own)
+    )
+    lasting = [] if alone >= together else list(_differences(compared, SPAN))
+    length = SPAN if lasting else 1
+    found = lasting or list(_differences(compared, 1))
+    return DayAnomaly(day, max(alone, together), length, found, len(compared.others))
+
+
+def _left_out(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) -> Float64:
+    """Return how far each day is from what is usual on the others."""
+    days = len(table)
+    others = np.array([np.delete(np.arange(days), row) for row in range(days)])
+    return fit_baseline(table[others], weekend[others], figures).deviations(table, weekend)
+
+
+def rarity(own: Float64, compared: Compared) -> float:
+    """Return in how many days some are expected that are as far from the usual, on average.
+
+    Beyond the score that three of ten days exceed, scores are taken to fall off exponentially.
+
+    Parameters
+    ----------
+    own : np.ndarray [shape=(k, f)], float64
+        Deviations of one day or of successive ones.
+
+    Returns
+    -------
+    float
+        In days, 1 or more.
+    """
+    length = len(own)
+    others = sliding_window_view(compared.others, length, axis=0)
+    score, scores = routine_scores(
+        _mean_of_known(own), _mean_of_known(np.moveaxis(others, -1, 0)), compared.figures
+    )
+    edge = float(np.quantile(scores, 1 - _TAIL))
+    if score <= edge:
+        return 1 / max(float((scores >= score).mean()), _TAIL)
+    excess = scores[scores > edge] - edge
+    total = excess.sum() + _TAIL_PRIOR_DAYS * _PRIOR_SHARE * edge
+    longer = _LONGER[SPAN if length > 1 else 1] * DAYS / len(compared.others)
+    scale = longer * total / (len(excess) + _TAIL_PRIOR_DAYS)
+    return float(np.exp(min((score - edge) / scale, 50.0)) / _TAIL)
+
+
+def _mean_of_known(rows: Float64) -> Float64:
+    """Average rows over what is known; NaN where nothing is."""
+    known = np.isfinite(rows)
+    sums = np.where(known, rows, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), sums / np.maximum(known.sum(axis=0), 1), np.nan)
+
+
+def _differences(compared: Compared, length: int) -> Iterator[FigureDifference]:
+    rows, own = compared.rows[-length:], compared.own[-length:]
+    values, deviations = quantile(rows, 0.5), np.nan_to_num(quantile(own, 0.5))
+    usual = compared.usual
+    offset = usual.weekend * compared.weekend[-length:].mean()
+    edges = [edge + offset for edge in (usual.low, usual.middle, usual.high)]
+    for number in np.argsort(-np.abs(deviations), kind="stable").tolist():
+        if abs(deviations[number]) < _DIFFERS[length]:
+            return
+        figure = compared.figures[number]
+        value, low, middle, high = (
+            _amount(float(each[number]), figure.kind) for each in (values, *edges)
+        )
+        yield FigureDifference(figure, value, low, middle, high, float(deviations[number]))
+
+
+def _amount(number: float, kind: str) -> float:
+    return number if kind == CLOCK else max(number, 0.0) ** 2

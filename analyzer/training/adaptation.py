@@ -1,0 +1,560 @@
+"""Adaptation: adds a home's marks to the weights of a model."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.calibration import cross_validate, home_temperature, softmax
+from hearthlog.analyzer.training.dataset import (
+    CONFIRMED,
+    Dataset,
+    EmbeddingWindows,
+    learned_digests,
+    segment_digests,
+)
+from hearthlog.analyzer.training.direction_samples import with_directions
+from hearthlog.analyzer.training.heads import in_units, regressed
+from hearthlog.analyzer.training.landmark_method import (
+    ROOM,
+    LandmarkMap,
+    LandmarkMethod,
+    centres,
+)
+from hearthlog.analyzer.training.learned_inputs import balanced, kept_inputs
+from hearthlog.analyzer.training.manifest import Scenario
+from hearthlog.analyzer.training.method import Examples, Method, prepare
+from hearthlog.analyzer.training.train import default_transitions, merged_spans
+from hearthlog.analyzer.training.window_method import LearnedMachine
+from hearthlog.analyzer.workers.parallel import single_thread
+from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.models.classifiers.classifier import classifier_kind
+from hearthlog.models.classifiers.evidence import (
+    UNIT,
+    UNTAUGHT,
+    EmbeddingHeads,
+    mixed,
+    sounds_of,
+)
+from hearthlog.models.classifiers.landmarks import (
+    RBF_LANDMARKS,
+    LandmarkParameters,
+    LandmarksMachine,
+)
+from hearthlog.models.classifiers.model import (
+    FORMAT,
+    FORMAT_OF_EMBEDDINGS,
+    MOST_WEIGHT,
+    Amount,
+    Array,
+    ClassMetrics,
+    Description,
+    EmbeddingMix,
+    Model,
+    NamesHead,
+)
+from hearthlog.models.classifiers.names import insist_taught
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int32
+from hearthlog.schemas.errors import ignore_progress
+
+_HEAD_PULL = 10.0  # to zero, of weights of inputs of one standard deviation
+_NEW_HEAD_PULL = 1.0  # of those of a class that the base has not: all of it is to be learned
+_CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a mark has 1
+_SHARE = 0.5  # that counts of what is learned: marks are of few sources, and others lie between
+_BELOW = 2.0  # the others on average, is a new class before anything is learned
+
+
+class Heads(NamedTuple):
+    """The mix of a model, the arrays of its heads, and how many of the last classes are new."""
+
+    mix: EmbeddingMix
+    weights: Int32
+    bias: Int32
+    scaler: Float64
+    new: int
+
+
+def base_heads(model: Model, classes: Sequence[str]) -> Heads:
+    """Return the heads of a model as before it was ever adapted, with room for new classes."""
+    mix = model.description.embedding
+    assert mix is not None
+    count = len(mix.head_weights)
+    same = sum(name in model.classes for name in classes)
+    inverse = mix.base_inverse_temperature or mix.inverse_temperature
+    weights = model.embedding_weights[:count, :, :same]
+    bias = model.embedding_bias[:count, :same]
+    new = len(classes) - same
+    if new:
+        sounds = sounds_of(classes[:same])
+        middle = bias[:, sounds] + np.einsum(
+            "w,hws->hs", model.embedding_scaler[0], weights[..., sounds].astype(np.float64)
+        )
+        middle = np.ma.masked_array(middle, bias[:, sounds] == UNTAUGHT)
+        constant = np.rint(middle.mean(axis=1).filled(0.0) - _BELOW / inverse / UNIT)
+        constant = constant.astype(np.int32)
+        weights = np.pad(weights, ((0, 0), (0, 0), (0, new)))
+        bias = np.concatenate([bias, np.tile(constant[:, np.newaxis], (1, new))], axis=1)
+    update = {
+        "names": [_with_classes(head, classes) for head in mix.names],
+        "bias": {name: value for name, value in mix.bias.items() if name in classes},
+        "inverse_temperature": inverse,
+        "base_inverse_temperature": None,
+        "of_home": False,
+    }
+    return Heads(mix.model_copy(update=update), weights, bias, model.embedding_scaler, new)
+
+
+def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
+    """Return a head with the classes of a home, of which the names say what of unknown ones."""
+    kept = {name: values for name, values in head.classes.items() if name in classes}
+    bias = {name: value for name, value in head.bias.items() if name in classes}
+    if UNKNOWN in head.classes:
+        for name in classes:
+            if name not in kept and name != SILENCE:
+                kept[name] = head.classes[UNKNOWN]
+                bias |= {name: head.bias[UNKNOWN]} if UNKNOWN in head.bias else {}
+    return head.model_copy(update={"classes": kept, "bias": bias})
+
+
+def learn_home(
+    heads: Heads, windows: EmbeddingWindows, marked: Bool, classes: Sequence[str]
+) -> Heads:
+    """Add what a home teaches: one half of what is learned, for a class of the base.
+
+    The heads stay as they are; what a home teaches is a linear head of its own that is added to
+    them, so that nothing of the base's recordings is needed. It is learned by logistic regression,
+    and pulled to zero: where nothing is marked the base decides.
+
+    Where nobody has marked a sound of no class, and there is no new class, how likely that is
+    against the others is not learned: by marks of what was wrongly called unknown alone nearly
+    nothing would be unknown any more.
+
+    Parameters
+    ----------
+    marked : np.ndarray [shape=(m,)], bool
+        Whether somebody has said what it is; the others are as they were labelled.
+    """
+    sounds = sounds_of(classes)
+    if UNKNOWN in classes and not heads.new:
+        unknown = classes.index(UNKNOWN)
+        if not (windows.target[marked] == unknown).any():
+            sounds = sounds[sounds != unknown]
+    own = np.isin(windows.target, sounds)
+    if not own.any():
+        return heads
+    mix, values = heads.mix, windows.values[own]
+    by_heads = EmbeddingHeads(mix, heads.weights, heads.bias, classes).log_probabilities(values)
+    shares = sum(mix.head_weights) + sum(head.weight for head in mix.names)
+    before = mix.inverse_temperature / shares * by_heads[:, sounds]
+    used = np.flatnonzero(heads.weights.any(axis=(0, 2)))
+    mean, scale = heads.scaler[:, used]
+    inputs = (values[:, used] - mean) / scale
+    # The windows of a mark are of one sound: many of them say no more than one.
+    windows_of = np.bincount(windows.recording[own])[windows.recording[own]]
+    weight = np.where(marked[own], 1.0 / windows_of, _CONFIRMED_WEIGHT)
+    target = np.searchsorted(sounds, windows.target[own])
+    pull = np.full(len(sounds), _HEAD_PULL)
+    pull[len(sounds) - heads.new :] = _NEW_HEAD_PULL
+    truth = np.eye(len(sounds))[target]
+    slopes, constants = regressed(inputs, truth, weight, before, pull, free=False)
+    taken = np.where(np.arange(len(sounds)) < len(sounds) - heads.new, _SHARE, 1.0)
+    slopes, constants = taken * slopes, taken * constants
+    weights = np.zeros((1, *heads.weights.shape[1:]))
+    bias = np.zeros((1, heads.bias.shape[1]))
+    factor = shares / mix.inverse_temperature
+    weights[0][np.ix_(used, sounds)] = factor * slopes / scale[:, np.newaxis]
+    bias[0, sounds] = factor * (constants - (mean / scale) @ slopes)
+    return heads._replace(
+        mix=mix.model_copy(update={"of_home": True}),
+        weights=np.concatenate([heads.weights, in_units(weights)]),
+        bias=np.concatenate([heads.bias, in_units(bias)]),
+    )
+
+
+_LANDMARK_PULL = 1.0  # to zero, of what is added to the weights
+_NEW_LANDMARK_PULL = 0.1  # of those of a class that the base has not: all of it is to be learned
+_LANDMARK_WEIGHT = 3.0  # of what the base says of a landmark; a window of a mark has 1
+_HOME_LANDMARKS = 200  # at most, of its windows
+_LANDMARK_SHARE = (
+    0.5  # that counts of what is learned: marks are of few sources, and others lie between
+)
+_LANDMARK_BELOW = (
+    2.0  # the others on average, is a new class before anything is learned, a logarithm
+)
+_IMITATION_COST = 30.0  # probabilities are learned closer than labels, which are wrong at times
+_SMOOTHED = 1 / 3  # of the weight of a frame of a machine, which is less sure between its vectors
+_ROWS_AT_ONCE = 256
+_MOST_BIAS = 100.0
+
+
+@dataclass(frozen=True)
+class HomeLandmarks(Method):
+    """Adds to the weights of a classifier on landmarks.
+
+    The landmarks, each by what the base says of it, keep the base as it is where the home has no
+    windows: a home has few sources, of few classes. A classifier of another kind is first learned
+    over, by what it says itself.
+    """
+
+    base: Mapping[str, Array] = field(default_factory=dict, compare=False)
+    values: Mapping[str, float] = field(default_factory=dict)
+    inverse: float = 1.0
+
+    @classmethod
+    def of_learned(cls, method: LandmarkMethod, learned: LearnedMachine) -> Self:
+        """Return the method that moves what another has learned, as it is."""
+        return cls(
+            method.name,
+            method.feature_set,
+            method.inputs,
+            method.kind,
+            copies=0,
+            base=learned.arrays(),
+            values=learned.parameters(),
+        )
+
+    @classmethod
+    def of(cls, model: Model) -> Self:
+        """Return the method that moves a model of kind `rbf-landmarks`."""
+        description = model.description
+        return cls(
+            description.method,
+            description.feature_set,
+            description.inputs,
+            description.kind,
+            copies=0,
+            base=model.arrays,
+            values=description.parameters,
+            inverse=description.base_inverse_temperature or description.inverse_temperature,
+        )
+
+    def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> LearnedMachine:
+        """Move the base by some segments of a home, as of `Method.fit`."""
+        with single_thread():
+            return self._moved(*examples.windows(seen))
+
+    def _moved(self, inputs: Float32, target: Indices, weight: Float64) -> LearnedMachine:
+        arrays = dict(self.base)
+        arrays.pop("home_landmarks", None)
+        base_weights = arrays.setdefault("base_weights", arrays["weights"])
+        base_bias = arrays.setdefault("base_bias", arrays["bias"])
+        count, old = base_weights.shape
+        new = max(int(target.max(initial=-1)) + 1 - old, 0)
+        if len(inputs):
+            arrays["home_landmarks"], _ = centres(arrays, inputs, target, weight, _HOME_LANDMARKS)
+        parameters = LandmarkParameters.model_validate(self.values)
+        map_ = LandmarkMap(arrays, parameters)
+        kernels = np.concatenate([map_.kernels(arrays["landmarks"]), map_.kernels(inputs)])
+        before = self.inverse * (kernels[:, :count] @ base_weights + base_bias)
+        constant = before.mean() - _LANDMARK_BELOW
+        before = np.pad(before, ((0, 0), (0, new)), constant_values=constant)
+        mapped = kernels @ map_.root
+        mean = mapped[:count].mean(axis=0)
+        scale = np.sqrt(np.square(mapped[:count] - mean).sum(axis=1).mean())
+        slopes, constants = regressed(
+            (mapped - mean) / scale,
+            np.concatenate([softmax(before[:count]), np.eye(old + new)[target]]),
+            np.concatenate([np.full(count, _LANDMARK_WEIGHT), balanced(target, weight)]),
+            before,
+            np.where(np.arange(old + new) < old, _LANDMARK_PULL, _NEW_LANDMARK_PULL),
+            free=False,
+        )
+        taken = np.where(np.arange(old + new) < old, _LANDMARK_SHARE, 1.0) / self.inverse
+        slopes, constants = taken * slopes / scale, taken * constants
+        weights, bias = map_.root @ slopes, constants - mean @ slopes
+        weights[:count, :old] += base_weights
+        bias[:old] += base_bias
+        bias[old:] += constant / self.inverse
+        arrays["weights"], arrays["bias"] = weights, bias
+        arrays["landmark_counts"] = np.pad(arrays["landmark_counts"][:old], (0, new))
+        machine = LandmarksMachine(arrays, parameters)
+        return LearnedMachine(machine, np.arange(old + new), arrays, parameters.model_dump())
+
+
+def is_moved(model: Model) -> bool:
+    """Return whether a home moves the classifier of a model as it is."""
+    return model.description.kind == RBF_LANDMARKS.name
+
+
+def learned_over(base: Model) -> Model:
+    """Return a model whose landmarks say what the classifier of another kind says.
+
+    Raise `DataError` if the classifier has kept no inputs of its kind, or none of one of its
+    classes.
+    """
+    kept = kept_inputs(base)
+    if kept is None or not len(kept[0]):
+        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
+    inputs, target = kept
+    classes = int(target.max()) + 1
+    lacking = np.setdiff1d(np.arange(classes), target)
+    if len(lacking):
+        name = base.classes[lacking[0]]
+        raise DataError(f"{base.name}: has kept nothing of {name}; train it anew to adapt")
+    description = base.description
+    width, inverse = inputs.shape[1], description.inverse_temperature
+    method, smoothed = replace(ROOM, cost=_IMITATION_COST), 1.0
+    if description.kind == SVM_RBF.name:
+        if description.embedding is None:  # else smoothed is what the heads say, too
+            smoothed = _SMOOTHED
+        method = replace(method, gamma=description.parameters["gamma"] * width)
+    machine = classifier_kind(description.kind).machine(base)
+    parts = np.array_split(inputs, -(-len(inputs) // _ROWS_AT_ONCE))
+    decisions = np.concatenate([machine.decide(part)[0] for part in parts])[:, :classes]
+    with single_thread():
+        _, arrays, parameters = method.imitate(
+            inputs, target, np.ones(len(inputs)), softmax(inverse * decisions)
+        )
+    smoothing, bias = description.smoothing, description.decision_bias
+    update = {
+        "kind": RBF_LANDMARKS.name,
+        "parameters": parameters,
+        "inverse_temperature": 1.0,
+        "base_inverse_temperature": None,
+        "decision_bias": {
+            name: float(np.clip(inverse * value, -_MOST_BIAS, _MOST_BIAS))
+            for name, value in bias.items()
+        },
+        "novelty": "doubt",
+        "copies": 0,
+        "smoothing": smoothing.model_copy(
+            update={"weight": min(smoothed * smoothing.weight * inverse, MOST_WEIGHT)}
+        ),
+    }
+    return replace(base, description=description.model_copy(update=update), arrays=arrays)
+
+
+_FEWEST_SEGMENTS = 10
+_FOLDS = 3  # by which the temperature is found
+
+
+def base_classes(model: Model) -> tuple[str, ...]:
+    """Return the classes of a model without those that it has from a home alone."""
+    insist_taught(model)
+    kept = kept_inputs(model)
+    if kept is None or not len(kept[1]):
+        return model.classes
+    return model.classes[: int(kept[1].max()) + 1]
+
+
+def adapt_model(base: Model, home: Dataset) -> Model:
+    """Add what a home teaches to the weights of a model.
+
+    Parameters
+    ----------
+    base : Model
+        One whose classifier is not on landmarks is learned over by what it says, if it has kept
+        windows that it learned from.
+    home : Dataset
+        Of the `base_classes` of the model, some of which may have no segments, and of new ones
+        behind them, which have some.
+
+    Returns
+    -------
+    Model
+        With the parameters, transitions and metrics of `base`, which are those of other homes.
+        Parts of the home that were left out in turn move the temperature that the model had before
+        it was ever adapted. It can be adapted again to more of the home.
+
+    Raises
+    ------
+    DataError
+        If the home has no segments, or no loud ones of a new class, or if the base cannot be
+        learned over.
+    ModelError
+        If the feature set or the kind of classifier of the base is not installed.
+    """
+    insist_taught(base)
+    if not len(home):
+        raise DataError("the home has no segments of a class of the model")
+    moved = base if is_moved(base) else learned_over(base)
+    description, method = moved.description, HomeLandmarks.of(moved)
+    examples, here = prepare(method, home), np.arange(len(home))
+    _check_new_classes(base, examples, home.classes)
+    learned = method.fit(examples)
+    before = description.base_inverse_temperature or description.inverse_temperature
+    description = _of_classes(description, home.classes)
+    left_out = _left_out(method, examples, here, ~_is_confirmed(home), description)
+    inverse = _temperature_here(left_out, examples, here, description)
+    smoothing = description.smoothing
+    weight = min(smoothing.weight * description.inverse_temperature / inverse, MOST_WEIGHT)
+    training = description.training_data.model_copy(
+        update={
+            "home": home.amounts,
+            "home_confirmed": _confirmed(home),
+            "home_spans": merged_spans(home.spans),
+            "home_frames": 0,
+            "base_sha256": base.sha256,
+        }
+    )
+    update = {
+        "training_data": training,
+        "inverse_temperature": inverse,
+        "base_inverse_temperature": before,
+        "smoothing": smoothing.model_copy(update={"weight": weight}),
+    }
+    transitions = base.transitions
+    was_learned = base.description.training_data.home_frames > 0  # by an earlier version
+    if len(transitions) and (was_learned or home.classes != base.classes):
+        transitions = default_transitions(home.classes)
+    plain = {"format": FORMAT, "direction_microphones": []}
+    adapted = Model(
+        description.model_copy(update=update | plain),
+        learned.arrays(),
+        transitions=transitions,
+        training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
+    )
+    if description.embedding is not None:
+        adapted = _with_heads(adapted, base, home, inverse * left_out[here])
+    return with_directions(adapted, home.target, home.sightings)
+
+
+def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) -> Model:
+    """Let the heads of a model learn from a home, too; the classifier's decisions are left out."""
+    heads = base_heads(base, home.classes)
+    marked = home.embedding_windows.collection != _confirmed_number(home)
+    learned = learn_home(heads, home.embedding_windows, marked, home.classes)
+    inverse = _inverse_here(heads, home, decisions)
+    mix = learned.mix.model_copy(
+        update={
+            "inverse_temperature": inverse,
+            "base_inverse_temperature": heads.mix.inverse_temperature,
+        }
+    )
+    smoothing = adapted.description.smoothing.model_copy(
+        update={"weight": base.description.smoothing.weight}  # of probabilities as they are
+    )
+    update = {"format": FORMAT_OF_EMBEDDINGS, "embedding": mix, "smoothing": smoothing}
+    return replace(
+        adapted,
+        description=adapted.description.model_copy(update=update),
+        embedding_weights=learned.weights,
+        embedding_bias=learned.bias,
+        embedding_scaler=learned.scaler,
+    )
+
+
+def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
+    """Return how sure the mix may be of sounds of a home, by parts of it left out."""
+    base, sounds = heads.mix.inverse_temperature, sounds_of(home.classes)
+    marked = ~_is_confirmed(home)
+    tried = np.isfinite(decisions).all(axis=1) & home.is_embedded & np.isin(home.target, sounds)
+    if marked.sum() < _FEWEST_SEGMENTS or not tried.any():
+        return base
+    by_heads = np.full(decisions.shape, np.nan)
+    for part in _parts(marked):
+        own = part[tried[part]]
+        seen = np.setdiff1d(np.arange(len(home)), part)
+        learned = _learned_without(heads, home, seen)
+        of_home = EmbeddingHeads(learned.mix, learned.weights, learned.bias, home.classes)
+        by_heads[own] = of_home.log_probabilities(home.embedded[own])
+    plain = heads.mix.model_copy(update={"inverse_temperature": 1.0})
+    logarithms = mixed(decisions[tried], by_heads[tried], plain, home.classes)[:, sounds]
+    return home_temperature(logarithms, np.searchsorted(sounds, home.target[tried]), base)
+
+
+def _learned_without(heads: Heads, home: Dataset, seen: Indices) -> Heads:
+    """Let heads learn from some segments of a home instead of all windows."""
+    own = seen[home.is_embedded[seen]]
+    windows = EmbeddingWindows(
+        home.embedded[own],
+        home.target[own],
+        home.group[own],
+        home.collection[own],
+        np.ones(len(own), bool),
+        np.arange(len(own)),
+    )
+    return learn_home(heads, windows, windows.collection != _confirmed_number(home), home.classes)
+
+
+def _confirmed_number(home: Dataset) -> int:
+    names = home.collection_names
+    return names.index(CONFIRMED) if CONFIRMED in names else -1
+
+
+def _check_new_classes(base: Model, examples: Examples, classes: Sequence[str]) -> None:
+    """Refuse what would leave a class that the base lacks without a window to learn from."""
+    usable = examples.target[examples.usable.any(axis=(0, 2))]
+    for number in range(len(base_classes(base)), len(classes)):
+        if number not in usable:
+            raise DataError(
+                f"the home has no sound of {classes[number]} above its noise: mark louder ones"
+            )
+
+
+def _of_classes(description: Description, classes: Sequence[str]) -> Description:
+    """Return a description with other classes at its end, of which no figures are known."""
+    if tuple(description.classes) == tuple(classes):
+        return description
+    metrics, training = description.metrics, description.training_data
+    confusion = np.zeros((len(classes), len(classes)), int)
+    same = len([name for name in classes if name in description.classes])
+    confusion[:same, :same] = np.array(metrics.confusion)[:same, :same]
+    unknown = ClassMetrics(precision=0.0, recall=0.0, f1=0.0)
+    none = Amount(sources=0, segments=0, seconds=0.0)
+    figures = {name: metrics.classes.get(name, unknown) for name in classes}
+    amounts = {name: training.classes.get(name, none) for name in classes}
+    bias = description.decision_bias
+    new = {name: (name,) for name in classes if name not in description.classes}
+    labelled = {name: tuple(description.scenario.get(name, [name])) for name in description.classes}
+    before = Scenario(description.scenario_name, labelled)
+    kept = before.with_classes(name for name in classes if name not in new)
+    labels = kept.with_taught(new).classes
+    update = {
+        "classes": list(classes),
+        "scenario": {name: list(labels[name]) for name in classes},
+        "decision_bias": {name: value for name, value in bias.items() if name in classes},
+        "metrics": metrics.model_copy(update={"classes": figures, "confusion": confusion.tolist()}),
+        "training_data": training.model_copy(update={"classes": amounts}),
+    }
+    return description.model_copy(update=update)
+
+
+def _left_out(
+    method: Method, examples: Examples, home: Indices, marked: Bool, description: Description
+) -> Float64:
+    """Return what a classifier says of parts of a home that it was not adapted to.
+
+    NaN for all but the home, and for all if too little of it is marked.
+    """
+    everything, count = np.arange(len(examples.target)), len(description.classes)
+    if marked.sum() < _FEWEST_SEGMENTS:
+        return np.full((len(everything), count), np.nan)
+    parts = [home[part] for part in _parts(marked)]
+    folds = [(np.setdiff1d(everything, part), part) for part in parts]
+    [decisions] = cross_validate([method], examples, count, folds, ignore_progress)
+    bias = np.array([description.decision_bias.get(name, 0.0) for name in description.classes])
+    return decisions + bias
+
+
+def _parts(marked: Bool) -> list[Indices]:
+    """Divide the segments of a home into parts, each with its share of the marked ones."""
+    of_marks, others = (np.array_split(np.flatnonzero(same), _FOLDS) for same in (marked, ~marked))
+    return [np.concatenate(pair) for pair in zip(of_marks, others, strict=True)]
+
+
+def _temperature_here(
+    left_out: Float64, examples: Examples, home: Indices, description: Description
+) -> float:
+    """Return the inverse temperature of a model adapted to a home, by parts of it left out.
+
+    Marks alone, of what was hard, would make it unsure of all the rest.
+    """
+    before = description.base_inverse_temperature or description.inverse_temperature
+    tried = home[np.isfinite(left_out[home]).all(axis=1)]
+    return home_temperature(left_out[tried], examples.target[tried], before)
+
+
+def _is_confirmed(home: Dataset) -> Bool:
+    names = np.array(home.collection_names)
+    confirmed: Bool = names[home.collection] == CONFIRMED
+    return confirmed
+
+
+def _confirmed(home: Dataset) -> dict[str, int]:
+    """Count the segments of each class that are as they were labelled."""
+    counts = np.bincount(home.target[_is_confirmed(home)], minlength=len(home.classes))
+    return {name: int(count) for name, count in zip(home.classes, counts, strict=True) if count}

@@ -1,0 +1,599 @@
+"""Sound of labelled clips: decoded, altered by rooms and microphones, and embedded."""
+
+import hashlib
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding.networks import find_network, load_embedder
+from hearthlog.models.embedding.projection import WINDOW_FRAMES, Int8
+from hearthlog.models.embedding.stream import SteadyNoise
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.floor import low_power
+from hearthlog.models.features.infrasound import InfrasoundFilter
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.framing import FrameCutter
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
+from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.messages.topics import EmbeddingSource
+
+NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
+MOST_SECONDS = 3600.0  # of a clip, which is held in memory
+
+
+class ClipSound(NamedTuple):
+    """The sound of a clip, without the frames that hold samples that are no numbers.
+
+    Attributes
+    ----------
+    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
+        of the file.
+    """
+
+    frames: Float32
+    breaks: Sequence[int] = ()
+    lost: int = 0
+
+
+def clip_frames(clip: LabelledClip) -> Float32:
+    """Read the frames of a clip, as of `read_clip`."""
+    return read_clip(clip).frames
+
+
+def read_clip(clip: LabelledClip) -> ClipSound:
+    """Read a clip.
+
+    Raise `SourceError` if the clip cannot be read completely, is longer than an hour, or has no
+    sample that is finite.
+    """
+    cutter = FrameCutter()
+    faults: list[str] = []
+    blocks: list[Float32] = []
+    left = round(MOST_SECONDS / FRAME_SECONDS)
+    for block in read_audio(clip.path, clip.start, clip.end, incomplete=faults.append):
+        blocks.append(cutter.push(block))
+        left -= len(blocks[-1])
+        if left < 0:
+            raise SourceError(
+                f"{clip.path}: is longer than an hour; give it a start and an end in the manifest"
+            )
+    if faults:
+        raise SourceError(faults[0])
+    frames = np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
+    is_finite = np.isfinite(frames).all(axis=1)
+    if is_finite.all():
+        return ClipSound(InfrasoundFilter()(frames))
+    if not is_finite.any():
+        raise SourceError(f"{clip.path}: {NO_NUMBERS}")
+    runs = np.split(np.arange(len(frames)), np.flatnonzero(np.diff(is_finite)) + 1)
+    sounds = [InfrasoundFilter()(frames[run]) for run in runs if is_finite[run[0]]]
+    breaks = np.cumsum([len(sound) for sound in sounds])[:-1]
+    return ClipSound(np.concatenate(sounds), breaks.tolist(), int((~is_finite).sum()))
+
+
+_COPIED_SHARE = 0.5  # of the copies are in a reverberant room, and as many by another microphone
+_REVERBERATION_SECONDS = (0.1, 0.6)  # until it has fallen by 60 dB
+_DIRECT_DB = (-6.0, 12.0)  # direct sound above the reverberation
+_DIRECT_SAMPLES = 48  # 3 ms without an echo
+_TILT_SHARE, _TILT = 0.6, (-3.0, 3.0)  # dB an octave
+_BUMPS, _BUMP_DB, _BUMP_OCTAVES, _BUMP_WIDTH = 3, (-6.0, 6.0), (-4.0, 3.0), (0.3, 1.0)
+_LIMITS_SHARE, _LOW_HERTZ, _HIGH_HERTZ = 0.5, (50.0, 300.0), (3000.0, 8000.0)
+_LIMITS_ORDER = 4  # of a Butterworth filter
+_SETTLING = 4000  # samples
+_GAIN_DB = (-20.0, 20.0)
+_SIGNAL_TO_NOISE_DB = (5.0, 30.0)
+_SILENCE_DBFS = (-85.0, -40.0)  # noise in a room where nothing happens
+_ROOM_NOISE_DBFS = (-100.0, -30.0)  # limits of all noise
+_STEADY_DBFS = (-85.0, -32.0)
+_SLOPES = (0.0, 0.25, 0.5, 0.75, 1.0)  # amplitude falls with the frequency to this power
+_LOWEST_HERTZ = 20.0
+_FLOOR_ERROR_DB = 1.5  # of a tracked floor, in each band
+_STEADY_SECONDS = 5
+
+
+class RoomCopy(NamedTuple):
+    """Features of a sound in a room.
+
+    Attributes
+    ----------
+    features : np.ndarray [shape=(n, d)], float32
+    floor : np.ndarray [shape=(b,)], float64
+        Floor of the room, as a tracker would have it; powers of the bands of the feature set.
+    """
+
+    features: Float32
+    floor: Float64
+
+
+def in_room(
+    frames: Float32, features: FeatureSet, rng: np.random.Generator, *, silence: bool
+) -> RoomCopy:
+    """Compute the features of a sound in a room with steady noise, by any microphone.
+
+    Parameters
+    ----------
+    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        At least one frame.
+    """
+    sound, level = other_room(frames, rng, silence=silence)
+    return in_noise(sound, level, features, rng, silence=silence)
+
+
+def other_room(
+    frames: Float32, rng: np.random.Generator, *, silence: bool
+) -> tuple[Float64, float]:
+    """Put a sound into another room, before another microphone, without the noise there.
+
+    Reverberation is exponentially decaying noise behind the direct sound, as in Moorer, "About this
+    reverberation business", 1979; a microphone has tilt, bumps and band limits.
+
+    Parameters
+    ----------
+    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        At least one frame.
+
+    Returns
+    -------
+    sound : np.ndarray [shape=(n * FRAME_SAMPLES,)], float64
+    level : float
+        Of the noise, in dBFS.
+    """
+    sound = frames.ravel().astype(np.float64) * 10.0 ** (rng.uniform(*_GAIN_DB) / 20.0)
+    if rng.random() < _COPIED_SHARE:
+        seconds, direct = rng.uniform(*_REVERBERATION_SECONDS), rng.uniform(*_DIRECT_DB)
+        sound = reverberated(sound, seconds, direct, rng)
+    if rng.random() < _COPIED_SHARE:
+        sound = filtered(sound, _microphone_response(rng))
+    noise_level = level_of(sound) - rng.uniform(*_SIGNAL_TO_NOISE_DB)
+    if silence:
+        noise_level = rng.uniform(*_SILENCE_DBFS)
+    return sound, float(np.clip(noise_level, *_ROOM_NOISE_DBFS))
+
+
+def in_noise(
+    sound: Float64, level: float, features: FeatureSet, rng: np.random.Generator, *, silence: bool
+) -> RoomCopy:
+    """Compute the features of a sound in steady noise.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+        Samples of whole frames at 16 kHz, at least one frame.
+    level : float
+        Of the noise, in dBFS.
+    """
+    noise = steady_noise(len(sound), level, rng)
+    copy = captured(sound + noise, features)
+    assert features.band_powers is not None
+    if silence:
+        floor = low_power(features.band_powers(copy))
+    else:
+        floor = features.band_powers(captured(noise, features)).mean(axis=0)
+    return RoomCopy(copy, floor * _floor_error(len(floor), rng))
+
+
+def level_of(sound: Float64) -> float:
+    """Return the mean level of a sound in dBFS, not below -120.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+    """
+    return float(10.0 * np.log10(np.mean(np.square(sound, dtype=np.float64)) + 1e-12))
+
+
+def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
+    """Compute the features of some seconds of steady noise."""
+    level = rng.uniform(*_STEADY_DBFS)
+    noise = steady_noise(_STEADY_SECONDS * SAMPLE_RATE, level, rng)
+    copy = captured(noise, features)
+    assert features.band_powers is not None
+    floor = low_power(features.band_powers(copy), rng.uniform(0.05, 0.5))
+    return RoomCopy(copy, floor * _floor_error(len(floor), rng))
+
+
+def reverberated(
+    sound: Float64, seconds: float, direct: float, rng: np.random.Generator
+) -> Float64:
+    """Put a sound into a reverberant room.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+        Samples at 16 kHz.
+    seconds : float
+        Until the reverberation has fallen by 60 dB (RT60).
+    direct : float
+        Direct sound above the reverberation, in dB.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+        Of the same power.
+    """
+    from scipy.signal import fftconvolve  # noqa: PLC0415  what reads a home needs no rooms
+
+    time = np.arange(int(seconds * SAMPLE_RATE)) / SAMPLE_RATE
+    response = rng.standard_normal(len(time)) * 10.0 ** (-3.0 * time / seconds)
+    response[:_DIRECT_SAMPLES] = 0.0
+    response *= 10.0 ** (-direct / 20.0) / np.sqrt(np.square(response).sum())
+    response[0] = 1.0
+    return _of_power(fftconvolve(sound, response)[: len(sound)], sound)
+
+
+def filtered(sound: Float64, response: Callable[[Float64], Float64]) -> Float64:
+    """Change the spectrum of a sound.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+        Samples at 16 kHz.
+    response : callable
+        Maps frequencies in hertz to dB.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+        Of the same power.
+    """
+    count = len(sound) + _SETTLING + len(sound) % 2
+    frequencies = np.linspace(0.0, SAMPLE_RATE / 2, count // 2 + 1)
+    gain = 10.0 ** (response(frequencies) / 20.0)
+    return _of_power(np.fft.irfft(np.fft.rfft(sound, count) * gain, count)[: len(sound)], sound)
+
+
+def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
+    """Return the response of a microphone that is deaf below and above, in dB.
+
+    Parameters
+    ----------
+    frequencies : np.ndarray [shape=(n,)], float64
+        In hertz.
+    low, high : float
+        In hertz; there the response is -3 dB.
+    """
+    frequencies = np.maximum(frequencies, 1.0)
+    order = 2 * _LIMITS_ORDER
+    below, above = 1.0 + (low / frequencies) ** order, 1.0 + (frequencies / high) ** order
+    limits: Float64 = -10.0 * np.log10(below * above)
+    return limits
+
+
+def octaves_of(frequencies: Float64) -> Float64:
+    """Return how many octaves frequencies are above 1 kHz.
+
+    Parameters
+    ----------
+    frequencies : np.ndarray [shape=(n,)], float64
+        In hertz; those below 30 count as 30.
+    """
+    octaves: Float64 = np.log2(np.maximum(frequencies, 30.0) / 1000.0)
+    return octaves
+
+
+def _microphone_response(rng: np.random.Generator) -> Callable[[Float64], Float64]:
+    """Draw the response of a microphone."""
+    tilt = rng.uniform(*_TILT) * (rng.random() < _TILT_SHARE)
+    count = _BUMPS if rng.random() < _TILT_SHARE else 0
+    bumps = [
+        (rng.uniform(*_BUMP_DB), rng.uniform(*_BUMP_OCTAVES), rng.uniform(*_BUMP_WIDTH))
+        for _ in range(count)
+    ]
+    limited = rng.random() < _LIMITS_SHARE
+    low = float(np.exp(rng.uniform(*np.log(_LOW_HERTZ))))
+    high = rng.uniform(*_HIGH_HERTZ)
+
+    def response(frequencies: Float64) -> Float64:
+        octaves = octaves_of(frequencies)
+        decibels = tilt * octaves
+        for height, place, width in bumps:
+            decibels = decibels + height * np.exp(-0.5 * ((octaves - place) / width) ** 2)
+        return decibels + band_limits(frequencies, low, high) if limited else decibels
+
+    return response
+
+
+def _of_power(changed: Float64, sound: Float64) -> Float64:
+    """Give a changed sound the power of the original."""
+    factor: float = np.sqrt(np.square(sound).mean() / (np.square(changed).mean() + 1e-20))
+    return changed * factor
+
+
+def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
+    """Make Gaussian noise whose spectrum falls by 0 to 6 dB an octave.
+
+    Parameters
+    ----------
+    level : float
+        In dBFS.
+
+    Returns
+    -------
+    np.ndarray [shape=(count,)], float64
+    """
+    spectrum = np.fft.rfft(rng.standard_normal(count))
+    frequencies = np.maximum(np.fft.rfftfreq(count, 1.0 / SAMPLE_RATE), _LOWEST_HERTZ)
+    noise = np.fft.irfft(spectrum / frequencies ** rng.choice(_SLOPES), count)
+    scaled: Float64 = noise * (10.0 ** (level / 20.0) / np.sqrt(np.mean(np.square(noise))))
+    return scaled
+
+
+def captured(sound: Float64, features: FeatureSet) -> Float32:
+    """Compute the features of a sound as a microphone of 16 bits captures it.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+        Samples of whole frames at 16 kHz in full scale; those beyond it are clipped.
+
+    Returns
+    -------
+    np.ndarray [shape=(n / FRAME_SAMPLES, d)], float32
+    """
+    samples = np.clip(np.rint(sound * 32767.0), -32768, 32767) / 32768.0
+    return features.extractor()(samples.astype(np.float32).reshape(-1, FRAME_SAMPLES))
+
+
+def _floor_error(bands: int, rng: np.random.Generator) -> Float64:
+    error: Float64 = 10.0 ** (rng.normal(0.0, _FLOOR_ERROR_DB, bands) / 10.0)
+    return error
+
+
+AS_IT_IS, IN_A_ROOM, SHORT = 0, 1, 2  # versions of windows
+
+_WINDOW = WINDOW_FRAMES * FRAME_SAMPLES
+_HALF = _WINDOW // 2
+_HOP, _HOP_IN_ROOM = 4000, 8000  # samples: windows in a room cost as much, and teach less
+_FILLED = 0.5  # of a window, by a clip that is long enough
+_FILLED_BY_SHORT = 0.45  # of a clip that is shorter
+_PADDING_DBFS = -75.0  # where a clip is silent, no room is
+_MOST_WINDOWS = 32  # windows of a version of a clip, evenly spaced
+_MIDDLE = 2000  # samples on either side of the middle of a window
+_BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB, that the middle of a window may be
+_SHORT_SECONDS = (0.3, 0.3, 0.6, 0.6)
+SHORT_PARTS = len(_SHORT_SECONDS)  # of a clip
+_SHORT_NOISE_DBFS = (-80.0, -60.0)
+_SHORT_PLACE = (0.1, 0.9)  # of the window, in which a short part lies
+_FAINTER_DB = (-20.0, 0.0)  # every other short part
+_NEAR, _FAR = 5, 1 << 60  # frames
+_EMBEDDING_SEED = 20_261_126
+
+
+class Embeds(Protocol):
+    """Embeds a window of 20 frames, as `Embedder` does: the integers that are logged."""
+
+    def __call__(self, window: Float32) -> Int8:
+        """Compute the integers of a window."""
+
+
+class ClipEmbeddings(NamedTuple):
+    """Windows of a clip.
+
+    Attributes
+    ----------
+    values : np.ndarray [shape=(m, W)], int8
+        As they are logged.
+    version : np.ndarray [shape=(m,)], intp
+        `AS_IT_IS`, `IN_A_ROOM` or `SHORT`.
+    taught : np.ndarray [shape=(m,)], bool
+        Whether heads learn from the window; the others are where the sound is faint.
+    starts : np.ndarray [shape=(m,)], intp
+        Frames of the clip at which windows as it is begin; below 0 before it. 0 of other versions.
+    """
+
+    values: Int8
+    version: Indices
+    taught: Bool
+    starts: Indices
+
+    def at(self, start: int) -> Int8:
+        """Return the window nearest to one that begins at a frame, at most five frames from it.
+
+        Returns
+        -------
+        np.ndarray [shape=(1 or 0, W)], int8
+            None if there is none so near.
+        """
+        away = np.where(self.version == AS_IT_IS, np.abs(self.starts - start), _FAR)
+        nearest = int(away.argmin()) if len(away) else 0
+        return self.values[nearest : nearest + int(len(away) > 0 and away[nearest] <= _NEAR)]
+
+    def part(self, rows: slice) -> "ClipEmbeddings":
+        """Return some of the windows."""
+        return ClipEmbeddings(
+            self.values[rows], self.version[rows], self.taught[rows], self.starts[rows]
+        )
+
+
+class ClipEmbedder:
+    """Embeds the windows of clips, those of each clip once."""
+
+    def __init__(self, embed: Embeds, seed: int = 0) -> None:
+        self._embed, self._seed = embed, seed
+        self.source: EmbeddingSource | None = getattr(embed, "source", None)
+        self._done: dict[bytes, ClipEmbeddings] = {}
+
+    def __call__(self, frames: Float32, segments: Indices, *, silence: bool) -> ClipEmbeddings:
+        """Embed the windows of a clip, as of `clip_embeddings`."""
+        digest = hashlib.sha256(np.ascontiguousarray(frames).tobytes())
+        digest.update(segments.astype("<i8").tobytes() + bytes([silence]))
+        key = digest.digest()
+        if key not in self._done:
+            self._done[key] = clip_embeddings(
+                frames, self._embed, segments, silence=silence, seed=self._seed
+            )
+        return self._done[key]
+
+
+def clip_embeddings(
+    frames: Float32, embed: Embeds, segments: Indices, *, silence: bool, seed: int = 0
+) -> ClipEmbeddings:
+    """Embed the windows of a clip; the same clip and seed give the same ones.
+
+    A home gives windows that a sound fills in part, short sounds, and other rooms; so do these.
+
+    Parameters
+    ----------
+    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        At least one.
+    segments : np.ndarray [shape=(k,)], intp
+        Frames at which the segments of the clip begin, multiples of five: these windows are
+        embedded in any case.
+    silence : bool
+        Whether nothing happens in the clip: then only its segments are embedded.
+    """
+    digest = hashlib.blake2b(np.ascontiguousarray(frames).tobytes(), digest_size=8).digest()
+    rng = np.random.default_rng([_EMBEDDING_SEED + seed, int.from_bytes(digest, "little")])
+    sound, parts = frames.ravel().astype(np.float64), []
+    padded = _padded(
+        sound, 10.0 ** (_PADDING_DBFS / 20.0) * rng.standard_normal(_padding_samples(sound))
+    )
+    taught = np.empty(0, np.intp) if silence else _taught(padded, len(sound), _HOP)
+    middles = np.union1d(taught, segments * FRAME_SAMPLES + _HALF)
+    parts.append(
+        _embedded(padded, middles, embed, AS_IT_IS)._replace(
+            taught=np.isin(middles, taught), starts=(middles - _HALF) // FRAME_SAMPLES
+        )
+    )
+    if not silence:
+        echoing, level = other_room(frames, rng, silence=False)
+        noise = steady_noise(_padding_samples(sound), level, rng)
+        of_room = _noise_of(noise)
+        padded = _padded(echoing, noise)
+        padded = np.clip(np.rint(padded * 32767.0), -32768, 32767) / 32768.0
+        middles = _taught(padded, len(sound), _HOP_IN_ROOM)
+        in_room = _embedded(
+            padded, middles, lambda window: embed(of_room.reduced(window)), IN_A_ROOM
+        )
+        parts.append(in_room)
+        shorts = [embed(window) for window in _short_parts(sound, rng)]
+        count = len(shorts)
+        parts.append(
+            ClipEmbeddings(
+                np.stack(shorts),
+                np.full(count, SHORT),
+                np.ones(count, bool),
+                np.zeros(count, np.intp),
+            )
+        )
+    return ClipEmbeddings(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _padding_samples(sound: Float64) -> int:
+    """Return the samples of a sound with half a window before and behind it."""
+    return len(sound) + 2 * _HALF
+
+
+def _padded(sound: Float64, noise: Float64) -> Float64:
+    noise[_HALF : _HALF + len(sound)] += sound
+    return noise
+
+
+def _taught(padded: Float64, count: int, hop: int) -> Indices:
+    """Return the middles of the windows to learn from, in samples of the clip.
+
+    They are filled well enough, and not faint in their middle.
+    """
+    middles = np.arange(0, count + 1, hop)
+    filled = np.minimum(middles + _HALF, count) - np.maximum(middles - _HALF, 0)
+    enough = min(_FILLED * _WINDOW, _FILLED_BY_SHORT * count)
+    power = np.concatenate([[0.0], np.cumsum(np.square(padded))])
+    middle = power[middles + _HALF + _MIDDLE] - power[middles + _HALF - _MIDDLE]
+    chosen = middles[(filled >= enough) & (middle > _BELOW_CLIP * middle.mean())]
+    kept = np.linspace(0, len(chosen) - 1, min(len(chosen), _MOST_WINDOWS)).round().astype(np.intp)
+    return chosen[kept]
+
+
+def _embedded(padded: Float64, middles: Indices, embed: Embeds, version: int) -> ClipEmbeddings:
+    windows = [_window(padded[middle : middle + _WINDOW]) for middle in middles.tolist()]
+    values, count = [embed(window) for window in windows], len(middles)
+    if not values:  # as wide as any
+        return _embedded(padded, np.zeros(1, np.intp), embed, version).part(slice(0))
+    return ClipEmbeddings(
+        np.stack(values),
+        np.full(count, version),
+        np.ones(count, bool),
+        np.zeros(count, np.intp),
+    )
+
+
+def _window(samples: Float64) -> Float32:
+    window = np.zeros(_WINDOW, np.float32)
+    window[: len(samples)] = samples
+    return window.reshape(WINDOW_FRAMES, FRAME_SAMPLES)
+
+
+def _short_parts(sound: Float64, rng: np.random.Generator) -> Iterator[Float32]:
+    """Yield windows of faint noise with a short part of a sound somewhere, the loudest one."""
+    power = np.concatenate([[0.0], np.cumsum(np.square(sound))])
+    for number, seconds in enumerate(_SHORT_SECONDS):
+        length = min(int(seconds * SAMPLE_RATE), len(sound))
+        loudest = int(np.argmax(power[length:] - power[:-length]))
+        part = sound[loudest : loudest + length] * np.hanning(length) ** 0.1  # no clicks
+        if number % 2:
+            part *= 10.0 ** (rng.uniform(*_FAINTER_DB) / 20.0)
+        level = rng.uniform(*_SHORT_NOISE_DBFS)
+        window = 10.0 ** (level / 20.0) * rng.standard_normal(_WINDOW)
+        of_room = _noise_of(window)
+        first, last = _SHORT_PLACE[0] * _WINDOW, _SHORT_PLACE[1] * _WINDOW - length
+        place = int(rng.uniform(first, last))
+        window[place : place + length] += part
+        yield of_room.reduced(_window(window))
+
+
+def _noise_of(samples: Float64) -> SteadyNoise:
+    """Return the noise of a room in which there is nothing else, as it is learned there."""
+    noise = SteadyNoise()
+    for first in range(0, len(samples) - _WINDOW + 1, _WINDOW):
+        noise.learn(_window(samples[first : first + _WINDOW]))
+    return noise
+
+
+def model_embedder(model: Model) -> ClipEmbedder | None:
+    """Return what hears clips for the heads of a model; None if it has none.
+
+    Without its network, or with another projection, a `HearthlogWarning` says that the model is
+    tried without it.
+
+    Parameters
+    ----------
+    model : Model
+    """
+    mix = model.description.embedding
+    if mix is None:
+        return None
+    try:
+        embedder = network_embedder(mix.network)
+        source = embedder.source
+        if source is not None and source.space == mix.space:
+            return embedder
+        why = f"it was learned with another projection of the network {mix.network}"
+    except ModelError as error:
+        why = str(error)
+    name = model.name or model.description.scenario_name
+    text = f"a model is tried by the features alone: {why}"
+    warnings.warn(HearthlogWarning(text, f"model {name}"), stacklevel=2)
+    return None
+
+
+@lru_cache(maxsize=2)
+def network_embedder(network: str, seed: int = 0) -> ClipEmbedder:
+    """Return what hears clips by a network.
+
+    Raise `ModelError` if it is not known, not there, another file, or cannot be used.
+    """
+    path = find_network(network)
+    if path is None:
+        raise ModelError(
+            f"the network {network} is not here; fetch it: hearthlog models fetch {network}"
+        )
+    return ClipEmbedder(load_embedder(network, path), seed)

@@ -1,0 +1,167 @@
+"""Likelihood of each direction for each class, from the marks of a home."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hearthlog.models.classes import SILENCE
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.evidence import SECTORS, Directions, sectors_of
+from hearthlog.models.classifiers.model import (
+    FORMAT,
+    FORMAT_OF_DIRECTIONS,
+    MOST_ARRAYS,
+    Model,
+)
+from hearthlog.schemas.arrays import Float64, Indices, Int64
+from hearthlog.schemas.frames import NANOSECONDS
+
+_SPREAD = np.deg2rad(10.0)  # of a sound that is always at one place
+_DOUBT = 2.0  # sounds, with which a direction says half as much as with many
+_WITNESSES = 2.0  # as many as the blocks of a second are together
+_MOST = 4.0
+_ONE_SOUND = 10 * NANOSECONDS  # in which a class is at one place
+_HOUR = 3600 * NANOSECONDS
+_AGAIN = np.linspace(0, 0.95, 20)  # shares of the sounds that come from a place of before
+
+
+class DirectionSample(NamedTuple):
+    """Whence a recording came.
+
+    Attributes
+    ----------
+    microphone : str
+        Name of the array.
+    start : int
+        When, in nanoseconds of UTC.
+    shares : np.ndarray [shape=(S,)], float64
+        Of the sectors of the circle; their sum is 1.
+    """
+
+    microphone: str
+    start: int
+    shares: Float64
+
+
+def sighting_of(microphone: str, directions: Directions) -> DirectionSample | None:
+    """Sum up the directions of a recording; None if it has none."""
+    weight = directions.confidences.astype(np.float64)
+    if not weight.sum() > 0:
+        return None
+    shares = np.bincount(sectors_of(directions.azimuths), weight, SECTORS)
+    return DirectionSample(microphone, int(directions.stamps[0]), shares / weight.sum())
+
+
+def with_directions(
+    model: Model, target: Indices, sightings: Sequence[DirectionSample | None]
+) -> Model:
+    """Let a model take the directions of the arrays of a home.
+
+    Parameters
+    ----------
+    model : Model
+        That takes none.
+    target : np.ndarray [shape=(n,)], intp
+        Classes of segments that it was learned from; those of silence say nothing.
+    sightings : sequence of (Sighting or None)
+        Whence they came, if that is known; empty if it is of none.
+    """
+    silence = model.classes.index(SILENCE) if SILENCE in model.classes else -1
+    located = zip(target.tolist(), sightings, strict=False)
+    told = [(number, one) for number, one in located if one is not None and number != silence]
+    arrays = sorted({one.microphone for _, one in told})[:MOST_ARRAYS]
+    weights = np.zeros((len(arrays), len(model.classes), SECTORS))
+    for number, array in enumerate(arrays):
+        classes, own = zip(*(each for each in told if each[1].microphone == array), strict=True)
+        weights[number] = _weights(np.array(classes), own, len(model.classes))
+    if not weights.any():
+        return model
+    update: dict[str, Any] = {"direction_microphones": arrays}
+    if model.description.format == FORMAT:
+        update["format"] = FORMAT_OF_DIRECTIONS
+    description = model.description.model_copy(update=update)
+    return replace(model, description=description, direction_weights=weights)
+
+
+def _weights(target: Indices, sightings: Sequence[DirectionSample], classes: int) -> Float64:
+    """Return logarithms of the likelihood of sectors with a class over that with any class."""
+    sounds = _sounds(target, sightings)
+    likely = np.full((classes, SECTORS), 1 / SECTORS)
+    counts = np.bincount(sounds.target, minlength=classes)
+    for number in np.flatnonzero(counts):
+        own = sounds.target == number
+        likely[number] = _likelihood(sounds.shares[own], sounds.hours[own])
+    anything = likely[counts > 0].mean(axis=0)
+    weights = np.clip(_WITNESSES * np.log(likely / anything), -_MOST, _MOST)
+    return weights * (counts / (counts + _DOUBT))[:, np.newaxis]
+
+
+def evidence_of(
+    classifier: Classifier, sightings: Sequence[DirectionSample | None]
+) -> Float64 | None:
+    """Return what is known of segments by whence they came, as `Classifier.classify` takes it.
+
+    Parameters
+    ----------
+    sightings : sequence of (Sighting or None)
+        Of n segments; empty if it is known of none.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64, or None
+        None if nothing is known.
+    """
+    evidence = np.zeros((len(sightings), len(classifier.classes)))
+    for row, one in enumerate(sightings):
+        weights = None if one is None else classifier.direction_weights(one.microphone)
+        if one is not None and weights is not None:
+            evidence[row] = weights @ one.shares
+    return evidence if len(evidence) else None
+
+
+class _Sounds(NamedTuple):
+    """Sounds, each of one class: whence they came, and in which hour."""
+
+    target: Indices
+    hours: Int64
+    shares: Float64
+
+
+def _sounds(target: Indices, sightings: Sequence[DirectionSample]) -> _Sounds:
+    """Join what is of a class within ten seconds, so that it counts once however it was marked."""
+    times = np.array([one.start for one in sightings], np.int64) // _ONE_SOUND
+    joined, row = np.unique(np.stack([target, times]), axis=1, return_inverse=True)
+    shares = np.zeros((joined.shape[1], SECTORS))
+    np.add.at(shares, row.ravel(), np.stack([one.shares for one in sightings]))
+    shares /= np.bincount(row.ravel())[:, np.newaxis]
+    return _Sounds(joined[0], joined[1] * _ONE_SOUND // _HOUR, shares)
+
+
+def _likelihood(shares: Float64, hours: Int64) -> Float64:
+    """Return how likely each sector is with a class.
+
+    How much of what was heard comes again from where it came is told by hours left out in turn:
+    that of a television nearly all, that of someone who walks about nearly nothing.
+    """
+    near = shares @ _smoothing()
+    others = (hours[:, np.newaxis] != hours).astype(np.float64)
+    tried = others.any(axis=1)
+    if not tried.any():
+        return np.full(SECTORS, 1 / SECTORS)
+    left_out = (others @ near)[tried] / others.sum(axis=1, keepdims=True)[tried]
+    again = _AGAIN[:, np.newaxis, np.newaxis]
+    likelihoods = np.log(again * left_out + (1 - again) / SECTORS)
+    best = _AGAIN[(likelihoods * shares[tried]).sum(axis=(1, 2)).argmax()]
+    best *= len(shares) / (len(shares) + 1)
+    likely: Float64 = best * near.mean(axis=0) + (1 - best) / SECTORS
+    return likely
+
+
+def _smoothing() -> Float64:
+    """Return how much of each sector is taken for each other one: von Mises, rows sum to 1."""
+    turn = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    near = np.exp((np.cos(turn - turn[:, np.newaxis]) - 1) / _SPREAD**2)
+    smoothing: Float64 = near / near.sum(axis=1, keepdims=True)
+    return smoothing

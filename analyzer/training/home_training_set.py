@@ -1,0 +1,253 @@
+"""Training set of a home: its marks with pseudo-labels."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.training.adaptation import base_classes
+from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, Recording, cut_recordings
+from hearthlog.analyzer.training.home_recordings import (
+    HOME,
+    HomeSound,
+    is_short_silence,
+    marked_recordings,
+    read_reviewed_sound,
+    teaching,
+)
+from hearthlog.analyzer.training.manifest import Scenario, scenario_of
+from hearthlog.analyzer.training.pseudo_labels import (
+    FEWEST,
+    MOST_CONFIRMED,
+    Candidates,
+    chosen,
+    confirmed_segments,
+    unreviewed_silence,
+    unreviewed_sounds,
+)
+from hearthlog.models.classes import (
+    OTHER,
+    OTHER_NEGATIVE,
+    SILENCE,
+    UNKNOWN,
+    class_name,
+    meant_by,
+)
+from hearthlog.models.classifiers.model import MOST_CLASSES, Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.messages.topics import EmbeddingSpace
+
+_FEWEST_DAYS = 2  # of a new class
+_FEWEST_SECONDS = 10.0
+_NO_SILENCE = (
+    "nowhere in the logs is it silent, as the model to be adapted hears it: by marks of other "
+    "sounds alone it would forget silence; mark some seconds in which nothing sounds as silence"
+)
+_NOT_LOOKED_AT = (
+    "no time of this home was looked at: only silence, and what the model is very sure of, is kept "
+    "as it is; what a review leaves alone, such as `hearthlog review --queue`, keeps more"
+)
+
+
+class HomeTrainingSet(NamedTuple):
+    """What a home teaches.
+
+    Attributes
+    ----------
+    segments : Dataset
+        Of the classes of the model that was adapted first, and new ones behind them; none if there
+        is nothing to learn from marks.
+    nothing : str
+        Why there is nothing to learn from marks; empty if there is.
+    """
+
+    segments: Dataset
+    notes: list[str]
+    nothing: str
+
+
+def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> HomeTrainingSet:
+    """Read what marks teach a model, and what it is to keep.
+
+    Parameters
+    ----------
+    scenario : str, optional
+        For which it labels: only what was marked of this scenario, by its name, is learned from;
+        else only what was marked of none.
+
+    Raises
+    ------
+    LogError
+        If there is no log, or if a log or a layer is damaged.
+    DataError
+        If there are marks, and all of them are in logs of other feature sets, or if there is no
+        silence to keep the model from forgetting it.
+    """
+    features = feature_set(model.description.feature_set)
+    marked: list[Recording] = []
+    candidates: list[Candidates] = []
+    counts, window = _Counts(), features.window_frames
+    for folder in folders:
+        space = model.description.embedding_space
+        read = read_reviewed_sound(folder, features, scenario, space)
+        sounds = list(_counted(read, counts, features))
+        marked += marked_recordings(sounds, folder, features, model.description.gate)
+        candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
+    taught, notes, unlearned = _with_new_classes(marked, model, features)
+    marked = [one for one in marked if one.label not in unlearned]
+    notes += counts.notes()
+    if note := counts.embedding_note(model):
+        notes.append(note)
+    in_room = [one for one in marked if one.floor is not None]
+    kept: list[Recording] = []
+    if marked:
+        kept = chosen(candidates, model)
+        if in_room and SILENCE in model.classes and _silent(kept) < MOST_CONFIRMED:
+            kept = chosen([*candidates, *unreviewed_silence(folders, model, scenario)], model)
+            if not _silent([*kept, *in_room]):
+                raise DataError(_NO_SILENCE)
+        if in_room:
+            kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model), scenario)
+        if in_room and not counts.looked_at:
+            notes.append(_NOT_LOOKED_AT)
+    segments = cut_recordings([*marked, *_as_unknown(kept, model, taught)], taught, features)
+    if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
+        segments = cut_recordings([], taught, features)
+    nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
+    return HomeTrainingSet(segments, notes, "" if len(segments) else nothing)
+
+
+class _Counts:
+    """What was seen of a home."""
+
+    def __init__(self) -> None:
+        self.marks = 0
+        self.left_out = 0  # as they teach nothing
+        self.short = 0  # pauses that are marked as silence
+        self.looked_at = False
+        self.by_embedding: Counter[EmbeddingSpace | None] = Counter()  # marks
+
+    def notes(self) -> list[str]:
+        """Say what of the marks is not learned from."""
+        notes = []
+        if self.left_out:
+            notes.append(
+                f"{self.left_out} of {self.marks} marks are not learned from: they say `unknown`, "
+                "or lie in time that was drawn at random to measure how right the labels are"
+            )
+        if self.short:
+            notes.append(
+                f"{self.short} of {self.marks} marks are of silence for less than a second: not "
+                "learned from, for there are other sounds beside it"
+            )
+        return notes
+
+    def embedding_note(self, model: Model) -> str:
+        """Say which marks teach by features alone, though there are networks; else nothing."""
+        wanted = model.description.embedding_space
+        others = sorted({each.network for each in self.by_embedding if each not in {None, wanted}})
+        if wanted is None and others:
+            return (
+                f"the logs have embeddings of {', '.join(others)}, which {model.name} does not "
+                "take: marks teach it by features alone"
+            )
+        left = sum(self.by_embedding.values()) - self.by_embedding[wanted]
+        if wanted is None or not left:
+            return ""
+        theirs = f" (some of {', '.join(others)}, or of another projection)" if others else ""
+        return (
+            f"{left} of {self.marks} marks lie in logs without embeddings of {wanted.network} as "
+            f"{model.name} takes them{theirs}: they teach by features alone"
+        )
+
+
+def _counted(
+    sounds: Iterable[HomeSound], counts: _Counts, features: FeatureSet
+) -> Iterator[HomeSound]:
+    """Leave out the marks that teach nothing, and count them."""
+    for sound in sounds:
+        taught = teaching(sound)
+        counts.marks += len(sound.marks)
+        counts.by_embedding[sound.embedding] += len(sound.marks)
+        counts.left_out += len(sound.marks) - len(taught.marks)
+        counts.short += sum(is_short_silence(mark, features) for mark in taught.marks)
+        counts.looked_at |= any(span.chosen != RANDOM for span in sound.reviewed)
+        yield taught
+
+
+def _with_new_classes(
+    marked: Sequence[Recording], model: Model, features: FeatureSet
+) -> tuple[Scenario, list[str], set[str]]:
+    """Return a scenario with the classes of which marks tell enough.
+
+    A label that the scenario counts as unknown makes its class like any other, and until then is
+    learned as unknown. Then what lacks of other classes, and the labels that cannot be learned.
+    """
+    known = scenario_of(model).with_classes(base_classes(model))
+    as_unknown = set(known.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}
+    listed = {*known.classes, *known.class_of} - as_unknown
+    others = [one for one in marked if not meant_by(one.label, listed)]
+    labels: dict[str, set[str]] = {}
+    for one in others:
+        labels.setdefault(class_name(one.label), set()).add(one.label)
+    every = {name: tuple(sorted(same)) for name, same in sorted(labels.items())}
+    amounts = cut_recordings(others, Scenario(known.name, every), features).amounts if every else {}
+    notes: list[str] = []
+    learned: dict[str, tuple[str, ...]] = {}
+    unlearned: set[str] = set()
+    for name, amount in amounts.items():
+        seconds = max(_FEWEST_SECONDS - amount.seconds, 0.0)
+        room = len(known.classes) + len(learned) < MOST_CLASSES
+        if room and not seconds and amount.sources >= _FEWEST_DAYS:
+            learned[name] = every[name]
+            continue
+        count = sum(class_name(one.label) == name for one in others)
+        whole = math.ceil(round(seconds, 3))
+        more = f"{whole} more {'second' if whole == 1 else 'seconds'}" if whole else "any"
+        day = ", from another day," if amount.sources < _FEWEST_DAYS else ""
+        what = "the model has no room for it"
+        if room:
+            what = f"{more}{day} {'make' if whole > 1 else 'makes'} it a class"
+        if any(meant_by(label, as_unknown) for label in every[name]):
+            what += "; until then they count as unknown"
+        else:
+            unlearned |= set(every[name])
+        notes.append(f"{count} {'mark' if count == 1 else 'marks'} of {name}: {what}")
+    return known.with_taught(learned), notes + _lumped(marked, known), unlearned
+
+
+def _lumped(marked: Sequence[Recording], known: Scenario) -> list[str]:
+    """Name the marks that are learned as a class of another name, such as `other`."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for one in marked:
+        name = known.find(one.label, marked=True)
+        if name in {OTHER, UNKNOWN} and (name == OTHER or class_name(one.label) == OTHER_NEGATIVE):
+            counts[class_name(one.label), name] += class_name(one.label) != name
+    return [
+        f"{count} {'mark' if count == 1 else 'marks'} of {label}: learned as {name}, "
+        "to which the model counts them"
+        for (label, name), count in sorted(counts.items())
+        if count
+    ]
+
+
+def _as_unknown(kept: Sequence[Recording], model: Model, taught: Scenario) -> Iterator[Recording]:
+    """Give what stays unknown a label that no new class of the home has taken."""
+    before = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]
+    after = taught.classes.get(UNKNOWN, (before,))[0]
+    for one in kept:
+        yield one._replace(label=after) if one.label == before else one
+
+
+def _seldom_kept(kept: Sequence[Recording], model: Model) -> set[str]:
+    """Name the classes that are hardly among what was left alone; without marks they would go."""
+    amounts = Counter(one.label for one in kept)
+    return {name for name in model.classes if amounts[name] < FEWEST} - {SILENCE, UNKNOWN}
+
+
+def _silent(recordings: Iterable[Recording]) -> int:
+    return sum(class_name(one.label) == SILENCE for one in recordings)

@@ -1,0 +1,41 @@
+"""Likeliest path of the hidden Markov model over a sound, by hmmlearn (not yet for Python 3.14)."""
+
+import numpy as np
+from hmmlearn.base import BaseHMM
+
+from hearthlog.models.labels.smoothing import log_likelihoods
+from hearthlog.schemas.arrays import Float32, Float64, Indices
+
+
+def viterbi(probabilities: Float32, transitions: Float64, weight: float = 1.0) -> Indices:
+    """Decode the likeliest path through a whole sound; all classes are equally likely to begin it.
+
+    Parameters
+    ----------
+    probabilities : np.ndarray [shape=(n, C)], float32
+        Of the classes, frame by frame, 0 to 1.
+    transitions : np.ndarray [shape=(C, C)], float64
+        Probability that a frame of the row's class is followed by one of the column's class.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], intp
+        Index of the class of each frame.
+
+    References
+    ----------
+    Viterbi, "Error bounds for convolutional codes", 1967.
+    """
+    count = len(transitions)
+    model = _LikelihoodHMM(count)
+    model.startprob_ = np.full(count, 1.0 / count)
+    model.transmat_ = transitions
+    path: Indices = model.predict(log_likelihoods(probabilities, weight))
+    return path
+
+
+class _LikelihoodHMM(BaseHMM):  # type: ignore[misc]
+    """A hidden Markov model whose observations are the log-likelihoods of its states."""
+
+    def _compute_log_likelihood(self, X: Float64) -> Float64:  # noqa: N803
+        return X
