@@ -33,8 +33,8 @@ from hearthlog.analyzer.report.daily_metrics import day_of
 from hearthlog.analyzer.report.home_metrics import whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
-from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.lanes import class_precision
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.accuracy_text import Accuracy
@@ -220,7 +220,7 @@ def test_a_review_counts_what_was_right_in_the_four_weeks_before_and_after(tmp_p
 
     def counted(days):
         home, day = find_home_logs([tmp_path]), DAY + timedelta(days=days)
-        return checked_classes(read_timeline([tmp_path], *day_span(day, UTC)), home)
+        return class_precision(read_timeline([tmp_path], *day_span(day, UTC)), home)
 
     wrong = {("b", "Coughing"): (1, 0, 0, 0, 0)}
     assert counted(20) == {("mic", "Coughing"): (1, 1, 1, 0, 0)}

@@ -8,7 +8,7 @@ from killed_workers import every_layers, layers, relabel_under_fire
 from scheduler_kills import run_and_kill, with_layers
 from simulated_fleet import write_fleet
 
-from hearthlog.analyzer.relabel.run import relabel
+from hearthlog.analyzer.relabel.relabel import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings

@@ -20,20 +20,20 @@ from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_la
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.spans import NONE
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
-from hearthlog.analyzer.review.queue.judgeable_spans import (
-    border_pieces,
-    judgeable_spans,
-    other_labels,
-)
-from hearthlog.analyzer.review.queue.ranking import make_queue
-from hearthlog.analyzer.review.queue.review_list import (
+from hearthlog.analyzer.review.ranking import make_queue
+from hearthlog.analyzer.review.review_list import (
     REASONS,
     ReviewSpan,
     queued,
     read_list,
     write_list,
 )
-from hearthlog.analyzer.review.queue.uncertainty import uncertainty
+from hearthlog.analyzer.review.spans import (
+    border_pieces,
+    judgeable_spans,
+    other_labels,
+    uncertainty,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, read_time, time_text
 from hearthlog.schemas.logs.columns import read_columns

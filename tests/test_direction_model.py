@@ -21,11 +21,10 @@ from safetensors.numpy import load, save
 
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.relabel.run import relabel
-from hearthlog.analyzer.replay.log_set import LogSet
-from hearthlog.analyzer.replay.options import ReplayOptions
+from hearthlog.analyzer.relabel.relabel import relabel
+from hearthlog.analyzer.replay.player import ReplayOptions
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
-from hearthlog.analyzer.replay.replay import replay
+from hearthlog.analyzer.replay.replay import LogSet, replay
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.direction_samples import (
     DirectionSample,

@@ -34,9 +34,9 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.live import examine_live
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write_marks
-from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
-from hearthlog.analyzer.review.timeline.model import LabelledSpans
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.lanes import timeline_lanes
+from hearthlog.analyzer.review.timeline import LabelledSpans
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.schemas.frames import NANOSECONDS, read_time
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path

@@ -25,8 +25,8 @@ from test_interoperability import plain
 from test_typescript import FOLDER, like, need_node
 from waiting import wait_for
 
-from hearthlog.analyzer.foxglove.admission import Admission, RefusedError
-from hearthlog.analyzer.foxglove.recording import Recording
+from hearthlog.analyzer.foxglove.publisher import RecordedSpan
+from hearthlog.analyzer.foxglove.server import Admission, RefusedError
 from hearthlog.analyzer.ports import free_port
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
@@ -558,7 +558,7 @@ def test_years_without_a_log_are_passed_over(logs, day, tmp_path):
     shutil.copy(max(find_logs(logs)), tmp_path / "home_2.mcap")
     command = [*HEARTHLOG, "record", day, "-o", tmp_path, "--start", "1970-01-01T00:01"]
     subprocess.run(command, check=True)
-    recording = Recording(find_logs(tmp_path), None, None, pytest.fail)
+    recording = RecordedSpan(find_logs(tmp_path), None, None, pytest.fail)
     read = []
     recording._between = lambda *span: read.append(span) or iter(())
     assert list(recording.messages(recording.start)) == []

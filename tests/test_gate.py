@@ -44,8 +44,8 @@ from hearthlog.analyzer.gate.recent_time import (
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list
-from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
+from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
+from hearthlog.analyzer.review.session import queue_spans, review_items
 from hearthlog.models.classifiers.model import Amount, Description
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.modelfile.registry import (

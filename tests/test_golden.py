@@ -39,7 +39,7 @@ from spliced import run as run_here
 
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import read_marks
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns

@@ -17,21 +17,19 @@ from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.logs.spans import NONE, cut, joined, one, pieces
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
-from hearthlog.analyzer.review.queue import asked
-from hearthlog.analyzer.review.queue.coverage import cover, sample
-from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
-from hearthlog.analyzer.review.queue.random_minutes import (
+from hearthlog.analyzer.review import review_list as asked
+from hearthlog.analyzer.review.candidates import (
     MINUTE,
-    Minutes,
+    RecordedMinutes,
     draw_minutes,
     whole_minutes,
 )
-from hearthlog.analyzer.review.queue.ranking import worth
-from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list
-from hearthlog.analyzer.review.queue.span_sounds import labelling_model, span_sounds
-from hearthlog.analyzer.review.session.marking import Marking
-from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
-from hearthlog.analyzer.review.timeline.model import no_spans
+from hearthlog.analyzer.review.marking import Marking
+from hearthlog.analyzer.review.ranking import cover, sample, worth
+from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
+from hearthlog.analyzer.review.session import queue_spans, review_items
+from hearthlog.analyzer.review.spans import JudgeableSpans, labelling_model, span_sounds
+from hearthlog.analyzer.review.timeline import no_spans
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.log.clips import ClipWriter, KeptSound
@@ -114,14 +112,14 @@ def test_a_minute_is_one_of_the_clock_that_is_labelled_from_start_to_end():
 
 
 def test_three_of_four_minutes_that_are_drawn_have_a_sound():
-    night = Minutes(np.arange(1000) * MINUTE, np.arange(1000) % 20 == 0)
+    night = RecordedMinutes(np.arange(1000) * MINUTE, np.arange(1000) % 20 == 0)
     drawn = draw_minutes(night, 20)
     assert night.has_sound[drawn // MINUTE].sum() == 15
     assert len(draw_minutes(night, 2000)) == 1000
 
 
 def test_no_minute_is_drawn_twice_nor_one_that_is_reviewed_and_the_draw_repeats_itself():
-    minutes = Minutes(np.arange(60) * MINUTE, np.arange(60) % 3 > 0)
+    minutes = RecordedMinutes(np.arange(60) * MINUTE, np.arange(60) % 3 > 0)
     seen = []
     for _ in range(10):
         taken = joined(np.array([*seen, 5 * MINUTE + 7]), np.array([*seen, 5 * MINUTE]) + MINUTE)
@@ -134,7 +132,7 @@ def test_no_minute_is_drawn_twice_nor_one_that_is_reviewed_and_the_draw_repeats_
 
 
 def test_every_minute_of_a_kind_is_as_likely():
-    minutes = Minutes(np.arange(40) * MINUTE, np.ones(40, bool))
+    minutes = RecordedMinutes(np.arange(40) * MINUTE, np.ones(40, bool))
     first = [int(draw_minutes(minutes, 1, range(k))[0]) // MINUTE for k in range(400)]
     assert np.bincount(first, minlength=40).max() <= 24
     assert len(set(first)) == 40
@@ -350,7 +348,7 @@ def test_a_minute_whose_log_is_gone_has_no_lines():
     minutes = [(START, end), (end, end + MINUTE)]
     spans = [ReviewSpan("mic", *each, "live", "", "", "", None, RANDOM) for each in minutes]
     marks = [Mark("mic", START, middle, "speech"), Mark("mic", middle, end, "music")]
-    kept = asked.KeptSound({}, "/mic/audio", one(START, end + MINUTE))
+    kept = asked.KeptSoundLayers({}, "/mic/audio", one(START, end + MINUTE))
     files = asked.sound_files(marks, spans, kept)
     assert [(file.first, file.last) for file in files] == [(1, 1), (2, 2), (1, 2)]
     lines = asked.label_lines(marks, spans, files, "ten", UTC).splitlines()
@@ -389,5 +387,5 @@ def test_fewer_spans_than_asked_are_said(home, tmp_path, capfd):
 
 
 def test_of_no_minutes_none_is_drawn():
-    nothing = Minutes(np.empty(0, np.int64), np.empty(0, bool))
+    nothing = RecordedMinutes(np.empty(0, np.int64), np.empty(0, bool))
     assert draw_minutes(nothing, 5, (), NONE).tolist() == []

@@ -10,9 +10,9 @@ from viewers import patiently, pixels
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.timeline.model import SoundClip
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.analyzer.review.viewer.window import open_hidden
+from hearthlog.analyzer.review.timeline import SoundClip
+from hearthlog.analyzer.review.timeline_reader import read_timeline
+from hearthlog.analyzer.review.viewer.viewer import open_hidden
 
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND

@@ -29,11 +29,9 @@ from waiting import wait_for
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.logs.layers import find_chains
-from hearthlog.analyzer.relabel import labels
-from hearthlog.analyzer.relabel.jobs import Job
-from hearthlog.analyzer.relabel.labels import complete_layer, label_logs
-from hearthlog.analyzer.relabel.layer import read_layer_metadata
-from hearthlog.analyzer.relabel.run import relabel
+from hearthlog.analyzer.relabel import layer as labels
+from hearthlog.analyzer.relabel.layer import Job, complete_layer, label_logs, read_layer_metadata
+from hearthlog.analyzer.relabel.relabel import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.analyzer.workers.workers import InlineWorkers
 from hearthlog.models.classifiers.classifier import label_timing

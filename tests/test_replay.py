@@ -25,9 +25,8 @@ from rewriting import Log
 from together import record_together
 from waiting import wait_for
 
-from hearthlog.analyzer.replay.log_set import LogSet
-from hearthlog.analyzer.replay.options import ReplayOptions
-from hearthlog.analyzer.replay.replay import find_model
+from hearthlog.analyzer.replay.player import ReplayOptions
+from hearthlog.analyzer.replay.replay import LogSet, find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier, label_timing

@@ -27,14 +27,18 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
-from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
-from hearthlog.analyzer.review.queue.review_list import write_list
-from hearthlog.analyzer.review.session.marking import Marking
-from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
-from hearthlog.analyzer.review.session.session import ReviewItem, Session
-from hearthlog.analyzer.review.session.sound import sound_of
-from hearthlog.analyzer.review.timeline.model import SoundClip
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.marking import Marking
+from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
+from hearthlog.analyzer.review.review_list import write_list
+from hearthlog.analyzer.review.session import (
+    ReviewItem,
+    ReviewSession,
+    queue_spans,
+    review_items,
+    sound_of,
+)
+from hearthlog.analyzer.review.timeline import SoundClip
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -283,7 +287,7 @@ class Sitting:
         self.heard = []
         marking = marking_of(home)
         self.labelled = marking.labelled
-        self.session = Session(
+        self.session = ReviewSession(
             self.screen,
             marking,
             ["silence", "speech", "coughing"],

@@ -28,11 +28,10 @@ from hearthlog.analyzer.marks.marks import (
     read_review,
     write_marks,
 )
-from hearthlog.analyzer.review.session.marking import Marking
-from hearthlog.analyzer.review.session.queue_items import queue_spans
-from hearthlog.analyzer.review.session.session import Session
-from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.lanes import timeline_lanes
+from hearthlog.analyzer.review.marking import Marking
+from hearthlog.analyzer.review.session import ReviewSession, queue_spans
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.training.home_recordings import lesson_recordings
 from hearthlog.analyzer.training.speakers import SPEAKERS, speaker_recordings
 from hearthlog.models.features.installed import DEFAULT
@@ -99,7 +98,7 @@ def test_a_review_marks_the_classes_of_a_scenario_in_a_lane_of_their_own(home):
     assert ("tap_water" in heard.classes, "speech" in heard.classes) == (False, True)
     marking = Marking("mic", timeline.coverage["mic"], "Ann", WATER, segments[WATER], "water")
     screen = Screen()
-    session = Session(screen, marking, classes, UTC, print, print, print)
+    session = ReviewSession(screen, marking, classes, UTC, print, print, print)
     screen.marked = span = START + 2 * SECOND, START + 4 * SECOND
     key = {text: key for key, text in session.keys}["water tap"]
 

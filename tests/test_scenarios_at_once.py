@@ -38,8 +38,8 @@ from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
-from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.lanes import timeline_lanes
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model

@@ -18,7 +18,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.review.queue.span_sounds import labelling_model
+from hearthlog.analyzer.review.spans import labelling_model
 from hearthlog.analyzer.training.pseudo_labels import unreviewed_silence, unreviewed_sounds
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -11,8 +11,8 @@ from lossy import LossySource
 from rewriting import Log
 
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.analyzer.replay.log_set import LogSet
-from hearthlog.analyzer.replay.options import ReplayOptions
+from hearthlog.analyzer.replay.player import ReplayOptions
+from hearthlog.analyzer.replay.replay import LogSet
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import (
     FRAME_SECONDS,

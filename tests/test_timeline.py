@@ -29,27 +29,31 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.review.timeline import read_timeline as reading
-from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
-from hearthlog.analyzer.review.timeline.decode import worded
-from hearthlog.analyzer.review.timeline.disagreements import disagreements
-from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
-from hearthlog.analyzer.review.timeline.home_clock import home_clock
-from hearthlog.analyzer.review.timeline.lanes import reviewed_lane, timeline_lanes
-from hearthlog.analyzer.review.timeline.model import (
+from hearthlog.analyzer.review import timeline_reader as reading
+from hearthlog.analyzer.review.lanes import (
+    class_precision,
+    disagreements,
+    reviewed_lane,
+    timeline_lanes,
+    timeline_plots,
+)
+from hearthlog.analyzer.review.timeline import (
+    GridMeans,
     GridSeries,
     LabelledSpans,
     LabellingTimeline,
     LogLines,
     MicrophoneTimeline,
     Timeline,
+    TimelineGrid,
+    home_clock,
     no_spans,
+    worded,
 )
-from hearthlog.analyzer.review.timeline.plots import timeline_plots
-from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeline
+from hearthlog.analyzer.review.timeline_reader import SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import DrawnLane
-from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import in_words
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -523,7 +527,7 @@ def test_the_time_zone_is_that_of_the_logs_unless_another_one_is_said(tmp_path):
 def grids(draw):
     start = draw(st.integers(0, 2**61))
     count = draw(st.integers(1, 50))
-    return Grid(start, start + draw(st.integers(count, 40 * 86_400 * SECOND)), count)
+    return TimelineGrid(start, start + draw(st.integers(count, 40 * 86_400 * SECOND)), count)
 
 
 @given(grids(), st.data())
@@ -610,7 +614,7 @@ def lanes_of(*labellings, **more):
     empty = dict.fromkeys(("features", "level", "floor")) | {"level_frames": [], "clips": []}
     microphone = MicrophoneTimeline("mic", list(labellings), **(nothing | empty | more))
     lines = LogLines(*(np.empty(0, kind) for kind in (np.int64, np.int64, object)))
-    timeline = Timeline(Grid(0, 100 * SECOND, 10), {"mic": microphone}, lines, "UTC", {})
+    timeline = Timeline(TimelineGrid(0, 100 * SECOND, 10), {"mic": microphone}, lines, "UTC", {})
     return [(lane.labelling, lane.name, as_list(lane.spans)) for lane in timeline_lanes(timeline)]
 
 
@@ -778,7 +782,7 @@ def test_beside_a_class_of_the_recorder_stands_how_many_of_its_sounds_were_right
             names[entity] = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1][0]
     live = {entity: text for entity, text in names.items() if "/names/live/" in entity}
     told = {text for text in live.values() if " · " in text}
-    checked = checked_classes(read_timeline([home]), find_home_logs([home]))
+    checked = class_precision(read_timeline([home]), find_home_logs([home]))
     assert told == {f"{name} · {n.right}/{n.labelled} right" for (_, name), n in checked.items()}
     assert len(told) < len(live)
     others = {text for entity, text in names.items() if entity not in live}
@@ -927,9 +931,9 @@ _SAVE = """
 import pathlib, resource, sys
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.review.lanes import class_precision
+from hearthlog.analyzer.review.timeline_reader import read_timeline
+from hearthlog.analyzer.review.viewer.recording import save_timeline
 timeline = read_timeline([pathlib.Path(sys.argv[1])])
 if limit := int(sys.argv[3]): resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 try: save_timeline(timeline, pathlib.Path(sys.argv[2]))

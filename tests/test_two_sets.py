@@ -14,8 +14,8 @@ from spliced import run
 
 from hearthlog.analyzer.logs import recorder_info
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.timeline.plots import FEATURES, timeline_plots
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.lanes import FEATURES, timeline_plots
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.training.home_recordings import home_recordings
 from hearthlog.analyzer.training.landmark_method import EMBEDDING
 from hearthlog.analyzer.training.train import DEFAULT as DEFAULT_METHOD

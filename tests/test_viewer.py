@@ -31,11 +31,11 @@ from viewers import (
 from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
+from hearthlog.analyzer.review.viewer.recording import save_timeline
+from hearthlog.analyzer.review.viewer.viewer import WindowViewer
 from hearthlog.analyzer.review.viewer.web import open_page
-from hearthlog.analyzer.review.viewer.window import WindowViewer
 from hearthlog.schemas.logs.files import find_logs
 
 __all__ = ["display", "short_sounds", "viewer"]  # fixtures
@@ -50,8 +50,8 @@ _LONG = 300 * 1_000_000_000
 _SAVING = """
 import re, sys
 from pathlib import Path
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.review.timeline_reader import read_timeline
+from hearthlog.analyzer.review.viewer.recording import save_timeline
 save_timeline(read_timeline([Path(sys.argv[1])]), Path(sys.argv[2]))
 print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 """

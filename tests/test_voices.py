@@ -39,9 +39,9 @@ from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
-from hearthlog.analyzer.review.timeline.model import LabelledSpans
-from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.lanes import timeline_lanes
+from hearthlog.analyzer.review.timeline import LabelledSpans
+from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.training.speakers import speaker_recordings
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.starter import GENERAL, starter_file

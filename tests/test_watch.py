@@ -23,18 +23,23 @@ from waiting import wait_for
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.ports import free_port
-from hearthlog.analyzer.review.timeline.live import LiveTimeline, last_time
-from hearthlog.analyzer.review.timeline.model import LogLines
-from hearthlog.analyzer.review.timeline.plots import FEATURES, FLOOR, LEVEL, NOVELTY, SHARES, Plot
-from hearthlog.analyzer.review.timeline.state_lanes import (
+from hearthlog.analyzer.review.lanes import (
+    FEATURES,
+    FLOOR,
+    GAP_STATE,
     GAPS,
-    NOT_HEARD,
+    LEVEL,
+    NOVELTY,
     RECORDER,
-    Changes,
+    SHARES,
+    Plot,
+    StateChanges,
     StateLane,
 )
-from hearthlog.analyzer.review.viewer.live import LiveServer
+from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
+from hearthlog.analyzer.review.timeline import LogLines
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
+from hearthlog.analyzer.review.viewer.recording import LiveServer
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -212,7 +217,9 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
         for number in range(600):  # three days
             times = seconds + number * 500 * SECOND
             shares = Plot(SHARES, "mic", "live", names, times, values)
-            server.show([shares, StateLane(RECORDER, "mic", Changes(times, ["phone_ring"] * 500))])
+            server.show(
+                [shares, StateLane(RECORDER, "mic", StateChanges(times, ["phone_ring"] * 500))]
+            )
             taken.append(psutil.Process().memory_info().rss)
         assert taken[-1] - taken[100] < 60_000_000
         with looking(server.url) as eye:
@@ -232,7 +239,7 @@ def test_lanes_are_sent_at_once_and_plots_every_few_seconds():
         wait_for(lambda: eye.newest() == begin)
         for second in (1, 2, 3):
             server.show([level(second)])
-        lane = Changes(np.array([begin + 2 * SECOND]), ["speech"])
+        lane = StateChanges(np.array([begin + 2 * SECOND]), ["speech"])
         server.show([StateLane(RECORDER, "mic", lane)])
         wait_for(lambda: eye.newest() == begin + 2 * SECOND)
         server.show([level(5)])
@@ -299,7 +306,7 @@ def test_what_was_not_heard_is_a_hole_in_lanes_and_lines(recorded):
     times, states = lane_states(found, GAPS)
     assert len(gaps)
     assert np.array_equal(times[::2], gaps["header.stamp"])
-    assert states == [NOT_HEARD, None] * len(gaps)
+    assert states == [GAP_STATE, None] * len(gaps)
     live_times, live_states = lane_states(found, RECORDER)
     level = [each for each in found if isinstance(each, Plot) and each.kind is LEVEL]
     holes = np.concatenate([each.times[np.isnan(each.values[:, 0])] for each in level])

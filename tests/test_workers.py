@@ -20,7 +20,6 @@ from distributed import Client
 from waiting import wait_for
 
 import hearthlog.analyzer.workers.cluster
-import hearthlog.analyzer.workers.members
 from hearthlog.analyzer.errors import LostClusterError, WorkerError
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.schemas.errors import HearthlogWarning, LogError
@@ -328,7 +327,7 @@ def cluster_of_one(address):
 
 
 def test_a_scheduler_that_stops_answering_is_gone(tmp_path, monkeypatch):
-    monkeypatch.setattr(hearthlog.analyzer.workers.members, "_SILENT_SECONDS", 1.0)
+    monkeypatch.setattr(hearthlog.analyzer.workers.cluster, "_SILENT_SECONDS", 1.0)
     with (
         scheduler_in(tmp_path) as (address, scheduler),
         worker_of(address, "--no-nanny"),

@@ -1,9 +1,31 @@
-"""The channels of a server, and what is said in them: messages as the log has them."""
+"""Publishing of messages to Foxglove: those of a growing log, and those of recorded ones."""
+
+import math
+import time
+from collections.abc import Callable, Collection, Generator, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+from threading import Condition, Event
 
 from foxglove import Channel, Context, Schema
+from foxglove.websocket import (
+    PlaybackCommand,
+    PlaybackControlRequest,
+    PlaybackState,
+    PlaybackStatus,
+    WebSocketServer,
+)
 from mcap import records
 
-from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import AUDIO_LAYER, log_name, time_span
+from hearthlog.schemas.logs.follow import follow_messages
+from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
+from hearthlog.schemas.mcap.chunks import read_definitions
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages, in_order_of_time
 from hearthlog.schemas.messages.message_types import STREAM_INFO
 
 
@@ -60,3 +82,273 @@ def _is_of(known: Channel, channel: records.Channel, schema: records.Schema | No
 
 def _of_sdk(schema: records.Schema) -> Schema:
     return Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+
+
+_WINDOW = 3600 * NANOSECONDS  # whose logs are looked into at once
+_RECENT = NANOSECONDS  # what was said so long before a moment is still seen then
+
+Damaged = Callable[[LogError], None]
+ChannelType = tuple[records.Channel, records.Schema | None]
+
+
+def channels_of(log: Path) -> list[ChannelType]:
+    """List the channels of a log with their schemas.
+
+    Raise `LogError` if it cannot be read, is not an MCAP file, or is damaged.
+    """
+    with LogFile(log) as file:
+        read_definitions(file)
+        return [(each, file.schemas.get(each.schema_id)) for each in file.channels.values()]
+
+
+class RecordedSpan:
+    """The messages of some logs between two times.
+
+    Parameters
+    ----------
+    start, end : int or None
+        Nanoseconds of UTC: from `start` on, before `end`; None for all there is.
+
+    Raises
+    ------
+    DataError
+        If there is no message between the two times.
+    """
+
+    def __init__(
+        self, logs: Sequence[Path], start: int | None, end: int | None, damaged: Damaged
+    ) -> None:
+        self._damaged = damaged
+        spans = [
+            (first, last, path)
+            for first, last, path in time_spans(logs, self._span)
+            if (start is None or last >= start) and (end is None or first < end)
+        ]
+        if not spans:
+            raise DataError("nothing was recorded in this time; `hearthlog info` tells what was")
+        self.start = max(start or 0, spans[0][0])
+        last_end = max(last for _, last, _ in spans) + 1
+        self.end = last_end if end is None else min(end, last_end)
+        self._spans = spans
+        self._passed_over: set[Path] = set()
+        self.channels: dict[str, ChannelType] = {}
+        for _, _, path in spans:
+            self._add_channels(path)
+
+    def _span(self, log: Path) -> tuple[int, int] | None:
+        try:
+            return time_span(log)
+        except LogError as error:
+            self._damaged(error)
+            return None
+
+    def _add_channels(self, log: Path) -> None:
+        try:
+            for channel, schema in channels_of(log):
+                self.channels.setdefault(channel.topic, (channel, schema))
+        except LogError as error:
+            self._damaged(error)
+
+    def messages(self, start: int) -> Generator[list[RawMessages], None, None]:
+        """Read the messages from a moment on.
+
+        Yields
+        ------
+        list of RawMessages
+            Those of the next span of time; none is older than any that was yielded before.
+        """
+        while start < self.end:
+            end = min(start + _WINDOW, self.end)
+            yield from self._between(start, end)
+            # Years may lie between two logs: a box without a clock begins in 1970.
+            later = (max(first, end) for first, last, _ in self._spans if last >= end)
+            start = min(later, default=self.end)
+
+    def before(self, moment: int) -> list[tuple[RawMessages, int]]:
+        """Read what is known at a moment.
+
+        Returns
+        -------
+        list of (RawMessages, int)
+            The last description of each stream in the logs that have the moment, and the last
+            message of each topic in the second before, with their places.
+        """
+        known: dict[str, tuple[RawMessages, int]] = {}
+        topics = {
+            topic
+            for topic, (_, schema) in self.channels.items()
+            if schema is not None and schema.name == STREAM_INFO
+        }
+        first = min((a for a, b, _ in self._spans if a < moment <= b), default=moment)
+        descriptions = self._between(first, moment, topics)
+        for batches in (descriptions, self._between(max(moment - _RECENT, 0), moment)):
+            for batch in batches:
+                known |= {part.channel.topic: (part, len(part) - 1) for part in batch}
+        return list(known.values())
+
+    def _between(
+        self, start: int, end: int, topics: Collection[str] | None = None
+    ) -> Generator[list[RawMessages], None, None]:
+        """Read all logs together; without those that turn out to be damaged."""
+        spans = [path for a, b, path in self._spans if a < end and b >= start]
+        logs = [path for path in spans if path not in self._passed_over]
+        try:
+            for batch in iterate_messages(logs, topics, start, end):
+                start = 1 + max(int(part.log_times[-1]) for part in batch)
+                yield batch
+        except LogError as error:
+            self._damaged(error)
+            damaged = {path for path in logs if not _is_sound(path, start, end)}
+            self._passed_over |= damaged
+            if damaged:
+                yield from self._between(start, end, topics)
+
+
+def _is_sound(log: Path, start: int, end: int) -> bool:
+    try:
+        for _ in iterate_messages([log], None, start, end):
+            pass
+    except LogError:
+        return False
+    return True
+
+
+_SUBSCRIBE_SECONDS = 0.5  # that viewers have to ask for a new topic before it speaks
+_HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
+
+
+def publish_live(folder: Path, publisher: Publisher, stop: Event, damaged: Damaged) -> None:
+    """Publish what is written to the logs of a folder from now on.
+
+    Parameters
+    ----------
+    damaged : callable
+        Told the error of a log of which no more can be read.
+    """
+    known: set[Path] = set()
+    for path, parts in follow_messages(folder, stop=stop, damaged=damaged, infos=True):
+        if log_name(path).layer in _HEARD:
+            if path not in known:
+                known.add(path)
+                if _advertise(path, publisher):
+                    stop.wait(_SUBSCRIBE_SECONDS)
+            for part, row in in_order_of_time(parts):
+                publisher.publish(part, row)
+        if stop.is_set():
+            break
+
+
+def _advertise(log: Path, publisher: Publisher) -> bool:
+    """Tell of all topics of a log, also of those that speak rarely; tell whether one is new."""
+    with suppress(LogError):  # it gets another name at this moment
+        return sum(publisher.advertise(*channel) for channel in channels_of(log)) > 0
+    return False
+
+
+_SLOWEST, _FASTEST = 0.01, 100.0
+_TICK_SECONDS = 0.05  # so often viewers are told the time
+_IDLE_SECONDS = 0.2
+# The answer to a seek empties the views: what is to be seen then must come after it. Many seeks
+# follow each other while somebody drags the time, and only the last one is worth reading for.
+_SETTLE_SECONDS = 0.1
+
+
+class Playback:
+    """Publishes a recording; all viewers share one state of it."""
+
+    def __init__(self, recording: RecordedSpan, publisher: Publisher, stop: Event) -> None:
+        self._recording = recording
+        self._publisher = publisher
+        self._stop = stop
+        self._changed = Condition()
+        self._status = PlaybackStatus.Paused
+        self._speed = 1.0
+        self._position = recording.start  # at the moment `_since`
+        self._since = time.monotonic()
+        self._seeks = 0
+        self._told = self._since  # when the viewers were told the time
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Start and end of the recording, in nanoseconds of UTC."""
+        return self._recording.start, self._recording.end
+
+    def obey(self, request: PlaybackControlRequest) -> PlaybackState:
+        """Do what a viewer asks for."""
+        with self._changed:
+            self._position, self._since = self._now(), time.monotonic()
+            if math.isfinite(request.playback_speed):
+                self._speed = min(max(request.playback_speed, _SLOWEST), _FASTEST)
+            if request.seek_time is not None:
+                wanted = max(request.seek_time, self._recording.start)
+                self._position = min(wanted, self._recording.end)
+                self._seeks += 1
+                self._status = PlaybackStatus.Paused
+            if self._status != PlaybackStatus.Ended:  # from there only a seek leads back
+                plays = request.playback_command == PlaybackCommand.Play
+                self._status = PlaybackStatus.Playing if plays else PlaybackStatus.Paused
+            self._changed.notify()
+            return self._state(did_seek=request.seek_time is not None)
+
+    def play(self, server: WebSocketServer) -> None:
+        """Publish what is to be seen, until `stop` is set."""
+        while not self._stop.is_set():
+            with self._changed:
+                seeks, start = self._seeks, self._position
+            if seeks:
+                self._stop.wait(_SETTLE_SECONDS)
+                if seeks != self._seeks:
+                    continue
+            for messages, row in self._recording.before(start):
+                self._publisher.publish(messages, row)
+            with closing(self._recording.messages(start)) as batches:
+                played = all(self._publish(parts, server, seeks) for parts in batches)
+            if played and self._wait_until(self._recording.end, server, seeks):
+                self._end(server, seeks)
+
+    def _publish(self, parts: Sequence[RawMessages], server: WebSocketServer, seeks: int) -> bool:
+        """Publish messages at their times; tell whether nothing came in between."""
+        for part, row in in_order_of_time(parts):
+            if not self._wait_until(int(part.log_times[row]), server, seeks):
+                return False
+            self._publisher.publish(part, row)
+        return True
+
+    def _wait_until(self, moment: int, server: WebSocketServer, seeks: int) -> bool:
+        """Wait until a moment is played; tell whether nothing came in between."""
+        while True:
+            with self._changed:
+                if self._stop.is_set() or self._seeks != seeks:
+                    return False
+                now, is_playing = self._now(), self._status == PlaybackStatus.Playing
+                is_there = now > moment or (is_playing and now == moment)
+                if not is_there:
+                    ahead = (moment - now) / NANOSECONDS / self._speed
+                    self._changed.wait(min(ahead, _TICK_SECONDS) if is_playing else _IDLE_SECONDS)
+            if is_playing and time.monotonic() - self._told >= _TICK_SECONDS:
+                self._told = time.monotonic()
+                server.broadcast_time(min(now, moment))
+            if is_there:
+                return True
+
+    def _end(self, server: WebSocketServer, seeks: int) -> None:
+        """Tell that all was played, and wait until a viewer goes back."""
+        with self._changed:
+            if self._seeks != seeks:
+                return
+            self._position, self._status = self._recording.end, PlaybackStatus.Ended
+            state = self._state(did_seek=False)
+        server.broadcast_playback_state(state)
+        with self._changed:
+            while self._seeks == seeks and not self._stop.is_set():
+                self._changed.wait(_IDLE_SECONDS)
+
+    def _now(self) -> int:
+        """Return the log time that is played now."""
+        if self._status != PlaybackStatus.Playing:
+            return self._position
+        elapsed = (time.monotonic() - self._since) * self._speed
+        return min(self._position + round(elapsed * NANOSECONDS), self._recording.end)
+
+    def _state(self, *, did_seek: bool) -> PlaybackState:
+        return PlaybackState(self._status, self._position, self._speed, did_seek, None)

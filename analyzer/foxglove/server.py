@@ -1,9 +1,17 @@
-"""A server of Foxglove's SDK behind a gate."""
+"""The server of Foxglove's SDK behind a gate that checks address, origin and token."""
 
+import asyncio
 import logging
+import re
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from asyncio import StreamReader, StreamWriter, Task
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from secrets import compare_digest
+from threading import Thread
+from typing import Self
 
 import foxglove
 from foxglove.websocket import (
@@ -16,11 +24,239 @@ from foxglove.websocket import (
     WebSocketServer,
 )
 
-from hearthlog.analyzer.foxglove.admission import Admission
-from hearthlog.analyzer.foxglove.gate import Gate, Refused
-from hearthlog.analyzer.foxglove.player import Player
-from hearthlog.analyzer.foxglove.publisher import Publisher
-from hearthlog.analyzer.ports import hidden_address
+from hearthlog.analyzer.foxglove.publisher import Playback, Publisher
+from hearthlog.analyzer.ports import hidden_address, host_name, ip_of, is_asked_in_digits
+from hearthlog.schemas.errors import HearthlogError
+
+# Foxglove in a browser, and the desktop applications, whose pages are files.
+_ORIGINS = frozenset({"https://app.foxglove.dev", "file://"})
+_FIELD = re.compile(r"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([\x20-\x7e]*?)[ \t]*")
+_HANDED_ON = ("Sec-WebSocket-Key", "Sec-WebSocket-Version", "Sec-WebSocket-Protocol")
+_LONGEST = 200  # characters of an origin that is told
+
+
+class RefusedError(HearthlogError):
+    """Somebody may not look; the message says why, to whoever runs the server."""
+
+
+@dataclass(frozen=True)
+class Admission:
+    """What a request must say.
+
+    A page in a browser can connect to every server of this machine. The token keeps out who does
+    not know the address, the origin other pages that came to know it, and the host those that let a
+    name of theirs point here.
+
+    Attributes
+    ----------
+    origins : frozenset of str
+        Pages that may look, as `https://lichtblick.example`, beside Foxglove's own and those that
+        this machine serves. What is no page names none, and needs the token only.
+    """
+
+    bind: str
+    token: str
+    origins: frozenset[str] = frozenset()
+
+    def check(self, head: bytes) -> bytes:
+        """Judge a request.
+
+        Parameters
+        ----------
+        head : bytes
+            Up to the empty line, with it.
+
+        Returns
+        -------
+        bytes
+            Head of the request for the server behind: what this one is not about is left out.
+
+        Raises
+        ------
+        RefusedError
+            If the one who asks may not look.
+        """
+        target, fields = _parse(head)
+        origin = fields.get("origin")
+        if not is_asked_in_digits(self.bind, fields.get("host", "")):
+            raise RefusedError(
+                "refused: it was asked for by a name; connect to an address in digits"
+            )
+        if origin is not None and origin not in _ORIGINS | self.origins and not _is_local(origin):
+            shown = origin[:_LONGEST]
+            raise RefusedError(
+                f"refused: a page of {shown}; if it is yours, let it look by --origin"
+            )
+        if not compare_digest(target.encode(), f"/?token={self.token}".encode()):
+            raise RefusedError("refused: the token is missing or wrong; copy the whole address")
+        handed_on = [
+            f"{name}: {fields[name.lower()]}" for name in _HANDED_ON if name.lower() in fields
+        ]
+        lines = ["GET / HTTP/1.1", "Host: hearthlog", "Upgrade: websocket", "Connection: Upgrade"]
+        return "\r\n".join([*lines, *handed_on, "", ""]).encode()
+
+
+def _parse(head: bytes) -> tuple[str, Mapping[str, str]]:
+    """Return the target and the fields, by their names in lower case."""
+    first, *lines = head.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
+    method, _, rest = first.partition(" ")
+    target, _, version = rest.partition(" ")
+    fields = [match.groups() for match in map(_FIELD.fullmatch, lines) if match]
+    named = {name.lower(): value for name, value in fields}
+    if method != "GET" or version != "HTTP/1.1" or len(named) != len(lines):
+        raise RefusedError("refused: what came was no request of a viewer")
+    return target, named
+
+
+def _is_local(origin: str) -> bool:
+    """Tell whether a page is one that this machine serves."""
+    address = ip_of(name := host_name(origin))
+    is_here = name == "localhost" or (address is not None and address.is_loopback)
+    return is_here and origin.startswith(("http://", "https://"))
+
+
+_HEAD_SECONDS, _CLOSE_SECONDS = 5, 1
+_LARGEST_HEAD = 16384  # bytes: the cookies of all servers of this machine are in it
+_MOST_ASKING, _MOST_LOOKING = 32, 8  # connections at once
+_BLOCK = 1 << 16  # bytes
+_BUFFER = (
+    1 << 17
+)  # bytes that the system holds of what is on its way: seconds of sound, not minutes
+_REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+_GONE_SECONDS = 30  # after which a viewer that answers nothing is given up
+
+Refused = Callable[[RefusedError], None]
+
+
+class Gate:
+    """Takes connections in a thread of its own, and pipes those that are admitted.
+
+    So many may ask at a time: another one takes the place of the oldest of the address that has
+    most of them, so that nobody keeps out who has the token by connections that say nothing.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        behind: tuple[str, int],
+        admission: Admission,
+        refused: Refused,
+    ) -> None:
+        self._listener = listener
+        self._behind = behind
+        self._admission = admission
+        self._refused = refused
+        self._asking: dict[Task[None], str] = {}  # and their addresses, the oldest first
+        self._looking: set[Task[None]] = set()
+        self._loop = asyncio.new_event_loop()
+        self._thread = Thread(target=self._run, name="gate", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        with self._listener:
+            self._listener.setblocking(False)
+            accepting = self._loop.create_task(self._accept())
+            self._loop.run_forever()
+            tasks = {accepting, *self._asking, *self._looking}
+            for task in tasks:
+                task.cancel()
+            self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        self._loop.close()
+
+    async def _accept(self) -> None:
+        while True:
+            try:
+                connection, address = await self._loop.sock_accept(self._listener)
+            except OSError:  # too many files are open, or it was gone already
+                await asyncio.sleep(1)
+                continue
+            if len(self._asking) >= _MOST_ASKING:
+                ((most, _),) = Counter(self._asking.values()).most_common(1)
+                oldest = next(task for task, host in self._asking.items() if host == most)
+                del self._asking[oldest]
+                oldest.cancel()
+            task = self._loop.create_task(self._take(connection))
+            self._asking[task] = address[0]
+            task.add_done_callback(lambda task: self._asking.pop(task, None))
+            task.add_done_callback(self._looking.discard)
+
+    async def _take(self, connection: socket.socket) -> None:
+        """Serve one who connects, from the request to the end."""
+        _configure(connection)
+        reader, writer = await asyncio.open_connection(sock=connection, limit=_LARGEST_HEAD)
+        with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            try:
+                async with asyncio.timeout(_HEAD_SECONDS):
+                    head = await reader.readuntil(b"\r\n\r\n")
+                await self._lead_on(self._admitted(head), reader, writer)
+            except RefusedError as error:
+                self._refused(error)
+                writer.write(_REFUSAL)
+                await _close(writer)
+            finally:
+                writer.transport.abort()
+
+    def _admitted(self, head: bytes) -> bytes:
+        head = self._admission.check(head)
+        if len(self._looking) >= _MOST_LOOKING:
+            raise RefusedError(f"refused: {_MOST_LOOKING} viewers are looking; close one")
+        task = asyncio.current_task()
+        assert task is not None
+        self._looking.add(task)
+        self._asking.pop(task, None)
+        return head
+
+    async def _lead_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
+        """Pipe between a viewer and the server, until one of them ends."""
+        inner_reader, inner_writer = await asyncio.open_connection(*self._behind)
+        _configure(inner_writer.get_extra_info("socket"))
+        inner_writer.write(head)
+        ways = (_pipe(reader, inner_writer), _pipe(inner_reader, writer))
+        tasks = [self._loop.create_task(way) for way in ways]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            inner_writer.transport.abort()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        await _close(writer)
+
+
+async def _close(writer: StreamWriter) -> None:
+    """End a connection when what was written last is sent."""
+    writer.close()
+    async with asyncio.timeout(_CLOSE_SECONDS):
+        await writer.wait_closed()
+
+
+async def _pipe(reader: StreamReader, writer: StreamWriter) -> None:
+    """Copy until one side ends; who reads slowly lets the other wait, and nothing piles up."""
+    while block := await reader.read(_BLOCK):
+        writer.write(block)
+        await writer.drain()
+
+
+def _configure(connection: socket.socket) -> None:
+    """Keep little for a slow viewer, and give up one that vanished, as a laptop that sleeps."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        ("TCP_KEEPIDLE", _GONE_SECONDS),
+        ("TCP_USER_TIMEOUT", _GONE_SECONDS * 1000),
+    ):
+        if hasattr(socket, option):  # not everywhere
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
 
 PORT = 8765  # where Foxglove looks for a server if it is not told
 _BACKLOG = 8192  # messages that wait for a slow viewer, some megabytes; then the oldest are dropped
@@ -29,7 +265,7 @@ _BACKLOG = 8192  # messages that wait for a slow viewer, some megabytes; then th
 class _Listener(ServerListener):
     """Takes what viewers ask for: descriptions that they missed, and the time to play."""
 
-    def __init__(self, publisher: Publisher, player: Player | None) -> None:
+    def __init__(self, publisher: Publisher, player: Playback | None) -> None:
         self._publisher = publisher
         self._player = player
 
@@ -49,7 +285,7 @@ def serve(
     admission: Admission,
     refused: Refused,
     publisher: Publisher,
-    player: Player | None = None,
+    player: Playback | None = None,
 ) -> Iterator[WebSocketServer]:
     """Let viewers connect that may look."""
     logging.getLogger("foxglove").addHandler(logging.NullHandler())  # it tells who hung up

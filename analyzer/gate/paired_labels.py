@@ -24,8 +24,7 @@ from hearthlog.analyzer.gate.recent_time import (
 )
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
-from hearthlog.analyzer.relabel.reading import infos_for_model
-from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller, infos_for_model
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classes import SILENCE, find_class, translation
 from hearthlog.models.classifiers.classifier import Classifier

@@ -1,28 +1,130 @@
-"""Recorded features or clips, given to a pipeline again, and a new log of what it makes of them."""
+"""Recorded features or clips through a pipeline, and the new log of its messages."""
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event as Flag
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, features_of, models_for
-from hearthlog.analyzer.replay.description import describe
-from hearthlog.analyzer.replay.options import Replay, ReplayOptions
-from hearthlog.analyzer.replay.recorded import Features, RecordedBatch
+from hearthlog.analyzer.replay.recorded import Features, RecordedBatch, ReplayComparison
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.names import is_by_names, without_classes
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.installed import DEFAULT, feature_set
+from hearthlog.models.features.installed import DEFAULT, entries_of, feature_set
+from hearthlog.models.modelfile.modelfile import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import class_conflict, shared_classes
-from hearthlog.recorder.log.rolling_log import LogDescription, RollingLog
-from hearthlog.recorder.stream.messages import LOGGED_EVERY, EncodedMessage
+from hearthlog.recorder.log.rolling_log import LogDescription, RollingLog, with_scenarios
+from hearthlog.recorder.stream.messages import LOGGED_EVERY, EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
-from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, SCENARIO, scenario_labelling, topic
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, NANOSECONDS
+from hearthlog.schemas.logs.metadata import FEATURE_SET, provenance
+from hearthlog.schemas.messages.topics import (
+    CANDIDATE,
+    LIVE,
+    SCENARIO,
+    scenario_labelling,
+    topic,
+    topics_of,
+)
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How logs are replayed."""
+
+    kind: str = "features"  # or "audio", for clips
+    model: Callable[[RecorderInfo], Model | None] = lambda _: None  # None: no labels
+    # By the name of the scenario: those that label beside it.
+    scenarios: Mapping[str, Model] = field(default_factory=dict)
+    output: Path | None = None  # folder of the new log, if there is to be one
+    start_offset: float = 0.0  # seconds from the first message
+    duration: float | None = None  # seconds; None for all
+    rate: float | None = None  # multiple of real time; None for as fast as possible
+    loop: bool = False  # begin anew at the end, until stopped
+
+
+@dataclass
+class Replay:
+    """What came of a replay.
+
+    `missing` are times (ns of UTC) before which the logs lack sound that was recorded: the labels
+    of the first second there, and the open segment, cannot be as recorded.
+    """
+
+    sources: list[Path]  # logs that were replayed
+    logs: list[Path] = field(default_factory=list)  # that were written
+    frames: int = 0
+    labels: int = 0
+    segments: int = 0
+    gaps: int = 0
+    compared: ReplayComparison = field(default_factory=ReplayComparison)
+    missing: list[int] = field(default_factory=list)
+    unfinished: list[Path] = field(default_factory=list)  # cut off, and replayed up to there
+    interrupted: bool = False
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of sound that were replayed."""
+        return self.frames * FRAME_SECONDS
+
+
+_OF_RECORDER = (CANDIDATE, SCENARIO, FEATURE_SET)  # entries that are not those of the new log
+# How attachments begin that are about the models of microphones.
+_MODELS = tuple(name.partition(".")[0] + "." for name in (CARD, DESCRIPTION))
+
+
+def describe(  # noqa: PLR0913, PLR0917
+    recorded: RecorderInfo,
+    features: FeatureSet,
+    model: Model | None,
+    scenarios: Mapping[str, Model],
+    output: Path,
+    replayed: Mapping[str, str],
+) -> LogDescription:
+    """Describe a new log as the recorder described the old one.
+
+    Parameters
+    ----------
+    model : Model or None
+        The model that labels the new log; None if there are no labels.
+    """
+    if model is not None and model.sha256 == recorded.model_sha256:
+        model = replace(model, name=recorded.model)  # whatever its file is called here
+    classes = None if model is None else list(model.classes)
+    info = stream_info(recorded.microphone, recorded.device, features, model)
+    attachments = [item for item in recorded.attachments if not item.name.startswith(_MODELS)]
+    if model is not None:
+        attachments += model_attachments(model)
+    named = {scenario_labelling(name): list(one.classes) for name, one in scenarios.items()}
+    description = LogDescription(
+        root=output,
+        node=recorded.node,
+        topics=topics_of(
+            recorded.microphone,
+            features.feature_names,
+            classes,
+            named,
+            directions=recorded.has_directions,
+            embedding=recorded.embedding,
+        ),
+        infos=[info],
+        metadata={
+            **{k: v for k, v in recorded.metadata.items() if not k.startswith(_OF_RECORDER)},
+            **provenance(recorded.node),
+            **entries_of(features),
+            "model": info.model,
+            "model_sha256": info.model_sha256,
+            **replayed,
+        },
+        attachments=attachments,
+    )
+    return with_scenarios(description, recorded.microphone, scenarios)
+
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096

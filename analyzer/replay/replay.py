@@ -1,25 +1,229 @@
-"""Recorded logs once more through the pipeline, from their features or from their clips."""
+"""Replay of logs through the pipeline, from their features or from their clips."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.clips import read_clips
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-from hearthlog.analyzer.replay.clip_frames import ClipFramer
-from hearthlog.analyzer.replay.log_set import LogSet
-from hearthlog.analyzer.replay.options import Replay, ReplayOptions
-from hearthlog.analyzer.replay.player import Player
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_infos
+from hearthlog.analyzer.replay.player import Player, Replay, ReplayOptions
 from hearthlog.analyzer.replay.recorded import read_recorded
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.schemas.errors import LogError, Progress, ignore_progress
-from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.recorder.sources.framing import FrameCutter
+from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress, listed
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
+from hearthlog.schemas.logs.merged_reading import time_spans
 from hearthlog.schemas.messages.topics import topic
+
+_NEVER = (1 << 63) - 1
+
+
+class LogSet:
+    """Logs of one microphone, in the order of their first messages.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Layers and empty logs among them are left out.
+    microphone : str or None
+        Name of the microphone; None if there is one only.
+
+    Attributes
+    ----------
+    first, last : int
+        Log times of the first and the last message, in nanoseconds of UTC.
+
+    Raises
+    ------
+    LogError
+        If they hold no message, or one is damaged.
+    """
+
+    def __init__(self, paths: Sequence[Path], kind: str, microphone: str | None = None) -> None:
+        spans = time_spans(paths)
+        if not spans:
+            raise LogError(f"{paths[0]}: no messages, nothing to replay")
+        self.kind = kind
+        self.first, self.last = spans[0][0], max(last for _, last, _ in spans)
+        self._spans = spans
+        self._microphone = microphone
+        self._infos: dict[Path, list[RecorderInfo]] = {}
+
+    def span(self, options: ReplayOptions) -> tuple[int, int]:
+        """Return the span of time that is replayed.
+
+        Returns
+        -------
+        start, end : int
+            Log times in nanoseconds of UTC, from `start` on, before `end`; without a duration the
+            end is the largest number of 64 bits.
+        """
+        start = self.first + round(options.start_offset * NANOSECONDS)
+        if options.duration is None:
+            return start, _NEVER
+        return start, min(start + round(options.duration * NANOSECONDS), _NEVER)
+
+    def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
+        """Return the logs to replay.
+
+        Returns
+        -------
+        list of RecorderInfo
+            At least one, in the order of their first messages.
+
+        Raises
+        ------
+        LogError
+            If there is none, and as `between`.
+        """
+        infos = self.between(*self.span(options))
+        if not infos:
+            raise self.nothing()
+        return infos
+
+    def nothing(self) -> LogError:
+        """Make the error that says that there is nothing to replay."""
+        what = "clips" if self.kind == "audio" else "features"
+        there = sorted({info.microphone for infos in self._infos.values() for info in infos})
+        if self._microphone is not None and there and self._microphone not in there:
+            return LogError(
+                f"no microphone is called {self._microphone!r} there; choose {listed(there)}"
+            )
+        seconds = (self.last - self.first) / NANOSECONDS
+        return LogError(f"no {what} to replay there; the logs last {seconds:.1f} s")
+
+    def between(self, start: int, end: int) -> list[RecorderInfo]:
+        """Return the logs that have messages in a span of time.
+
+        Parameters
+        ----------
+        start, end : int
+            Log times, in nanoseconds of UTC: from `start` on, before `end`.
+
+        Returns
+        -------
+        list of RecorderInfo
+            In the order of their first messages, without logs that have nothing of this kind.
+
+        Raises
+        ------
+        LogError
+            If they are of several microphones or nodes, or one is damaged or there twice.
+        """
+        infos: list[RecorderInfo] = []
+        for first, last, path in self._spans:
+            if first < end and last >= start:
+                if path not in self._infos:
+                    self._infos[path] = read_recorder_infos(path, self.kind)
+                infos += self._infos[path]
+        if self._microphone is not None:
+            infos = [info for info in infos if info.microphone == self._microphone]
+        names = sorted({f"{info.node}/{info.microphone}" for info in infos})
+        if len(names) > 1:
+            raise LogError(
+                f"{infos[0].path}: these logs are of several microphones ({', '.join(names)}); "
+                "replay one at a time, with --microphone or by naming only its logs"
+            )
+        by_frame: dict[tuple[int, int], RecorderInfo] = {}
+        for info in infos:
+            if info.first_frame is not None:
+                same = by_frame.setdefault(info.first_frame, info)
+                if same is not info:
+                    raise LogError(f"{same.path} and {info.path} hold the same; leave out one")
+        return infos
+
+
+_JOINED = 10_000_000  # nanoseconds at most between clips that follow each other
+_REASON = "no clip holds it"
+
+
+class ClipFramer:
+    """Cuts clips into frames; clips that follow each other are one sound.
+
+    After a hole the next frame begins with the first sample of a clip. Samples before a hole that
+    do not fill a frame are dropped.
+    """
+
+    def __init__(self) -> None:
+        self._next_frame = 0
+        self._end: int | None = None  # end of the last frame, in nanoseconds of UTC
+        self._rate = 0  # of the clips that follow each other; 0 before the first one
+        self._samples = 0  # number of their samples
+        self._frames = 0  # number of frames cut from them
+        self._cutter = FrameCutter()
+        # Where clips begin, in nanoseconds of their sound, and how much later that is in UTC.
+        self._starts: list[int] = []
+        self._offsets: list[int] = []
+
+    def add(self, start: int, rate: int, samples: Float32) -> Iterator[Frames | Gap]:
+        """Add a clip, and yield the frames that it completes and the gap before them.
+
+        Parameters
+        ----------
+        start : int
+            Time of its first sample, in nanoseconds of UTC.
+        rate : int
+            Samples per second.
+        samples : np.ndarray [shape=(n,)], float32
+
+        Yields
+        ------
+        Frames or Gap
+            In the order of time: the last frames before a hole, the gap, the frames of this clip.
+        """
+        if rate != self._rate or abs(start - self._expected()) > _JOINED:
+            yield from self.finish()
+            self._rate, self._samples, self._frames = rate, 0, 0
+            self._starts, self._offsets = [], []
+            self._cutter = FrameCutter(rate)
+        position = self._position()
+        self._starts.append(position)
+        self._offsets.append(start - position)
+        self._samples += len(samples)
+        yield from self._events(self._cutter.push(samples))
+
+    def finish(self) -> Iterator[Frames | Gap]:
+        """Yield the last frames of the clips that follow each other, and a gap before them."""
+        yield from self._events(self._cutter.push(np.empty(0, np.float32), last=True))
+        self._cutter = FrameCutter()
+
+    def _position(self) -> int:
+        """Return the length of the clips so far that follow each other, in nanoseconds."""
+        return self._samples * NANOSECONDS // self._rate
+
+    def _expected(self) -> int:
+        return self._position() + self._offsets[-1]
+
+    def _events(self, frames: Float32) -> Iterator[Frames | Gap]:
+        count = len(frames)
+        if not count:
+            return
+        stamps = self._stamps(count)
+        if self._frames == 0 and self._end is not None:
+            start, end = self._end, int(stamps[0])
+            lost = max(round((end - start) / FRAME_NANOSECONDS), 1)
+            self._next_frame += lost
+            yield Gap(start, end, _REASON, lost)
+        yield Frames(self._next_frame, frames, stamps)
+        self._next_frame += count
+        self._frames += count
+        self._end = int(stamps[-1]) + FRAME_NANOSECONDS
+
+    def _stamps(self, count: int) -> NDArray[np.int64]:
+        """Return when the next frames start, each by the clip that it starts in."""
+        positions = (self._frames + np.arange(count)) * FRAME_NANOSECONDS
+        clips = np.searchsorted(self._starts, positions, side="right") - 1
+        stamps = positions + np.array(self._offsets)[clips]
+        self._starts, self._offsets = self._starts[clips[-1] :], self._offsets[clips[-1] :]
+        return stamps
+
 
 _WARM_UP = 60 * NANOSECONDS
 _LONGEST_NAME = 200

@@ -28,7 +28,7 @@ from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.train import default_transitions, merged_spans
 from hearthlog.analyzer.training.window_method import LearnedMachine
-from hearthlog.analyzer.workers.parallel import single_thread
+from hearthlog.analyzer.workers.workers import single_thread
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.evidence import (

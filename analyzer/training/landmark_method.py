@@ -18,7 +18,7 @@ from hearthlog.analyzer.training.learned_inputs import (
 )
 from hearthlog.analyzer.training.method import Examples
 from hearthlog.analyzer.training.window_method import LearnedMachine, WindowMethod, as_room
-from hearthlog.analyzer.workers.parallel import single_thread
+from hearthlog.analyzer.workers.workers import single_thread
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.landmarks import (
     RBF_LANDMARKS,

@@ -1,6 +1,6 @@
-"""A worker process, started by `processes.py`."""
+"""A worker process, started by `workers.py`."""
 
-from hearthlog.analyzer.workers.processes import serve
+from hearthlog.analyzer.workers.workers import serve
 
 if __name__ == "__main__":
     serve()

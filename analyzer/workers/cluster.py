@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster that runs already."""
+"""Workers of a running Dask cluster, and the check of their versions."""
 
 import asyncio
 import gc
@@ -6,10 +6,10 @@ import logging
 import pickle
 import time
 import warnings
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Collection, Coroutine, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from uuid import uuid4
 
@@ -17,11 +17,77 @@ import numpy as np
 
 from hearthlog.analyzer.errors import LostClusterError, WorkerError
 from hearthlog.analyzer.extras import remedy
-from hearthlog.analyzer.workers.members import Members
 from hearthlog.schemas.errors import HearthlogWarning
 
 if TYPE_CHECKING:
     from distributed import Client
+
+
+_SILENT_SECONDS = 20.0  # after which a scheduler that does not answer is as good as gone
+
+
+class Members:
+    """The workers of a cluster, as they come and go."""
+
+    def __init__(self, client: "Client") -> None:
+        self._client = client
+        self._ours = version("hearthlog")
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._versions: dict[str, str] = {}  # by address, of workers that are there
+        self.threads: dict[str, int] = {}  # by address, of workers that may be used
+        self.manned = asyncio.Event()  # whether there are any
+        self.refused: dict[str, str] = {}  # by address, what other workers have; kept
+
+    async def look(self) -> None:
+        """Ask the scheduler which workers there are, and new ones for their version.
+
+        Raise `OSError, TimeoutError` if the scheduler does not answer.
+        """
+        scheduler: Any = self._client.scheduler
+        identity = await asyncio.wait_for(scheduler.identity(n_workers=-1), _SILENT_SECONDS)
+        workers = identity["workers"]
+        for address in self._versions.keys() - workers.keys():
+            del self._versions[address]
+        for address in workers.keys() - self._versions.keys() - self._asking.keys():
+            # Not waited for: a worker that hangs must not hide that the scheduler does.
+            self._asking[address] = asyncio.create_task(self._ask(address))
+        self.threads = {
+            address: about["nthreads"]
+            for address, about in workers.items()
+            if self._versions.get(address) == self._ours
+        }
+        if self.threads:
+            self.manned.set()
+        else:
+            self.manned.clear()
+
+    async def settle(self) -> None:
+        """Wait until the workers that were seen have said their version, and look again."""
+        if self._asking:
+            await asyncio.wait(self._asking.values(), timeout=_SILENT_SECONDS)
+        await self.look()
+
+    def any_of(self, addresses: Collection[str]) -> bool:
+        """Tell whether one of some workers is still there, and may be used."""
+        return not self.threads.keys().isdisjoint(addresses)
+
+    async def _ask(self, address: str) -> None:
+        try:
+            # A function of the standard library, so that a worker without hearthlog can answer.
+            (theirs,) = (
+                await self._client.run(version, "hearthlog", workers=[address], on_error="return")
+            ).values()
+        except (OSError, ValueError):  # it has gone
+            return
+        finally:
+            del self._asking[address]
+        if isinstance(theirs, str | PackageNotFoundError):  # else it could not answer this time
+            self._versions[address] = theirs if isinstance(theirs, str) else ""
+        if isinstance(theirs, PackageNotFoundError):
+            self.refused[address] = "no hearthlog"
+        elif isinstance(theirs, str) and theirs != self._ours:
+            self.refused[address] = f"hearthlog {theirs}"
+
 
 _CONNECT_SECONDS = 10.0
 _WORKERS_SECONDS = 30.0  # for workers that are started together with the run

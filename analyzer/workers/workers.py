@@ -1,16 +1,230 @@
-"""One way to run tasks: in this process, in several processes, or on a Dask cluster."""
+"""Workers that run tasks: this process, processes of this machine, or a Dask cluster."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from typing import ParamSpec, Protocol, TypeVar
+from contextvars import ContextVar
+from importlib import import_module
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from threading import Lock
+from typing import Any, ParamSpec, Protocol, TypeVar
 
-from hearthlog.analyzer.workers.cluster import connected
-from hearthlog.analyzer.workers.processes import Processes
-from hearthlog.recorder.host import keep_freed_blocks
+from hearthlog.analyzer.errors import WorkerError
+from hearthlog.analyzer.workers.cluster import Cluster, connected
+from hearthlog.recorder.host import keep_freed_blocks, module_command
+from hearthlog.schemas.blas import kernel_environment
+from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
+
+
+def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
+    """Pickle a call."""
+    return pickle.dumps((function, args))
+
+
+def attempt(call: bytes) -> bytes:
+    """Do a call, and pickle its result or its exception."""
+    try:
+        function, args = pickle.loads(call)  # noqa: S301  sent by our own parent or client
+        return pickle.dumps((function(*args), None))
+    except Exception as error:  # noqa: BLE001  raised again where the reply is read
+        return pickle.dumps((None, _portable(error)))
+
+
+def read_reply(reply: bytes) -> Any:
+    """Return what the call returned, or raise what it raised.
+
+    Raises
+    ------
+    Exception
+        What the call raised; with its traceback as a note, unless it is an error of hearthlog.
+    WorkerError
+        If the call raised something that cannot be pickled.
+    """
+    value, error = pickle.loads(reply)  # noqa: S301  sent by our own worker
+    if error is not None:
+        raise error
+    return value
+
+
+def _portable(error: Exception) -> Exception:
+    """Return the error with its traceback as a note; a WorkerError if it cannot be pickled."""
+    if not isinstance(error, HearthlogError):
+        error.add_note("in a worker:\n" + "".join(traceback.format_exception(error)))
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301  made here
+    except Exception:  # noqa: BLE001  an error of any library, with anything in it
+        return WorkerError(f"{type(error).__name__}: {error}")
+    return error
+
+
+MAX_ATTEMPTS = 3  # of a task whose worker is killed
+_TIDY_SECONDS = 3.0  # for a task to remove unfinished files
+_SERVE = module_command("hearthlog.analyzer.workers")
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+# concurrent.futures.ProcessPoolExecutor does not suffice: one killed worker fails all running
+# tasks, so does an exception that cannot be unpickled, and workers outlive a killed parent.
+class Processes:
+    """Processes, each with a thread here that gives it one task after the other.
+
+    Parameters
+    ----------
+    count : int
+        Number of processes, at least 1.
+    module : str, optional
+        Name of the module of the tasks. The processes are started at once and import it while there
+        is no task yet; without it each is started by its first task.
+    """
+
+    def __init__(self, count: int, module: str | None = None) -> None:
+        self.parallel = count
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
+        self._mine = threading.local()
+        self._lock = threading.Lock()
+        self._alive: set[_Process] = set()
+        self._closed = False
+        if module is not None:
+            for _ in range(count):
+                self.submit(import_module, module)
+
+    def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
+        """Run a function once a process is free."""
+        return self._threads.submit(self._run, function, args)
+
+    def close(self) -> None:
+        """Give up the tasks that are not done, and end the processes.
+
+        A task that has not begun is cancelled: its future raises CancelledError.
+        """
+        with self._lock:
+            self._closed = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for process in list(self._alive):
+            process.hang_up()
+        self._threads.shutdown()
+        for process in self._alive:
+            process.end()
+
+    def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
+        call = pack_call(function, args)
+        for _ in range(MAX_ATTEMPTS):
+            process = self._process()
+            try:
+                return read_reply(process.ask(call))
+            except _LostError:
+                self._drop(process)
+        raise WorkerError(
+            f"the task lost its worker {MAX_ATTEMPTS} times: killed, or out of memory"
+        )
+
+    def _process(self) -> "_Process":
+        """Return the process of this thread; start one if there is none."""
+        process: _Process | None = getattr(self._mine, "process", None)
+        if process is None:
+            with self._lock:
+                if self._closed:
+                    raise WorkerError("given up")
+                process = self._mine.process = _Process()
+                self._alive.add(process)
+        return process
+
+    def _drop(self, process: "_Process") -> None:
+        process.end()
+        self._mine.process = None
+        with self._lock:
+            if not self._closed:
+                self._alive.discard(process)
+
+
+class _LostError(Exception):
+    """The process ended before it answered."""
+
+
+class _Process:
+    """A process that answers calls, until the other end of its pipe is closed."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(  # noqa: S603  our own module
+            _SERVE,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            env=dict.fromkeys(_THREADS, "1")
+            | kernel_environment()
+            | os.environ
+            | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            process_group=0,  # Ctrl-C reaches the parent only, which then hangs up
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._calls = Connection(os.dup(self._process.stdin.fileno()), readable=False)
+        self._replies = Connection(os.dup(self._process.stdout.fileno()), writable=False)
+        self._process.stdin.close()
+        self._process.stdout.close()
+
+    def ask(self, call: bytes) -> bytes:
+        """Return the reply to a call."""
+        try:
+            self._calls.send_bytes(call)
+            return self._replies.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise _LostError from error
+
+    def hang_up(self) -> None:
+        """Let the process end: nobody will call it again."""
+        self._calls.close()
+
+    def end(self) -> None:
+        """End the process, even if it hangs."""
+        self._calls.close()
+        try:
+            self._process.wait(2 * _TIDY_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._replies.close()
+
+
+def serve() -> None:
+    """Answer calls from standard input on standard output, until the parent hangs up or dies."""
+    calls = Connection(os.dup(0), writable=False)
+    replies = Connection(os.dup(1), readable=False)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.dup2(2, 1)  # what a task prints must not get into the replies
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that a task can clean up
+    warnings.simplefilter("ignore", HearthlogWarning)  # the parent warns once
+    keep_freed_blocks()
+    waiting: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_listen, args=(calls, waiting), daemon=True).start()
+    while True:
+        replies.send_bytes(attempt(waiting.get()))
+
+
+def _listen(calls: Connection, waiting: "SimpleQueue[bytes]") -> None:
+    """Receive calls, and end the process when the parent hangs up or dies, even during a task."""
+    try:
+        while True:
+            waiting.put(calls.recv_bytes())
+    except (EOFError, OSError):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_TIDY_SECONDS)
+        os._exit(1)
 
 
 class Workers(Protocol):
@@ -87,3 +301,115 @@ class InlineWorkers:
         except Exception as error:  # noqa: BLE001  raised where the result is asked for
             future.set_exception(error)
         return future
+
+
+_MOST_THREADS = 4
+_CLUSTER: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
+
+
+def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
+    """Yield the results of calls, in their order."""
+    cluster = _CLUSTER.get()
+    if cluster is not None:
+        yield from _on(cluster, calls)
+        return
+    import joblib  # noqa: PLC0415  part of the extra `headless`
+
+    threads = min(os.cpu_count() or 1, _MOST_THREADS)
+    yield from joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
+
+
+def _on(cluster: Cluster, calls: Iterable[Any]) -> Iterator[Any]:
+    waiting: deque[Future[Any]] = deque()
+    for function, args, _ in calls:
+        waiting.append(cluster.submit(function, *args))
+        if len(waiting) >= 2 * cluster.parallel:  # so that no worker waits for the next one
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+@contextmanager
+def fits_on(scheduler: str | None) -> Iterator[None]:
+    """Let `in_parallel` run calls in this block on a Dask cluster, if one is named.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of the scheduler, as `tcp://host:port`; None changes nothing.
+
+    Raises
+    ------
+    WorkerError
+        As `connected` does, and if the cluster goes away or a fit kills its workers.
+    """
+    if scheduler is None:
+        yield
+        return
+    with connected(scheduler) as cluster:
+        token = _CLUSTER.set(cluster)
+        try:
+            yield
+        finally:
+            _CLUSTER.reset(token)
+
+
+class _SingleThread:
+    """Lets libraries of linear algebra use one thread while anybody is inside.
+
+    The limit of a BLAS is of the process: who leaves first must not lift it for the others.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._inside = 0
+        self._limits: Any = None
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        from threadpoolctl import threadpool_limits  # noqa: PLC0415  as joblib
+
+        with self._lock:
+            if not self._inside:
+                _forget_controlling_thread()
+                self._limits = threadpool_limits(1, user_api="blas")
+            self._inside += 1
+        try:
+            with threadpool_limits(1, user_api="openmp"):  # of this thread alone
+                yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside:
+                    _forget_controlling_thread()
+                    self._limits.restore_original_limits()
+                    _forget_controlling_thread()
+
+
+def _forget_controlling_thread() -> None:
+    """Let this thread set limits: since 3.8 threadpoolctl heeds only the one that did last."""
+    import threadpoolctl  # noqa: PLC0415  as joblib
+
+    openblas = getattr(threadpoolctl, "OpenBLASController", None)
+    if openblas is not None and hasattr(openblas, "clear_controlling_thread"):
+        openblas.clear_controlling_thread(force=True)
+
+
+single_thread = _SingleThread()  # a sum depends on how many threads share it
+
+
+def kernel_in_use() -> str:
+    """Return the library and the kernel of the products of this process.
+
+    Returns
+    -------
+    str
+        Such as "openblas SkylakeX"; empty if it is another library than OpenBLAS, or not known
+        for want of threadpoolctl.
+    """
+    try:
+        from threadpoolctl import threadpool_info  # noqa: PLC0415  part of the extra `headless`
+    except ModuleNotFoundError:
+        return ""
+    kernels = (each.get("architecture") for each in threadpool_info())
+    return next((f"openblas {kernel}" for kernel in kernels if kernel), "")

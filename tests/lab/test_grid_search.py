@@ -14,7 +14,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.method_scores import evaluate_method
 from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.analyzer.workers.parallel import fits_on
+from hearthlog.analyzer.workers.workers import fits_on
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import adaptation_curve, command, grid_search

@@ -86,13 +86,13 @@ def import_labels(
         read_reviewed,
         write_marks,
     )
-    from hearthlog.analyzer.review.queue.asked import (
-        asked_path,
+    from hearthlog.analyzer.review.review_list import (
         check_scenario,
         looked_at,
+        queue_file,
+        read_list,
         unasked,
     )
-    from hearthlog.analyzer.review.queue.review_list import read_list
 
     log, labels = _log_and_labels(log, labels)
     _check_use(labels, scenario)
@@ -102,7 +102,7 @@ def import_labels(
     coverage = find_coverage(log)
     _check_microphone(log, coverage, microphone)
     options = ImportOptions(microphone, names, choice, strict)
-    asked = asked_path(labels)
+    asked = queue_file(labels)
     spans = read_list(asked) if asked.exists() else []
     check_scenario(asked, spans, scenario, "--scenario")
     by_log, left_out, moved = read_labels(

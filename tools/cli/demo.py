@@ -29,13 +29,13 @@ def demo(
     from hearthlog.analyzer.extras import require
 
     require("scipy", "rerun", "rerun_cli")
-    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-    from hearthlog.analyzer.review.viewer.file import save_timeline
+    from hearthlog.analyzer.review.timeline_reader import read_timeline
     from hearthlog.analyzer.review.viewer.process import (
         ViewerProcess,
         has_display,
         hidden_options,
     )
+    from hearthlog.analyzer.review.viewer.recording import save_timeline
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL
     from hearthlog.recorder.config import load_settings

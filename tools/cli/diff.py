@@ -26,7 +26,7 @@ from hearthlog.tools.cli.text import end_with_warnings, tell, unfinished_lines, 
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
-    from hearthlog.analyzer.review.queue.review_list import ReviewSpan
+    from hearthlog.analyzer.review.review_list import ReviewSpan
 
 _SHOWN, _QUEUED = 10, 60
 
@@ -63,7 +63,7 @@ def diff(
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
     from hearthlog.analyzer.logs.labelling import find_labellings
-    from hearthlog.analyzer.review.queue.review_list import write_list
+    from hearthlog.analyzer.review.review_list import write_list
     from hearthlog.schemas.messages.topics import labelling_topic
 
     place = log_location(log)
@@ -105,7 +105,7 @@ class _Result(NamedTuple):
 
 def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
     from hearthlog.analyzer.evaluation.event_scores import compare_labellings
-    from hearthlog.analyzer.review.queue.review_list import disagreements
+    from hearthlog.analyzer.review.review_list import disagreements
 
     difference = compare_labellings(*sides)
     figures = {"microphone": microphone, **asdict(difference)}
@@ -120,9 +120,9 @@ def _queue(
     sides: "list[NamedLabelling]",
     count: int,
 ) -> _Result:
-    from hearthlog.analyzer.review.queue.ranking import make_queue
-    from hearthlog.analyzer.review.queue.review_list import queued
-    from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
+    from hearthlog.analyzer.review.candidates import reviewed_time
+    from hearthlog.analyzer.review.ranking import make_queue
+    from hearthlog.analyzer.review.review_list import queued
     from hearthlog.schemas.messages.topics import is_review, scenario_name
 
     names = [side.name for side in sides]

@@ -10,7 +10,7 @@ from hearthlog.tools.cli.text import moment
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.event_scores import Amounts, LabellingDifference
-    from hearthlog.analyzer.review.queue.ranking import ReviewQueue
+    from hearthlog.analyzer.review.ranking import ReviewQueue
 
 _AMOUNTS = "minutes a", "minutes b", "both", "events a", "events b", "agreement", "kappa"
 

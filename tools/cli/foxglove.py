@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from hearthlog.tools.cli.text import TellOnce, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.foxglove.admission import Admission
+    from hearthlog.analyzer.foxglove.server import Admission
 
 
 def show_in_foxglove(
@@ -25,12 +25,13 @@ def show_in_foxglove(
     stop: Event,
 ) -> bool:
     """Serve viewers, live or what is of a span of time; tell whether some could not be read."""
-    from hearthlog.analyzer.foxglove.admission import Admission
-    from hearthlog.analyzer.foxglove.live import publish_live
-    from hearthlog.analyzer.foxglove.player import Player
-    from hearthlog.analyzer.foxglove.publisher import Publisher
-    from hearthlog.analyzer.foxglove.recording import Recording
-    from hearthlog.analyzer.foxglove.server import PORT, serve
+    from hearthlog.analyzer.foxglove.publisher import (
+        Playback,
+        Publisher,
+        RecordedSpan,
+        publish_live,
+    )
+    from hearthlog.analyzer.foxglove.server import PORT, Admission, serve
     from hearthlog.analyzer.ports import HOST, listen
     from hearthlog.schemas.logs.files import find_logs
 
@@ -39,10 +40,10 @@ def show_in_foxglove(
     admission = Admission(address, secrets.token_urlsafe(16), origins)
     damaged, publisher, player = TellOnce(), Publisher(), None
     if span != (None, None):
-        recording = Recording(find_logs(logs), *span, damaged)
+        recording = RecordedSpan(find_logs(logs), *span, damaged)
         for channel, schema in recording.channels.values():
             publisher.advertise(channel, schema)
-        player = Player(recording, publisher, stop)
+        player = Playback(recording, publisher, stop)
     listener = listen(port or PORT, address)
     with (
         serve(listener, admission, TellOnce(), publisher, player) as server,

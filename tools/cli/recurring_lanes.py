@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from hearthlog.tools.cli.progress import share_done
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.review.timeline.model import Timeline
+    from hearthlog.analyzer.review.timeline import Timeline
 
 
 def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
@@ -18,7 +18,7 @@ def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
     from hearthlog.analyzer.discover.groups_file import load_groups
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline.model import LabelledSpans
+    from hearthlog.analyzer.review.timeline import LabelledSpans
 
     groups = load_groups(file)
     if groups is None:
@@ -43,7 +43,7 @@ def add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
     from hearthlog.analyzer.discover.voices_file import load_voices
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline.model import LabelledSpans
+    from hearthlog.analyzer.review.timeline import LabelledSpans
 
     known = load_voices(file)
     if known is None:

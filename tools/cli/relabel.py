@@ -12,9 +12,9 @@ from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location, sta
 from hearthlog.tools.cli.text import first_of, number, tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.relabel.run import Relabelled
+    from hearthlog.analyzer.relabel.relabel import Relabelled
 
-_TASKS = "hearthlog.analyzer.relabel.labels"
+_TASKS = "hearthlog.analyzer.relabel.layer"
 
 
 def relabel(
@@ -47,7 +47,7 @@ def relabel(
     count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler, _TASKS) as pool:
         # Here, since it takes as long as the workers take to be ready.
-        from hearthlog.analyzer.relabel.run import relabel as run
+        from hearthlog.analyzer.relabel.relabel import relabel as run
         from hearthlog.models.modelfile.modelfile import load_model
 
         model = starter_of(model, logs)
@@ -84,7 +84,7 @@ def _print(result: "Relabelled", model: str) -> None:
 
 
 def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:
-    from hearthlog.analyzer.workers.kernel import kernel_in_use
+    from hearthlog.analyzer.workers.workers import kernel_in_use
 
     return {
         "model": model,

@@ -19,8 +19,8 @@ from hearthlog.tools.cli.text import moment, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-    from hearthlog.analyzer.replay.log_set import LogSet
-    from hearthlog.analyzer.replay.options import Replay, ReplayOptions
+    from hearthlog.analyzer.replay.player import Replay, ReplayOptions
+    from hearthlog.analyzer.replay.replay import LogSet
     from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
@@ -77,8 +77,8 @@ def replay(
     SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
     unfinished, sound before or between the logs is missing, or labels were not to be had.
     """
-    from hearthlog.analyzer.replay.log_set import LogSet
-    from hearthlog.analyzer.replay.options import ReplayOptions
+    from hearthlog.analyzer.replay.player import ReplayOptions
+    from hearthlog.analyzer.replay.replay import LogSet
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL, starter_file
     from hearthlog.schemas.logs.files import find_logs
@@ -197,7 +197,7 @@ def _check_output(output: Path | None, source: Path) -> None:
     if output is None:
         return
     if output.suffix == ".rrd":
-        from hearthlog.analyzer.review.viewer.file import check_output
+        from hearthlog.analyzer.review.viewer.recording import check_output
 
         check_output(output)
         return
@@ -219,8 +219,8 @@ def _run(logs: "LogSet", options: "ReplayOptions", stop: Flag) -> "Replay":
 
     if options.output is None or options.output.suffix != ".rrd":
         return run(options)
-    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-    from hearthlog.analyzer.review.viewer.file import save_timeline
+    from hearthlog.analyzer.review.timeline_reader import read_timeline
+    from hearthlog.analyzer.review.viewer.recording import save_timeline
 
     output = options.output
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:

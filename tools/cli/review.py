@@ -36,11 +36,10 @@ if TYPE_CHECKING:
 
     from hearthlog.analyzer.logs.labelling import Labellings
     from hearthlog.analyzer.logs.spans import Spans
-    from hearthlog.analyzer.review.queue.asked import SoundFile
-    from hearthlog.analyzer.review.queue.review_list import ReviewSpan
-    from hearthlog.analyzer.review.session.marking import Marking
-    from hearthlog.analyzer.review.session.session import ReviewItem
-    from hearthlog.analyzer.review.timeline.model import Timeline
+    from hearthlog.analyzer.review.marking import Marking
+    from hearthlog.analyzer.review.review_list import ReviewSpan, SoundFile
+    from hearthlog.analyzer.review.session import ReviewItem
+    from hearthlog.analyzer.review.timeline import Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _QUEUE = "--queue"
@@ -108,8 +107,8 @@ def review(
     if day is not None and (start or end):
         wrong_use("--day is a span of its own: leave out --start and --end")
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
-    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+    from hearthlog.analyzer.review.lanes import class_precision
+    from hearthlog.analyzer.review.timeline_reader import read_timeline
 
     limits = parse_span(start, end) if day is None else _day(logs, day, timezone)
 
@@ -128,11 +127,11 @@ def review(
         return
     _require_viewer(queue)
     if save is not None:
-        from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
+        from hearthlog.analyzer.review.viewer.recording import check_output, save_timeline
 
         check_output(save)
         timeline = read()
-        save_timeline(timeline, save, checked_classes(timeline, find_home_logs(logs)))
+        save_timeline(timeline, save, class_precision(timeline, find_home_logs(logs)))
         print_recording(save)
     else:
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -159,7 +158,7 @@ class ReviewCommand(TyperCommand):
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """Parse arguments, with the ranking named where none is."""
-        from hearthlog.analyzer.review.queue.ranking import USEFUL
+        from hearthlog.analyzer.review.ranking import USEFUL
 
         if _QUEUE in args:
             following = args.index(_QUEUE) + 1
@@ -196,7 +195,7 @@ def _open(*, web: bool, port: int | None) -> "Viewer":
         from hearthlog.analyzer.review.viewer.web import open_page
 
         return open_page(port)
-    from hearthlog.analyzer.review.viewer.window import open_window
+    from hearthlog.analyzer.review.viewer.viewer import open_window
 
     return open_window(port)
 
@@ -216,11 +215,10 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     """Show a timeline until the reviewer is done."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
-    from hearthlog.analyzer.review.session.session import Session
-    from hearthlog.analyzer.review.session.sound import listen
-    from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
-    from hearthlog.analyzer.review.timeline.model import no_spans
-    from hearthlog.analyzer.review.timeline.read_timeline import (
+    from hearthlog.analyzer.review.lanes import class_precision
+    from hearthlog.analyzer.review.session import ReviewSession, listen
+    from hearthlog.analyzer.review.timeline import no_spans
+    from hearthlog.analyzer.review.timeline_reader import (
         MOST_FRAMES,
         read_frames,
         read_timeline,
@@ -246,7 +244,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         near = [log for log, first, last in spans if first < end and last > start]
         viewer.draw_close_up(read_timeline(near, start, end, zone=timeline.zone))
 
-    session = Session(
+    session = ReviewSession(
         viewer,
         marking,
         heard.classes_of(marking.scenario),
@@ -267,7 +265,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         grid = timeline.grid
         if not items and grid.end - grid.start <= MOST_FRAMES:
             look_closely(grid.start, grid.end)
-        viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
+        viewer.write_checked(timeline, class_precision(timeline, find_home_logs(logs)))
         print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
         if session.run(keys):
             _say_next(logs, marking.scenario)
@@ -300,10 +298,10 @@ def _work(
 ) -> "tuple[list[ReviewItem], Marking]":
     """Find what is to be gone through, and what is corrected."""
     from hearthlog.analyzer.logs.labelling import find_labellings
-    from hearthlog.analyzer.review.queue.asked import corrected_name
-    from hearthlog.analyzer.review.session.marking import Marking
-    from hearthlog.analyzer.review.session.queue_items import review_items
-    from hearthlog.analyzer.review.timeline.model import no_spans
+    from hearthlog.analyzer.review.marking import Marking
+    from hearthlog.analyzer.review.review_list import corrected_name
+    from hearthlog.analyzer.review.session import review_items
+    from hearthlog.analyzer.review.timeline import no_spans
     from hearthlog.schemas.messages.topics import LIVE, scenario_name
 
     segments = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
@@ -333,17 +331,17 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     from hearthlog.analyzer.logs.layers import find_coverage, zone_of
     from hearthlog.analyzer.marks.formats.formats import AUDACITY
     from hearthlog.analyzer.marks.label_files import write_labels
-    from hearthlog.analyzer.review.queue.asked import (
-        asked_path,
+    from hearthlog.analyzer.review.review_list import (
         drawn_minutes,
         find_kept_sound,
         label_lines,
         labels_of,
+        queue_file,
         sound_files,
         sounds_folder,
+        write_list,
         write_sounds,
     )
-    from hearthlog.analyzer.review.queue.review_list import write_list
     from hearthlog.schemas.messages.topics import scenario_name
     from hearthlog.schemas.new_files import check_new, new_file
 
@@ -351,7 +349,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
         wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")
     if len(logs) > 1:
         wrong_use("--save --queue: name one log or folder, as `hearthlog annotate import` takes it")
-    asked, folder = asked_path(path), sounds_folder(path)
+    asked, folder = queue_file(path), sounds_folder(path)
     for new in (path, asked, folder):
         check_new(new)
     zone = zone_of(logs, timezone)
@@ -416,7 +414,7 @@ def _queue_spans(
     choice: _Choice,
     audible: "Spans | None" = None,
 ) -> "list[ReviewSpan]":
-    from hearthlog.analyzer.review.session.queue_items import queue_spans
+    from hearthlog.analyzer.review.session import queue_spans
 
     with share_done("choosing spans") as progress:
         folder = models_folder()

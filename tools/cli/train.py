@@ -119,7 +119,7 @@ def train(
     else:
         assert scenario is not None
         from hearthlog.analyzer.training.train import DEFAULT
-        from hearthlog.analyzer.workers.parallel import fits_on
+        from hearthlog.analyzer.workers.workers import fits_on
 
         if speakers and method is None:
             method = DEFAULT.name  # who speaks is told by the features

@@ -14,7 +14,7 @@ from hearthlog.tools.cli.options import LogsFolder, Timezone, parse_span
 from hearthlog.tools.cli.text import TellOnce, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.review.viewer.live import LiveServer
+    from hearthlog.analyzer.review.viewer.recording import LiveServer
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _POLL_SECONDS = 0.2
@@ -81,7 +81,7 @@ def watch(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
 
-    from hearthlog.analyzer.review.timeline.live import last_time
+    from hearthlog.analyzer.review.live_timeline import last_time
     from hearthlog.schemas.logs.files import check_allowed
 
     check_allowed(logs)
@@ -137,7 +137,7 @@ def _show_in_rerun(
 
 def _server(port: int | None, bind: str | None, minutes: int, *, web: bool) -> "LiveServer":
     from hearthlog.analyzer.ports import free_port, hidden_address
-    from hearthlog.analyzer.review.viewer.live import PORT, LiveServer
+    from hearthlog.analyzer.review.viewer.recording import PORT, LiveServer
 
     if bind is not None:
         return LiveServer(port or PORT, bind, minutes)
@@ -146,8 +146,8 @@ def _server(port: int | None, bind: str | None, minutes: int, *, web: bool) -> "
 
 
 def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
+    from hearthlog.analyzer.review.viewer.viewer import open_window
     from hearthlog.analyzer.review.viewer.web import open_page
-    from hearthlog.analyzer.review.viewer.window import open_window
 
     if not web:
         return open_window(data=url)
@@ -183,7 +183,7 @@ def _follow(
 ) -> bool:
     """Draw what is written until it is enough; tell whether something could not be read."""
     from hearthlog.analyzer.logs.layers import zone_of
-    from hearthlog.analyzer.review.timeline.live import LiveTimeline
+    from hearthlog.analyzer.review.live_timeline import LiveTimeline
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages
 

@@ -21,7 +21,7 @@ from hearthlog.analyzer.training.home_recordings import HOME_WEIGHT
 from hearthlog.analyzer.training.landmark_method import LandmarkMethod
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.pseudo_labels import MOST_CONFIRMED
-from hearthlog.analyzer.workers.parallel import in_parallel
+from hearthlog.analyzer.workers.workers import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.errors import Progress

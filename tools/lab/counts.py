@@ -26,7 +26,7 @@ from hearthlog.analyzer.accuracy.event_counts import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import joined, lengths
-from hearthlog.analyzer.review.queue.random_minutes import Minutes, draw_minutes
+from hearthlog.analyzer.review.candidates import RecordedMinutes, draw_minutes
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import HearthlogError
@@ -150,7 +150,7 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
         for number in _CHECKED:
             for draw in range(_DRAWS):
                 shift = np.roll(others, 7919 * draw)  # other minutes for the same draw
-                minutes = Minutes(home.starts[: len(others)], home.sounding[shift])
+                minutes = RecordedMinutes(home.starts[: len(others)], home.sounding[shift])
                 rows = shift[np.searchsorted(minutes.starts, draw_minutes(minutes, number))]
                 checks = _checks(home, rows)
                 for one in home.labelled:

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.relabel.reading import infos_for_model, read_sound
-from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller, infos_for_model, read_sound
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 

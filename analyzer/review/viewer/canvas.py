@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.spans import Spans
-from hearthlog.analyzer.review.timeline.home_clock import HomeClock
-from hearthlog.analyzer.review.timeline.model import FrameValues, LogLines, SoundClip
+from hearthlog.analyzer.review.timeline import FrameValues, HomeClock, LogLines, SoundClip
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.review.viewer.window import open_hidden
+from hearthlog.analyzer.review.viewer.viewer import open_hidden
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.lab.bench.table import Row, Table, Target
@@ -25,9 +25,9 @@ _RUN = """
 import json, resource, sys, time
 began = float(sys.argv[1])
 from pathlib import Path
-from hearthlog.analyzer.review.viewer.window import open_hidden
+from hearthlog.analyzer.review.viewer.viewer import open_hidden
 with open_hidden() as viewer:
-    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+    from hearthlog.analyzer.review.timeline_reader import read_timeline
     timeline = read_timeline([Path(sys.argv[2])])
     viewer.draw(timeline, close_up=False)
     viewer.wait_until_drawn()

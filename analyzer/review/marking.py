@@ -18,7 +18,7 @@ from hearthlog.analyzer.marks.marks import (
     read_reviewed,
     write_marks,
 )
-from hearthlog.analyzer.review.timeline.model import LabelledSpans
+from hearthlog.analyzer.review.timeline import LabelledSpans
 
 
 @dataclass

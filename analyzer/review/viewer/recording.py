@@ -1,7 +1,12 @@
-"""A timeline that goes on: a server that viewers connect to, and leave, as they like."""
+"""A timeline as a Rerun recording: in a file, or on a server that viewers connect to."""
 
+import os
+import shutil
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, tzinfo
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Self
 
 import numpy as np
@@ -9,30 +14,107 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import Colour
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.ports import free_port
-from hearthlog.analyzer.review.timeline.home_clock import home_clock
-from hearthlog.analyzer.review.timeline.live import Update
-from hearthlog.analyzer.review.timeline.model import LogLines
-from hearthlog.analyzer.review.timeline.plots import PLOTS, Plot
-from hearthlog.analyzer.review.timeline.state_lanes import StateLane
+from hearthlog.analyzer.review.lanes import PLOTS, Checked, Plot, StateLane
+from hearthlog.analyzer.review.live_timeline import Update
+from hearthlog.analyzer.review.timeline import LogLines, Timeline, home_clock
+from hearthlog.analyzer.review.timeline_reader import read_frames
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
+    APPLICATION,
     LINES,
-    add_to_plot,
-    configure_plot,
-    plot_entity,
-)
-from hearthlog.analyzer.review.viewer.layout import (
     Boundary,
     Row,
     TimelineBlueprint,
+    add_to_plot,
+    configure_plot,
+    draw,
+    draw_frames,
     lines_view,
+    plot_entity,
     plot_view,
+    review_layout,
     stack,
     states_view,
     tabs,
+    write_checked,
 )
-from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS, time_text
+from hearthlog.schemas.new_files import check_new, new_file
+
+SUFFIX = ".rrd"
+
+
+def check_output(output: Path) -> None:
+    """Raise DataError unless a recording can be saved under this name.
+
+    Raise `DataError` if the name does not end in `.rrd`, the file exists, or its folder does
+    not exist or cannot be written.
+    """
+    if output.suffix != SUFFIX:
+        raise DataError(f"{output}: the name of a Rerun recording must end in {SUFFIX}")
+    try:
+        check_new(output)
+    except LogError as error:
+        raise DataError(str(error)) from error
+
+
+def save_timeline(timeline: Timeline, output: Path, checked: Checked | None = None) -> None:
+    """Write a timeline into a Rerun recording (`.rrd`).
+
+    Only Rerun's viewer sends usage statistics and opens a port; this does neither.
+
+    Raise `DataError` if the name has another suffix, the file exists, or it cannot be written.
+    """
+    check_output(output)
+    try:
+        with new_file(output) as temporary:
+            _write(timeline, temporary, checked or {})
+    except LogError as error:
+        raise DataError(str(error)) from error
+
+
+def _write(timeline: Timeline, output: Path, checked: Checked) -> None:
+    """Write a recording through a pipe: to a file, Rerun waits for ever where the disk is full."""
+    rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
+    recording = rr.RecordingStream(APPLICATION)
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
+        pipe = Path(folder, "recording")
+        os.mkfifo(pipe)
+        written = thread.submit(_copy, pipe, output)
+        recording.save(pipe)
+        try:
+            recording.send_blueprint(review_layout(timeline))
+            canvas = Canvas(recording, timeline.clock)
+            name_recording(recording, timeline)
+            draw(timeline, canvas)
+            write_checked(timeline, checked, canvas)
+            for part in read_frames(timeline):
+                draw_frames(part, canvas)
+        finally:
+            recording.disconnect()
+        written.result()
+
+
+def _copy(pipe: Path, output: Path) -> None:
+    with pipe.open("rb") as source:
+        try:
+            with output.open("wb") as file:
+                shutil.copyfileobj(source, file)
+        except OSError:
+            while source.read(1 << 20):  # to its end, or nobody could close it
+                pass
+            raise
+
+
+def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
+    """Set the start of a recording, and name it after its span."""
+    start, end = (timeline.clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
+    recording.send_recording_start_time_nanos(start)
+    recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")
+
 
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told
 _APPLICATION = "hearthlog_watch"  # of its own: viewers keep the layout of each

@@ -1,18 +1,22 @@
-"""How spans sound: inputs of the model that labelled them, and what a network hears."""
+"""Spans of one label each that a person can judge, their uncertainty, and their sound."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.event_scores import Events
 from hearthlog.analyzer.logs.labelling import Labellings, LogContents
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
-from hearthlog.analyzer.logs.spans import ranges
-from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
+from hearthlog.analyzer.logs.spans import Spans, overlay, ranges, remains
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
@@ -26,6 +30,237 @@ from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
+
+SHORTEST = NANOSECONDS // 2
+LONGEST = 10 * NANOSECONDS
+_FLICKER = NANOSECONDS
+_MOST = 5_000_000
+
+
+@dataclass(frozen=True)
+class JudgeableSpans:
+    """Spans in the order of time, which do not overlap.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    labels : np.ndarray [shape=(n,)], int64
+        Indices of classes.
+    sources : np.ndarray [shape=(n,)], int64
+        Equal for spans that were cut from one.
+    """
+
+    starts: Int64
+    ends: Int64
+    labels: Int64
+    sources: Int64
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def take(self, rows: Int64) -> "JudgeableSpans":
+        """Return some of the spans.
+
+        Parameters
+        ----------
+        rows : np.ndarray [shape=(m,)], int64
+            In the order of time, or they are no longer in it.
+        """
+        return JudgeableSpans(
+            self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows]
+        )
+
+
+def judgeable_spans(segments: Events) -> JudgeableSpans:
+    """Make spans that a person can judge: join segments that flicker, and cut long ones.
+
+    Successive segments of less than a second each are joined, with the label of the longest. What
+    is longer than ten seconds is cut into equal spans; what is shorter than half a second is left
+    out, for nobody could judge it.
+
+    Parameters
+    ----------
+    segments : Events
+        In nanoseconds of UTC, in the order of time, one label at a time.
+
+    Raises
+    ------
+    DataError
+        If there are more than five million spans, as of a year and a half.
+    """
+    lengths = segments.ends - segments.starts
+    short = lengths < _FLICKER
+    joined = short[1:] & short[:-1] & (segments.starts[1:] == segments.ends[:-1])
+    new = np.append(True, ~joined)[: len(lengths)]
+    first = np.flatnonzero(new)
+    last = np.append(first[1:], len(new))[: len(first)] - 1
+    longest = np.lexsort((lengths, np.cumsum(new)))[last]
+    starts, ends = segments.starts[first], segments.ends[last]
+    parts = np.where(ends - starts < SHORTEST, 0, -(-(ends - starts) // LONGEST))
+    if parts.sum() > _MOST:
+        raise DataError("too much to rank at once: choose a part with --start and --end")
+    source, part = ranges(np.zeros(len(first), np.int64), parts)
+    begins, stops = (
+        starts[source] + (ends - starts)[source] * number // parts[source]
+        for number in (part, part + 1)
+    )
+    return JudgeableSpans(begins, stops, segments.labels[longest][source], source)
+
+
+def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which spans are less than a second of the border of another sound.
+
+    Where one sound goes over into the next the label wavers, and a person hears only the two. What
+    is as short and stands alone, such as a cough, can be judged.
+
+    Parameters
+    ----------
+    silent : np.ndarray [shape=(classes,)], bool
+        Which labels are silence.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
+    touching = spans.starts[1:] == spans.ends[:-1]
+    sounds = ~silent[spans.labels]
+    beside = np.zeros(len(spans), bool)
+    beside[1:] |= touching & sounds[:-1]
+    beside[:-1] |= touching & sounds[1:]
+    return beside & (spans.ends - spans.starts < _FLICKER)
+
+
+def without(segments: Events, reviewed: Spans) -> Events:
+    """Return the parts of segments outside of some time."""
+    spans, rows = remains(segments, reviewed)
+    return Events(*spans, segments.labels[rows])
+
+
+def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
+    """Compare spans with another labelling.
+
+    Returns
+    -------
+    labels : np.ndarray [shape=(n,)], int64
+        The other label of most of each span; -1 for none.
+    differing : np.ndarray [shape=(n,)], float64
+        The share of each span that has another label, 0 to 1.
+    """
+    own = Events(spans.starts, spans.ends, spans.labels)
+    pieces = overlay([own, others]).in_all()
+    row, label = pieces.rows[0], others.labels[pieces.rows[1]]
+    lengths = pieces.ends - pieces.starts
+    apart = np.where(label != spans.labels[row], lengths, 0)
+    differing = np.bincount(row, apart, len(spans)) / (spans.ends - spans.starts)
+    pairs, place = np.unique(np.stack([row, label]), axis=1, return_inverse=True)
+    by_length = np.lexsort((np.bincount(place, lengths), pairs[0]))
+    labels = np.full(len(spans), -1)
+    labels[pairs[0][by_length]] = pairs[1][by_length]  # of equal rows the last one stays
+    return labels, differing
+
+
+class ModelUncertainty:
+    """Mean uncertainty, novelty and silence of spans, of labels that come batch by batch.
+
+    Parameters
+    ----------
+    spans : JudgeableSpans
+        At least one.
+
+    Attributes
+    ----------
+    uncertainty, novelty : SpanMeans
+        0 to 1.
+    silence : SpanMeans
+        The probability of silence, which is 1 where nothing is above the floor of the room.
+    """
+
+    def __init__(self, spans: JudgeableSpans, classes: Sequence[str]) -> None:
+        self._spans, self._classes = spans, classes
+        self.uncertainty, self.novelty, self.silence = (SpanMeans(len(spans)) for _ in range(3))
+
+    def add(self, frames: Columns) -> None:
+        """Add the labels of frames; probabilities without names are left out.
+
+        Parameters
+        ----------
+        frames : Columns
+            Label messages with stamp, probabilities and novelty, in any order.
+        """
+        stamps, probabilities = frames["header.stamp"], frames["probabilities"]
+        row = np.searchsorted(self._spans.starts, stamps, side="right") - 1
+        inside = (row >= 0) & (stamps < self._spans.ends[row])
+        row = row[inside]
+        self.novelty.add(row, frames["novelty"][inside].astype(np.float64))
+        names = array_names(frames.metadata, "probabilities")
+        if probabilities.ndim == 2 and probabilities.shape[1] == len(names) > 1:
+            place = {name: i for i, name in enumerate(names)}
+            columns = np.array([place.get(name, -1) for name in self._classes])
+            labelled = columns[self._spans.labels[row]]
+            self.uncertainty.add(row, uncertainty(probabilities[inside], labelled))
+            silent = [class_name(name) == SILENCE for name in names]
+            self.silence.add(row, probabilities[inside][:, silent].sum(axis=1, dtype=np.float64))
+
+
+def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64:
+    """Return (1 - p + q) / 2, of the probabilities p of the label and q of the best other class.
+
+    Smoothing may choose another label than the most probable class, so the difference of the two
+    highest probabilities would not do.
+
+    Parameters
+    ----------
+    probabilities : np.ndarray [shape=(n, C)], float
+        Of each class, 0 to 1.
+    labelled : np.ndarray [shape=(n,)], int64
+        Columns of the labels; -1 for a label without a column, whose p is 0.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+        0 (certain) to 1; 0.5 where another class is as probable as the label.
+    """
+    others = probabilities.astype(np.float64)
+    rows = np.flatnonzero(labelled >= 0)
+    own = np.zeros(len(others))
+    own[rows] = others[rows, labelled[rows]]
+    others[rows, labelled[rows]] = 0.0
+    return np.clip((1.0 - own + others.max(axis=1, initial=0.0)) / 2.0, 0.0, 1.0)
+
+
+class SpanMeans:
+    """Means of the finite values in each span."""
+
+    def __init__(self, count: int) -> None:
+        self._sums, self._counts = np.zeros(count), np.zeros(count)
+
+    def add(self, row: Int64, values: Float64) -> None:
+        """Add values to their spans; those that are not finite are left out.
+
+        Parameters
+        ----------
+        row : np.ndarray [shape=(n,)], int64
+            Of the span that each value is in.
+        values : np.ndarray [shape=(n,)], float64
+        """
+        finite = np.isfinite(values)
+        row, values = row[finite], values[finite]
+        if len(row):
+            first = int(row.min())
+            part = slice(first, int(row.max()) + 1)
+            self._sums[part] += np.bincount(row - first, values)
+            self._counts[part] += np.bincount(row - first)
+
+    @property
+    def exist(self) -> bool:
+        """Whether there is any value."""
+        return bool(self._counts.any())
+
+    def values(self) -> Float64:
+        """Return the means, shape (count,); 0 where there is no value."""
+        return self._sums / np.maximum(self._counts, 1.0)
+
 
 _FIELDS = ("header.stamp", "frame", "values")
 _BEFORE = 60 * NANOSECONDS  # in which the floor of the room is found

@@ -1,4 +1,4 @@
-"""A relabelling: which logs are labelled by workers, and in which order layers are completed."""
+"""A relabelling: its jobs for the workers, and the order in which layers are completed."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,11 +10,15 @@ from typing import Any
 
 from hearthlog.analyzer.errors import LostClusterError
 from hearthlog.analyzer.logs.layers import Chain, find_chains
-from hearthlog.analyzer.relabel.jobs import Job, is_current, make_job
-from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_logs
 from hearthlog.analyzer.relabel.layer import (
+    Job,
     LayerMetadata,
     OpenRuns,
+    UnfinishedLayer,
+    complete_layer,
+    is_current,
+    label_logs,
+    make_job,
     read_layer_metadata,
 )
 from hearthlog.analyzer.workers import Workers

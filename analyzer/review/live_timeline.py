@@ -1,4 +1,4 @@
-"""Follow logs that are being written, second by second; what is kept does not grow."""
+"""Updates of a timeline from growing logs, second by second, within bounded memory."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -11,40 +11,39 @@ from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth
 from hearthlog.analyzer.logs.selection import decode_types
 from hearthlog.analyzer.logs.sound_vectors import degrees_of
 from hearthlog.analyzer.logs.spans import rows_at
-from hearthlog.analyzer.review.timeline.decode import (
+from hearthlog.analyzer.review.lanes import (
+    DIRECTION,
+    FEATURES,
+    FLOOR,
+    GAP_STATE,
+    GAPS,
+    LEVEL,
+    NOVELTY,
+    RECORDER,
+    SHARES,
+    TROUBLE,
+    TROUBLES,
+    Plot,
+    StateChanges,
+    StateLane,
+    scenario_kind,
+    scenario_sounds,
+    state_changes,
+)
+from hearthlog.analyzer.review.timeline import (
     ENERGY,
     FIELDS,
     DirectionRows,
     FeatureRows,
     GapRows,
+    LabelledSpans,
     LabelRows,
+    LogLines,
     Rows,
     SegmentRows,
     StateRows,
     decibel,
     read_rows,
-)
-from hearthlog.analyzer.review.timeline.lanes import scenario_sounds
-from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
-from hearthlog.analyzer.review.timeline.plots import (
-    DIRECTION,
-    FEATURES,
-    FLOOR,
-    LEVEL,
-    NOVELTY,
-    SHARES,
-    Plot,
-)
-from hearthlog.analyzer.review.timeline.state_lanes import (
-    GAPS,
-    NOT_HEARD,
-    RECORDER,
-    TROUBLE,
-    TROUBLES,
-    Changes,
-    StateLane,
-    changes,
-    scenario_kind,
 )
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
@@ -126,7 +125,7 @@ class LiveTimeline:
                 yield from self._segments(rows.microphone, rows.spans)
             case SegmentRows() if is_scenario(rows.labelling):
                 kind = scenario_kind(rows.labelling)
-                yield StateLane(kind, rows.microphone, changes(scenario_sounds(rows.spans)))
+                yield StateLane(kind, rows.microphone, state_changes(scenario_sounds(rows.spans)))
             case GapRows():
                 yield _gaps(rows)
             case DirectionRows():
@@ -155,7 +154,7 @@ class LiveTimeline:
         present = ~np.isnan(shares[:, 0])
         best = np.where(present, np.nan_to_num(shares).argmax(axis=1), len(names))
         states = np.array([*names, None], object)[best]
-        yield StateLane(RECORDER, microphone, Changes(starts, states.tolist()))
+        yield StateLane(RECORDER, microphone, StateChanges(starts, states.tolist()))
         seconds = np.append(self._open_seconds(microphone), starts[present])
         self._open[microphone] = seconds[-_MOST_OPEN:]
 
@@ -166,7 +165,7 @@ class LiveTimeline:
         rows = rows_at(spans, times)
         closed = rows >= 0
         states = spans.texts[rows[closed]].tolist()
-        yield StateLane(RECORDER, microphone, Changes(times[closed], states))
+        yield StateLane(RECORDER, microphone, StateChanges(times[closed], states))
         self._open[microphone] = seconds[seconds >= spans.ends[-1]]
 
     def _open_seconds(self, microphone: str) -> Int64:
@@ -223,9 +222,9 @@ class _Scale:
 def _gaps(rows: GapRows) -> StateLane:
     spans = rows.spans
     later = spans.ends > spans.starts  # where the clock was set back nothing is missing
-    texts = np.full(later.sum(), NOT_HEARD, object)
+    texts = np.full(later.sum(), GAP_STATE, object)
     spans = LabelledSpans(spans.starts[later], spans.ends[later], texts)
-    return StateLane(GAPS, rows.microphone, changes(spans))
+    return StateLane(GAPS, rows.microphone, state_changes(spans))
 
 
 def _states(rows: StateRows) -> Iterator[StateLane | Plot]:
@@ -236,7 +235,7 @@ def _states(rows: StateRows) -> Iterator[StateLane | Plot]:
         times = np.array([state.time for state in states])
         levels = (min(state.level, len(TROUBLES)) for state in states)
         texts = [TROUBLES[level - 1] if level else None for level in levels]
-        yield StateLane(TROUBLE, name, Changes(times, texts))
+        yield StateLane(TROUBLE, name, StateChanges(times, texts))
         floors = np.array([[state.floor_dbfs] for state in states])
         if not np.isnan(floors).all():
             yield Plot(FLOOR, name, "", ("floor",), times, floors)

@@ -1,0 +1,385 @@
+"""Spans for a review beside the ranking: changes by a model, hints, random minutes."""
+
+from collections.abc import Collection, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.event_scores import Events, events_of
+from hearthlog.analyzer.gate.paired_labels import ChangedTime, find_changed_time
+from hearthlog.analyzer.gate.promotion_check import find_champion, other_features
+from hearthlog.analyzer.gate.recent_time import recent_logs
+from hearthlog.analyzer.logs.labelling import Labelling, Labellings, LogContents, NamedLabelling
+from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
+from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay
+from hearthlog.analyzer.marks.marks import RANDOM, read_review
+from hearthlog.analyzer.review.ranking import spread
+from hearthlog.analyzer.review.review_list import CHANGE, HINT, ReviewSpan
+from hearthlog.analyzer.review.spans import (
+    JudgeableSpans,
+    judgeable_spans,
+    other_labels,
+    without,
+)
+from hearthlog.models.classes import SILENCE, class_name
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.names import AUDIOSET
+from hearthlog.models.embedding.networks import YAMNET
+from hearthlog.models.embedding.projection import Embeddings, Projection, read_projection
+from hearthlog.models.embedding.sound_names import SoundName, audioset_names, named_sounds
+from hearthlog.schemas.arrays import Bool, Int64
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import is_layer
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    EmbeddingSource,
+    labelling_topic,
+    relabelling,
+    scenario_labelling,
+    topic,
+)
+
+
+def hinted_spans(
+    side: NamedLabelling,
+    sources: Labellings,
+    microphone: str,
+    reviewed: Spans,
+    count: int,
+) -> list[ReviewSpan]:
+    """Choose sounds that a network names with a name that is a hint, and labels do not.
+
+    Parameters
+    ----------
+    count : int
+        How many, at most.
+
+    Returns
+    -------
+    list of ReviewSpan
+        Spread over names and days, of each the clearest first. The score is by how many logits the
+        network is above the threshold of the name.
+
+    Raises
+    ------
+    DataError
+        If there are no embeddings, or nothing is left in which the network gives a hint.
+    """
+    names = [name for name in audioset_names() if not name.is_event]
+    hints, above = _named(sources, microphone, names)
+    classes = list(dict.fromkeys([*side.classes, *(name.name for name in names)]))
+    spans = judgeable_spans(without(hints, reviewed))
+    labels, _ = other_labels(spans, events_of(side.labelling, classes))
+    own = [class_name(classes[label]) if label >= 0 else "" for label in labels.tolist()]
+    new = np.array(
+        [names[n].name != label for n, label in zip(spans.labels.tolist(), own, strict=True)], bool
+    )
+    labelled = np.flatnonzero(new & (labels >= 0))
+    labelled = labelled[np.unique(spans.sources[labelled], return_index=True)[1]]  # one of each
+    if not len(labelled):
+        raise DataError(f"{side.name}: no span is left in which the network gives a hint")
+    spans, labels = spans.take(labelled), labels[labelled]
+    place = np.searchsorted(hints.starts, spans.starts, "right") - 1
+    scores = above[place]
+    rows = spread(1.0 + scores, spans, count)
+    return [
+        ReviewSpan(
+            microphone,
+            int(spans.starts[row]),
+            int(spans.ends[row]),
+            side.name,
+            classes[labels[row]],
+            scenario_labelling(AUDIOSET),
+            names[spans.labels[row]].name,
+            round(float(scores[row]), 3),
+            HINT,
+        )
+        for row in rows.tolist()
+    ]
+
+
+def _named(
+    sources: Labellings, microphone: str, names: list[SoundName]
+) -> tuple[Events, np.ndarray[tuple[int], np.dtype[np.float64]]]:
+    """Return the sounds that networks name, one at a time, and how far each is above.
+
+    Of two names at once it is the one that is further above its threshold.
+    """
+    found: list[tuple[int, int, int, float]] = []
+    embedded = False
+    numbers = {name: number for number, name in enumerate(names)}
+    for log in sources.logs:
+        try:
+            for embeddings, projection in _embedded(log, microphone):
+                embedded = True
+                for sound in named_sounds(embeddings, projection, names):
+                    start, end = (_time(embeddings, at) for at in (sound.first, sound.end))
+                    row = start, end, numbers[sound.name], sound.logit - sound.name.threshold
+                    found.append(row)
+        except LogError as error:
+            sources.lose(error)
+    if not embedded:
+        raise DataError(
+            f"{microphone}: --queue hint needs embeddings, and these logs have none: record with a "
+            "network (hearthlog models fetch yamnet)"
+        )
+    kept: list[tuple[int, int, int, float]] = []
+    for row in sorted(found):
+        if kept and row[0] < kept[-1][1]:
+            if row[3] > kept[-1][3]:
+                kept[-1] = row
+        else:
+            kept.append(row)
+    starts, ends, labels = (np.array([row[n] for row in kept], np.int64) for n in range(3))
+    return Events(starts, ends, labels), np.array([row[3] for row in kept], np.float64)
+
+
+def _embedded(log: LogContents, microphone: str) -> Iterator[tuple[Embeddings, Projection]]:
+    """Yield the embeddings of a log, of which frames follow, with their projection."""
+    name = topic(microphone, "embedding")
+    columns = read_columns([log.path], {name}, fields=EMBEDDING_FIELDS).get(name)
+    if columns is None or columns.type != message_types.EMBEDDING or not len(columns):
+        return
+    source = EmbeddingSource.from_metadata(columns.metadata)
+    projection = read_projection(YAMNET.projection)
+    if source is None or source.projection_sha256 != projection.sha256:
+        return
+    embeddings = embeddings_of(columns)
+    new = np.flatnonzero(np.diff(embeddings.frames) <= 0) + 1
+    for first, last in pairwise([0, *new.tolist(), len(embeddings.frames)]):
+        yield embeddings.rows(slice(first, last)), projection
+
+
+def _time(embeddings: Embeddings, frame: int) -> int:
+    """Return the start of a frame in nanoseconds of UTC, by the window nearest before it."""
+    place = max(int(np.searchsorted(embeddings.frames, frame, "right")) - 1, 0)
+    away = frame - int(embeddings.frames[place])
+    return int(embeddings.stamps[place]) + away * FRAME_NANOSECONDS
+
+
+MINUTE = 60 * NANOSECONDS
+SOUND_SHARE = 0.75  # of the minutes that are drawn has a sound, so that nights take no one's time
+_SEED = 20_261_123
+_UNLABELLED = NANOSECONDS // 10  # in a minute at most
+
+
+class RecordedMinutes(NamedTuple):
+    """Minutes of the clock that are labelled from start to end.
+
+    Attributes
+    ----------
+    starts : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, ascending.
+    has_sound : np.ndarray [shape=(n,)], bool
+        Whether a label in it is none of silence.
+    """
+
+    starts: Int64
+    has_sound: Bool
+
+
+def whole_minutes(labelling: Labelling) -> RecordedMinutes:
+    """Find the minutes of a labelling, and tell those with a sound from those without."""
+    if not len(labelling):
+        return RecordedMinutes(np.empty(0, np.int64), np.empty(0, bool))
+    stretches = joined(labelling.starts, labelling.ends, _UNLABELLED)
+    numbers = [
+        np.arange(-(-start // MINUTE), end // MINUTE)
+        for start, end in zip(stretches.starts.tolist(), stretches.ends.tolist(), strict=True)
+    ]
+    starts = np.concatenate(numbers) * MINUTE
+    names = {name: class_name(name) != SILENCE for name in set(labelling.labels)}
+    loud = np.array([names[name] for name in labelling.labels], bool)
+    sounds = joined(labelling.starts[loud], labelling.ends[loud])
+    return RecordedMinutes(starts, _length_in(sounds, starts) > 0)
+
+
+def draw_minutes(
+    minutes: RecordedMinutes, count: int, drawn: Collection[int] = (), taken: Spans = NONE
+) -> Int64:
+    """Draw minutes at random, three of four of those with a sound.
+
+    The same minutes and the same earlier draws give the same ones.
+
+    Parameters
+    ----------
+    count : int
+        How many, at most.
+    drawn : collection of int
+        Starts of the minutes that were drawn and reviewed before, in nanoseconds of UTC.
+    taken : Spans
+        Time that is reviewed already, of which no minute is drawn.
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], int64
+        Starts, in the order in which they were drawn.
+    """
+    before = minutes.has_sound[np.isin(minutes.starts, list(drawn))]
+    shuffled = np.random.default_rng([_SEED, len(drawn)]).permutation(len(minutes.starts))
+    free = shuffled[_length_in(taken, minutes.starts)[shuffled] == 0]
+    left = {sound: free[minutes.has_sound[free] == sound].tolist()[::-1] for sound in (True, False)}
+    total, sounds = len(before), int(before.sum())
+    chosen: list[int] = []
+    while len(chosen) < count and any(left.values()):
+        sound = bool(left[True]) and (not left[False] or sounds < SOUND_SHARE * (total + 1))
+        chosen.append(left[sound].pop())
+        total, sounds = total + 1, sounds + sound
+    return minutes.starts[np.array(chosen, np.intp)]
+
+
+def _length_in(spans: Spans, minutes: Int64) -> Int64:
+    """Return how much of each minute lies in spans, in nanoseconds."""
+    if not len(minutes):
+        return np.empty(0, np.int64)
+    edges = np.unique(np.concatenate([minutes, minutes + MINUTE]))
+    inside = lengths(common(spans, joined(minutes, minutes + MINUTE)), edges)
+    return inside[np.searchsorted(edges, minutes)]
+
+
+class ReviewedTime(NamedTuple):
+    """The time of a microphone that a person has marked, or looked at.
+
+    Attributes
+    ----------
+    random : frozenset of int
+        Starts of the spans that were drawn at random, in nanoseconds of UTC.
+    """
+
+    spans: Spans
+    random: frozenset[int]
+
+
+def reviewed_time(sources: Labellings, microphone: str, scenario: str = "") -> ReviewedTime:
+    """Read what is reviewed of a microphone, by anyone and of any labelling of one scenario.
+
+    Parameters
+    ----------
+    scenario : str, optional
+        Its name; empty for the sounds of the home.
+    """
+    times, random = [], set[int]()
+    for log in sources.logs:
+        if is_layer(log.path):
+            continue
+        try:
+            review = read_review(log.path)
+        except LogError as error:
+            sources.lose(error)
+            continue
+        marks, looked_at = review.get(scenario, ((), ()))
+        own = [span for span in looked_at if span.microphone == microphone]
+        random |= {span.start for span in own if span.chosen == RANDOM}
+        times += [(span.start, span.end) for span in own]
+        times += [(mark.start, mark.end) for mark in marks if mark.microphone == microphone]
+    starts, ends = np.array(times, np.int64).reshape(-1, 2).T
+    return ReviewedTime(joined(starts, ends), frozenset(random))
+
+
+def changed_by(  # noqa: PLR0913, PLR0917
+    model: tuple[Path, Model],
+    side: NamedLabelling,
+    sources: Labellings,
+    microphone: str,
+    count: int,
+    progress: Progress = ignore_progress,
+) -> list[ReviewSpan]:
+    """Choose spans in which a model says something else than the one that labels now.
+
+    Parameters
+    ----------
+    side : NamedLabelling
+        The labelling to be reviewed. Where it says something else than the model that labels now,
+        as of older logs it may, nothing is asked.
+    count : int
+        How many, at most.
+    progress : callable, optional
+        Is told the share of the sound that is done, 0 to 1.
+
+    Returns
+    -------
+    list of ReviewSpan
+        Those of the largest changes first, spread over changes and days, of each the longest first.
+        The score is minutes a day, if a day is recorded.
+
+    Raises
+    ------
+    DataError
+        If the model cannot be compared, or changes nothing that a person could judge.
+    ModelError
+        As `find_champion`, and if a feature set is not installed.
+    """
+    folder, after = model
+    topic = labelling_topic(microphone, LIVE, "segment")
+    paths = [log.path for log in sources.with_topic(topic)]
+    before = _champion(folder, after, paths)
+    changed = find_changed_time(before, after, recent_logs(paths), microphone, progress)
+    sources.losses.extend(loss for loss in changed.losses if loss not in sources.losses)
+    left = without(_where(changed, side), reviewed_time(sources, microphone).spans)
+    spans = judgeable_spans(left)
+    if not len(spans):
+        raise DataError(
+            f"{after.name}: no span is left in which it says something else than {before.name}"
+        )
+    return _listed(spans, changed, side.name, microphone, after.name, count)
+
+
+def _champion(folder: Path, model: Model, paths: list[Path]) -> Model:
+    champion = find_champion(folder, paths, model)
+    if champion is None:
+        raise DataError(f"{model.name}: no model labels here yet, so there is nothing to change")
+    if champion.sha256 == model.sha256:
+        raise DataError(f"{model.name} labels here already: name a model that would change that")
+    if other := other_features(champion, model):
+        raise DataError(f"{model.name}: {other}")
+    return champion
+
+
+def _where(changed: ChangedTime, side: NamedLabelling) -> Events:
+    """Return the changed time in which a labelling says what the first model does."""
+    classes, labels = changed.changes.classes, side.called_as(changed.changes.classes)
+    every = list(dict.fromkeys([*classes, *labels.classes]))
+    said = events_of(labels.labelling, every)
+    parts = overlay([changed.spans, said]).in_all()
+    pairs = changed.spans.labels[parts.rows[0]]
+    same = pairs // len(classes) == said.labels[parts.rows[1]]
+    return Events(parts.starts[same], parts.ends[same], pairs[same])
+
+
+def _listed(  # noqa: PLR0913, PLR0917
+    spans: JudgeableSpans,
+    changed: ChangedTime,
+    a: str,
+    microphone: str,
+    model: str,
+    count: int,
+) -> list[ReviewSpan]:
+    """List the spans to be asked, at most one of what changes without a break."""
+    classes, changes = changed.changes.classes, changed.changes
+    _, first = np.unique(spans.sources, return_index=True)
+    ordered = first[np.argsort(spans.starts[first] - spans.ends[first], kind="stable")]
+    longest = spans.take(ordered)
+    minutes = changes.minutes.reshape(-1)[longest.labels]
+    rows = spread(minutes, longest, count)
+    chosen, score = longest.take(rows), minutes[rows].round(1).tolist()
+    columns = (column.tolist() for column in (chosen.starts, chosen.ends, chosen.labels))
+    return [
+        ReviewSpan(
+            microphone,
+            start,
+            end,
+            a,
+            classes[pair // len(classes)],
+            relabelling(model),
+            classes[pair % len(classes)],
+            much if changes.each else None,
+            CHANGE,
+        )
+        for start, end, pair, much in zip(*columns, score, strict=True)
+    ]

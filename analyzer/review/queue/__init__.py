@@ -1,1 +1,0 @@
-"""What to review next: uncertain, novel, where two labellings differ."""

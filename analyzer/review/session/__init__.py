@@ -1,1 +1,0 @@
-"""A review session: keys, and the marks that they make."""

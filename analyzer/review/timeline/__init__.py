@@ -1,1 +1,0 @@
-"""Logs as a timeline: at the resolution of a screen, or as they are being written."""
