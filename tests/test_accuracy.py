@@ -29,15 +29,14 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.report.daily_metrics import day_of
-from hearthlog.analyzer.report.home_metrics import whole_home
+from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.review.lanes import class_precision
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.cli.accuracy_text import Accuracy
+from hearthlog.tools.cli.info_summary import Accuracy
 
 DAY = date(2026, 3, 1)
 START = midnight(DAY)

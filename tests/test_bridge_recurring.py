@@ -23,12 +23,12 @@ from hearthlog.analyzer.bridge.page.group_naming import GroupNaming
 from hearthlog.analyzer.bridge.page.recurring import Recurring
 from hearthlog.analyzer.bridge.page.recurring_list import Moment, recurring_list
 from hearthlog.analyzer.bridge.page.said import REVIEWER
-from hearthlog.analyzer.discover.groups_file import GROUPS
-from hearthlog.analyzer.discover.summary_file import (
+from hearthlog.analyzer.discover.groups import GROUPS
+from hearthlog.analyzer.discover.summary import (
     SUMMARY,
     Example,
+    GroupsSummary,
     GroupSummary,
-    HomeSummary,
     load_summary,
     save_summary,
     summary_path,
@@ -68,7 +68,9 @@ def group(number, name="", times=84, *, microphones=("mic",), **changes):
 
 
 def summary_of(*groups, of="5b4e0d1c"):
-    return HomeSummary(id=of, sounds=1000, timezone="UTC", groups_file=GROUPS, groups=list(groups))
+    return GroupsSummary(
+        id=of, sounds=1000, timezone="UTC", groups_file=GROUPS, groups=list(groups)
+    )
 
 
 def keep(folder, *groups, **options):

@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.colours import colour, colour_on_paper
-from hearthlog.analyzer.report.class_words import several_in_words
+from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.train import (
     default_transitions,

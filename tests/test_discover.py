@@ -20,16 +20,20 @@ from hypothesis import strategies as st
 from recurring import RECURRING, names_of, record_recurring
 from sklearn.metrics import adjusted_rand_score
 
-from hearthlog.analyzer.discover import descriptors
-from hearthlog.analyzer.discover import read_sounds as read_sounds_module
-from hearthlog.analyzer.discover.descriptors import describe, descriptor_width
-from hearthlog.analyzer.discover.discover import discover
-from hearthlog.analyzer.discover.group_spans import group_spans
-from hearthlog.analyzer.discover.groups import NO_GROUP, add_groups, new_groups
-from hearthlog.analyzer.discover.groups_file import GROUPS, load_groups, save_groups
-from hearthlog.analyzer.discover.hours import usual_hours
-from hearthlog.analyzer.discover.read_sounds import read_sounds
-from hearthlog.analyzer.discover.summary_file import summary_path
+from hearthlog.analyzer.discover import groups
+from hearthlog.analyzer.discover import sounds as sounds_module
+from hearthlog.analyzer.discover.groups import (
+    GROUPS,
+    NO_GROUP,
+    add_groups,
+    describe,
+    descriptor_width,
+    load_groups,
+    new_groups,
+    save_groups,
+)
+from hearthlog.analyzer.discover.sounds import discover, group_spans, read_sounds
+from hearthlog.analyzer.discover.summary import busiest_hours, summary_path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.live import examine_live
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -324,7 +328,7 @@ def test_sounds_are_read_in_the_order_of_time_where_a_clock_was_set_back():
     stamps = np.array([50, 60, 10, 20])
     fields = {"header.stamp": stamps, "label": np.array(list("cdab"), object)}
     columns = Columns("/mic/label", message_types.LABEL, {}, stamps, stamps, stamps, fields)
-    times, labels = read_sounds_module._by_time(columns, "label")
+    times, labels = sounds_module._by_time(columns, "label")
     assert times.tolist() == [10, 20, 50, 60]
     assert labels.tolist() == list("abcd")
 
@@ -342,14 +346,14 @@ def test_what_lies_about_a_known_group_is_no_new_one():
 
 
 def test_features_that_are_no_numbers_are_left_out_and_said(home, monkeypatch):
-    real = read_sounds_module.read_columns
+    real = sounds_module.read_columns
 
     def with_nan(*arguments, **options):
         found = real(*arguments, **options)
         found["/mic/features"].fields["values"][2000:2400] = np.nan
         return found
 
-    monkeypatch.setattr(read_sounds_module, "read_columns", with_nan)
+    monkeypatch.setattr(sounds_module, "read_columns", with_nan)
     with read_sounds(find_home_logs([home]), "all") as sounds:
         assert np.isfinite(sounds.descriptors).all()
     assert "with features that are no numbers; left out" in sounds.losses[0]
@@ -507,7 +511,7 @@ def test_descriptions_are_the_same_in_blocks_of_any_size(monkeypatch):
     last = first + rng.integers(4, 60, len(first))
     whole = describe(values, names, first, last)
     for size in (1, 100, 1 << 30):
-        monkeypatch.setattr(descriptors, "_AT_ONCE", size)
+        monkeypatch.setattr(groups, "_DESCRIBED_AT_ONCE", size)
         assert np.array_equal(describe(values, names, first, last), whole)
 
 
@@ -526,4 +530,4 @@ def test_a_description_is_what_it_says():
     ],
 )
 def test_the_usual_hours_are_the_shortest_span_with_four_fifths(hours, text):
-    assert usual_hours([hours.get(hour, 0) for hour in range(24)]) == text
+    assert busiest_hours([hours.get(hour, 0) for hour in range(24)]) == text

@@ -31,7 +31,7 @@ from hearthlog.recorder.labelling import embedder_probe
 from hearthlog.recorder.labelling.embedder_probe import Probe, open_embedder, probe_network
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES
-from hearthlog.tools.cli import fetch as verb
+from hearthlog.tools.cli.models import _tried
 
 _PLACES = (
     Path(__file__).parents[2] / "shared" / "data" / "networks" / "yamnet.tflite",
@@ -362,7 +362,7 @@ def test_a_configured_network_that_is_not_there_is_noticed(hearthlog, tmp_path, 
 def test_a_file_that_hears_otherwise_is_told_when_it_is_fetched(yamnet, monkeypatch):
     probe = Probe(0.01, 60.0, ["beep of tone: -3.00, where 2.00 is known"])
     monkeypatch.setattr(embedder_probe, "probe_network", lambda *_: probe)
-    (line,) = verb._tried(YAMNET, yamnet)
+    (line,) = _tried(YAMNET, yamnet)
     assert "hears otherwise than models were made with (beep of tone: -3.00" in line
 
 

@@ -11,10 +11,13 @@ import numpy as np
 import spliced
 from recurring import record_recurring
 
-from hearthlog.analyzer.discover.discover import discover, unembedded_note
-from hearthlog.analyzer.discover.groups import NO_GROUP
-from hearthlog.analyzer.discover.groups_file import load_groups, save_groups
-from hearthlog.analyzer.discover.read_sounds import read_log_sounds, read_sounds
+from hearthlog.analyzer.discover.groups import NO_GROUP, load_groups, save_groups
+from hearthlog.analyzer.discover.sounds import (
+    discover,
+    read_log_sounds,
+    read_sounds,
+    unembedded_note,
+)
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings

@@ -25,12 +25,18 @@ from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
-from hearthlog.analyzer.report.baseline import FEWEST, compared, usual
-from hearthlog.analyzer.report.daily_metrics import day_of
-from hearthlog.analyzer.report.home_metrics import whole_home
+from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
-from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
+from hearthlog.analyzer.report.values import (
+    FEWEST,
+    Clock,
+    Count,
+    Duration,
+    compared,
+    exactly,
+    usual_range,
+)
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -160,7 +166,7 @@ def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give
     assert count == Count(27, 2, Strata(100, 20, 25), rates), "the same each time"
     both = count + Count(3, 3, rates=rates)
     assert (both.labelled, both.range) == (30, (low + 3, high + 3))
-    assert [Minutes(m).text for m in (0, 0.2, 59.4, 125)] == [
+    assert [Duration(m).text for m in (0, 0.2, 59.4, 125)] == [
         "0 min",
         "under 1 min",
         "59 min",
@@ -171,8 +177,8 @@ def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give
 
 def test_what_is_usual_needs_a_week_and_what_is_unusual_is_outside_of_all_of_it():
     days = [exactly(n) for n in (3, 4, 4, 5, 6, 3, 4)]
-    assert usual(days[: FEWEST - 1]) is None
-    known = usual(days)
+    assert usual_range(days[: FEWEST - 1]) is None
+    known = usual_range(days)
     assert known == (4, 3, 6)
     assert exactly(0).spread(*known) == "4 (3 to 6)"
     assert compared(exactly(7), known) == 1

@@ -20,7 +20,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import joined, one, without
 from hearthlog.analyzer.report.report import Period, make_report
-from hearthlog.analyzer.report.routine_text import difference_text, judgement_text
+from hearthlog.analyzer.report.wording import difference_text, judgement_text
 from hearthlog.analyzer.routine import day_anomaly as usual
 from hearthlog.analyzer.routine.day_anomaly import (
     FEWEST,

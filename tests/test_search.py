@@ -25,7 +25,7 @@ from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.workers.workers import fits_on, in_parallel, single_thread
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import ignore_progress
-from hearthlog.tools.cli import progress
+from hearthlog.tools.cli import terminal
 from hearthlog.tools.home.simulate import write_training_set
 
 
@@ -150,7 +150,7 @@ def test_wrong_use_is_one_line(words, line, tmp_path, hearthlog):
 
 _STEPS = """
 import time
-from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.terminal import share_done
 with share_done("trying") as report:
     for done in range(1, 5):
         time.sleep(0.3)
@@ -172,8 +172,8 @@ def test_a_terminal_shows_the_time_left():
 
 
 def test_elsewhere_a_line_now_and_then_says_how_much_is_done(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "_LINE_SECONDS", 0.0)
-    with progress.share_done("trying") as report:
+    monkeypatch.setattr(terminal, "_LINE_SECONDS", 0.0)
+    with terminal.share_done("trying") as report:
         report(0.125)
     assert capsys.readouterr().err == "hearthlog: trying: 12.5%\n"
 

@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from hearthlog.tools.cli.table import print_confusion, print_table
+from hearthlog.tools.cli.terminal import print_confusion, print_table
 
 HEAD = ("class", "support", "false alarms/day")
 ROWS = [("objects_activity", "123", "5019.8"), ("a\x1b[31m\nb", "7", "-")]
-CODE = f"from hearthlog.tools.cli.table import print_table; print_table({HEAD!r}, {ROWS!r})"
+CODE = f"from hearthlog.tools.cli.terminal import print_table; print_table({HEAD!r}, {ROWS!r})"
 
 
 def printed_on_a_terminal(columns):

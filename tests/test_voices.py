@@ -16,24 +16,36 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 from spoken import ALLISON, DAY, START, THEO, record_conversation, two_voices
 
-from hearthlog.analyzer.discover.common_speech import SpeechFrames, louder_elsewhere
-from hearthlog.analyzer.discover.home_voices import NO_VOICE, Voices, find_voices
-from hearthlog.analyzer.discover.read_speech import (
+from hearthlog.analyzer.discover.home_voices import (
+    NO_VOICE,
+    VOICES,
+    HomeVoices,
+    find_voices,
+    load_voices,
+    save_voices,
+    spoken_spans,
+)
+from hearthlog.analyzer.discover.speech import (
     HomeSpeech,
+    SpeechFrames,
     Turns,
+    is_doubtful,
+    louder_elsewhere,
     read_speech,
+    speech_spans,
     speech_voices,
 )
-from hearthlog.analyzer.discover.speech_spans import is_doubtful, speech_spans
-from hearthlog.analyzer.discover.voice_space import (
+from hearthlog.analyzer.discover.voices import (
+    VoiceEvidence,
     describe_speech,
     has_voices,
+    merged_voices,
+    same_voice,
+    summed,
+    tell_apart,
     voice_space,
     window_starts,
 )
-from hearthlog.analyzer.discover.voice_summary import spoken_spans
-from hearthlog.analyzer.discover.voices import Evidence, joined, same_voice, summed, tell_apart
-from hearthlog.analyzer.discover.voices_file import VOICES, load_voices, save_voices
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -139,7 +151,7 @@ def test_the_voices_of_one_day_are_known_again_on_the_next(clips, two_days, tmp_
 def test_each_voice_of_a_conversation_is_the_one_that_is_like_it():
     where, of = points(3, 3, 40)
     likes = summed(where[::2], of[::2], 3)
-    known = Voices(np.array([4, 7]), likes.rows(np.array([0, 1])), ["anna", ""], "0" * 8)
+    known = HomeVoices(np.array([4, 7]), likes.rows(np.array([0, 1])), ["anna", ""], "0" * 8)
     turns = Turns(*(np.empty(0, np.int64) for _ in Turns._fields))
     heard = summed(where[1::2], of[1::2], 3).rows(np.array([1, 2, 0]))
     voices, found = find_voices(HomeSpeech([], [], turns, heard, [], 0), known)
@@ -389,7 +401,7 @@ def points(draw_seed, voices, each):
 def test_voices_far_apart_are_told_apart_whatever_their_order(seed, voices):
     where, of = points(seed, voices, 20)
     order = np.random.default_rng(seed).permutation(len(of))
-    found = joined(Evidence(np.ones(len(of)), where[order]), SPREAD)
+    found = merged_voices(VoiceEvidence(np.ones(len(of)), where[order]), SPREAD)
     pairs = set(zip(found.tolist(), of[order].tolist(), strict=True))
     assert len(pairs) == len(np.unique(found)) == voices
 
@@ -450,7 +462,9 @@ def test_features_of_other_sets_have_no_voices():
 
 def a_file(tmp_path):
     numbers, counts = np.array([1, 2]), np.array([30.0, 20.0])
-    voices = Voices(numbers, Evidence(counts, np.ones((2, len(SPREAD)))), ["anna", ""], "0" * 8)
+    voices = HomeVoices(
+        numbers, VoiceEvidence(counts, np.ones((2, len(SPREAD)))), ["anna", ""], "0" * 8
+    )
     path = tmp_path / VOICES
     save_voices(voices, path)
     return path
@@ -510,10 +524,10 @@ def test_another_file_is_no_file_of_voices(tmp_path, content):
 
 @pytest.mark.parametrize("sums", [np.nan, np.inf, 2e9])
 def test_voices_that_could_not_be_read_are_not_written(tmp_path, sums):
-    evidence = Evidence(np.ones(1), np.full((1, len(SPREAD)), sums))
+    evidence = VoiceEvidence(np.ones(1), np.full((1, len(SPREAD)), sums))
     path = tmp_path / VOICES
     with pytest.raises(DataError, match="not written, for some speech has features that no sound"):
-        save_voices(Voices(np.array([1]), evidence, [""], "0" * 8), path)
+        save_voices(HomeVoices(np.array([1]), evidence, [""], "0" * 8), path)
     assert not path.exists()
 
 
@@ -530,7 +544,7 @@ def test_frames_that_no_sound_can_have_are_of_no_voice(two_days, monkeypatch, na
             columns["/mic/features"]["values"][:400, spoilt] = value
         return columns
 
-    monkeypatch.setattr("hearthlog.analyzer.discover.read_speech.read_columns", read_spoilt)
+    monkeypatch.setattr("hearthlog.analyzer.discover.speech.read_columns", read_spoilt)
     speech = read_speech(find_home_logs([two_days[0]]))
     assert 10 < whole - speech.seconds <= 40, "of twenty seconds in each of two logs"
     assert np.isfinite(speech.voices.sums).all()

@@ -1,16 +1,40 @@
-"""The voices of a home: those that are known, found again in each conversation, and new ones."""
+"""Voices of a home: found again in each conversation, their file, summaries, and enrolment."""
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from datetime import tzinfo
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+import safetensors
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from hearthlog.analyzer.discover.read_speech import HomeSpeech
-from hearthlog.analyzer.discover.voice_space import HOP_FRAMES, voice_space
-from hearthlog.analyzer.discover.voices import Evidence, joined, same_voice
+from hearthlog.analyzer.discover.speech import HomeSpeech, voices_of
+from hearthlog.analyzer.discover.voices import (
+    HOP_FRAMES,
+    WINDOW_FRAMES,
+    VoiceEvidence,
+    has_voices,
+    merged_voices,
+    same_voice,
+    summed,
+    voice_space,
+)
 from hearthlog.analyzer.errors import DataError
-from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.marks.enrol import Enrolled, cut_path, enrol_log
+from hearthlog.analyzer.training.dataset import Recording
+from hearthlog.analyzer.training.speakers import APART, is_voice
+from hearthlog.models.classes import CLASS_NAME
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.schemas.arrays import Float32, Float64, Int64, read_sealed, write_sealed
+from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, time_text
+from hearthlog.schemas.logs.files import log_readers
+from hearthlog.schemas.new_files import replaced_file
 
 NO_VOICE = -1
 MOST_VOICES = 1_000  # in a file
@@ -20,7 +44,7 @@ _MOST = 2_000  # voices of conversations, among which those of the home are look
 
 
 @dataclass(frozen=True)
-class Voices:
+class HomeVoices:
     """The voices of a home.
 
     Attributes
@@ -32,17 +56,17 @@ class Voices:
     """
 
     numbers: Int64
-    evidence: Evidence
+    evidence: VoiceEvidence
     names: list[str] = field(default_factory=list)
     id: str = ""
 
 
-def find_voices(speech: HomeSpeech, known: Voices | None) -> tuple[Voices, Int64]:
+def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoices, Int64]:
     """Find the voices of a home in its conversations.
 
     Parameters
     ----------
-    known : Voices or None
+    known : HomeVoices or None
         Those of an earlier time, which are not changed; None if there are none.
 
     Returns
@@ -61,8 +85,8 @@ def find_voices(speech: HomeSpeech, known: Voices | None) -> tuple[Voices, Int64
             f"{LEAST_SECONDS:.0f} s"
         )
     spread = voice_space().spread
-    voices = known or Voices(
-        np.empty(0, np.int64), Evidence(np.empty(0), np.empty((0, len(spread))))
+    voices = known or HomeVoices(
+        np.empty(0, np.int64), VoiceEvidence(np.empty(0), np.empty((0, len(spread))))
     )
     while True:
         of = _known_again(speech.voices, voices.evidence, spread)
@@ -78,7 +102,7 @@ def seconds_of(counts: Float64) -> Float64:
     return counts * (HOP_FRAMES * FRAME_SECONDS)
 
 
-def _known_again(evidence: Evidence, known: Evidence, spread: Float64) -> Int64:
+def _known_again(evidence: VoiceEvidence, known: VoiceEvidence, spread: Float64) -> Int64:
     """Return the known voice that each is likeliest of, if one voice is likelier than two."""
     best = np.zeros(len(evidence.counts))
     of = np.full(len(best), NO_VOICE)
@@ -89,15 +113,15 @@ def _known_again(evidence: Evidence, known: Evidence, spread: Float64) -> Int64:
     return of
 
 
-def _with_new(voices: Voices, rest: Evidence, spread: Float64) -> Voices:
+def _with_new(voices: HomeVoices, rest: VoiceEvidence, spread: Float64) -> HomeVoices:
     """Add the voices of what is of none, if one of them speaks for long enough."""
     largest = np.sort(np.argsort(-rest.counts, kind="stable")[:_MOST])
     rest = rest.rows(largest)
     if not len(rest.counts):
         return voices
-    of = joined(rest, spread)
+    of = merged_voices(rest, spread)
     own = (of == np.arange(of.max() + 1)[:, np.newaxis]).astype(np.float64)
-    found = Evidence(own @ rest.counts, own @ rest.sums)
+    found = VoiceEvidence(own @ rest.counts, own @ rest.sums)
     order = np.argsort(-found.counts, kind="stable")
     order = order[found.counts[order] >= _LEAST_WINDOWS][: MOST_VOICES - len(voices.numbers)]
     new = found.rows(order)
@@ -105,7 +129,7 @@ def _with_new(voices: Voices, rest: Evidence, spread: Float64) -> Voices:
     return replace(
         voices,
         numbers=np.append(voices.numbers, np.arange(first, first + len(order))),
-        evidence=Evidence(
+        evidence=VoiceEvidence(
             np.append(voices.evidence.counts, new.counts),
             np.concatenate([voices.evidence.sums, new.sums]),
         ),
@@ -113,6 +137,311 @@ def _with_new(voices: Voices, rest: Evidence, spread: Float64) -> Voices:
     )
 
 
-def _identified(voices: Voices) -> Voices:
+def _identified(voices: HomeVoices) -> HomeVoices:
     digest = hashlib.sha256(b"".join(each.tobytes() for each in voices.evidence)).hexdigest()
     return replace(voices, id=digest[:8])
+
+
+VOICES = "voices.safetensors"  # in a folder of logs
+_KEY = "hearthlog_voices"
+_FORMAT: Final = 1
+_LARGEST = 4 << 20  # bytes
+_LARGEST_HEADER = 1 << 20
+_LEAST_NUMBER, _MOST_NUMBER = 1, (1 << 31) - 1
+_LARGE = 1e9  # of counts and sums
+_ARRAYS = {"numbers": np.int64, "counts": np.float64, "sums": np.float64}
+
+_Name = Annotated[str, StringConstraints(pattern=rf"^({CLASS_NAME.pattern})?$")]
+
+
+class _Head(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    format: Annotated[int, Field(ge=1, le=_FORMAT)]
+    id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{8}$")]
+    names: Annotated[list[_Name], Field(max_length=MOST_VOICES)]
+
+
+def save_voices(voices: HomeVoices, path: Path) -> None:
+    """Write the file of voices, in place of the one that is there.
+
+    Raise `DataError` if it could not be read again, for the features of the voices are too
+    large. Raise `LogError` if it cannot be written.
+    """
+    head = _Head(format=_FORMAT, id=voices.id, names=voices.names)
+    arrays = {"numbers": voices.numbers, **voices.evidence._asdict()}
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    if not _fits(head, arrays):
+        raise DataError(
+            f"{path}: not written, for some speech has features that no sound has; leave out logs "
+            "that hearthlog did not record"
+        )
+    data = write_sealed(arrays, _KEY, head.model_dump_json())
+    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
+        temporary.write_bytes(data)
+
+
+def load_voices(path: Path) -> HomeVoices | None:
+    """Read the file of voices; None if there is none.
+
+    Raise `DataError` if it is no such file, or damaged.
+    """
+    if not path.exists():
+        return None
+    data = read_whole(path, "file of voices", _LARGEST, DataError)
+    size = int.from_bytes(data[:8], "little")
+    if size > _LARGEST_HEADER:
+        raise DataError(f"{path}: is no file of voices (its header is too large)")
+    try:
+        arrays, text, damaged = read_sealed(path, data, _KEY)
+        head = _Head.model_validate_json(text)
+    except (safetensors.SafetensorError, KeyError, ValidationError) as error:
+        raise DataError(f"{path}: is no file of voices of this version of hearthlog") from error
+    if damaged:
+        raise DataError(damaged)
+    if not _fits(head, arrays):
+        raise DataError(f"{path}: is damaged; move it away to begin anew")
+    return HomeVoices(
+        arrays["numbers"], VoiceEvidence(arrays["counts"], arrays["sums"]), head.names, head.id
+    )
+
+
+def _fits(head: _Head, arrays: dict[str, NDArray[Any]]) -> bool:
+    count, dimensions = len(head.names), len(voice_space().spread)
+    shapes = {"numbers": (count,), "counts": (count,), "sums": (count, dimensions)}
+    if {name: array.shape for name, array in arrays.items()} != shapes:
+        return False
+    numbers, counts, sums = (arrays[name] for name in _ARRAYS)
+    return (
+        all(arrays[name].dtype == kind for name, kind in _ARRAYS.items())
+        and len(np.unique(numbers)) == count
+        and bool(((numbers >= _LEAST_NUMBER) & (numbers <= _MOST_NUMBER)).all())
+        and bool(((counts >= 1.0) & (counts <= _LARGE)).all())
+        and bool((np.abs(sums) <= _LARGE).all())
+    )
+
+
+_HOURS = 24
+_SHOWN = 3
+
+
+class VoiceTurn(NamedTuple):
+    """A turn of a voice; times in nanoseconds of UTC."""
+
+    log: Path
+    microphone: str
+    start: int
+    end: int
+
+
+@dataclass(frozen=True)
+class VoiceSummary:
+    """A voice.
+
+    Attributes
+    ----------
+    name : str
+        That a person gave; empty where nobody did.
+    days : int
+        On how many days, at home.
+    hours : list of int
+        How many of its turns began in each hour of the day, at home.
+    """
+
+    number: int
+    name: str
+    minutes: float
+    turns: int
+    days: int
+    hours: list[int]
+    examples: list[VoiceTurn]
+
+
+class SpokenSpans(NamedTuple):
+    """Turns of the voices of one microphone, in the order of time.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    texts : np.ndarray [shape=(n,)] of str
+        The name of the voice, or `voice 3`; `no voice` for what is of none.
+    """
+
+    starts: Int64
+    ends: Int64
+    texts: NDArray[np.object_]
+
+
+def summarise(
+    speech: HomeSpeech, voices: HomeVoices, of: Int64, zone: tzinfo
+) -> list[VoiceSummary]:
+    """Summarise the voices that speak, that with most speech first.
+
+    Parameters
+    ----------
+    of : np.ndarray [shape=(n,)], int64
+        As `find_voices` returns it.
+    """
+    found = []
+    for row in range(len(voices.numbers)):
+        rows = np.flatnonzero(of[speech.turns.voice] == row)
+        if len(rows):
+            found.append(_summary(speech, voices, row, rows, zone))
+    return sorted(found, key=lambda each: (-each.minutes, each.number))
+
+
+def _summary(
+    speech: HomeSpeech, voices: HomeVoices, row: int, rows: Int64, zone: tzinfo
+) -> VoiceSummary:
+    turns = speech.turns
+    moments = [local_time(start, zone) for start in turns.starts[rows].tolist()]
+    seconds = (turns.ends - turns.starts)[rows] / NANOSECONDS
+    hours = np.bincount([moment.hour for moment in moments], minlength=_HOURS)
+    return VoiceSummary(
+        int(voices.numbers[row]),
+        voices.names[row],
+        float(seconds.sum()) / 60.0,
+        len(rows),
+        len({moment.date() for moment in moments}),
+        hours.tolist(),
+        [turn_at(speech, each) for each in longest(speech, rows)[:_SHOWN].tolist()],
+    )
+
+
+def longest(speech: HomeSpeech, rows: Int64) -> Int64:
+    """Order turns by their lengths, the longest first."""
+    lengths = (speech.turns.ends - speech.turns.starts)[rows]
+    return rows[np.argsort(-lengths, kind="stable")]
+
+
+def turn_at(speech: HomeSpeech, row: int) -> VoiceTurn:
+    """Return a turn."""
+    turns = speech.turns
+    return VoiceTurn(
+        speech.logs[turns.log[row]],
+        speech.microphones[turns.microphone[row]],
+        int(turns.starts[row]),
+        int(turns.ends[row]),
+    )
+
+
+def spoken_spans(speech: HomeSpeech, voices: HomeVoices, of: Int64) -> dict[str, SpokenSpans]:
+    """Return when which voice speaks, by microphone.
+
+    Parameters
+    ----------
+    of : np.ndarray [shape=(n,)], int64
+        As `find_voices` returns it.
+    """
+    named = zip(voices.names, voices.numbers.tolist(), strict=True)
+    texts = np.array([*(name or f"voice {number}" for name, number in named), "no voice"], object)
+    turns = speech.turns
+    order = np.argsort(turns.starts, kind="stable")
+    spans = {}
+    for place, microphone in enumerate(speech.microphones):
+        rows = order[turns.microphone[order] == place]
+        spans[microphone] = SpokenSpans(
+            turns.starts[rows], turns.ends[rows], texts[of[turns.voice[rows]]]
+        )
+    return spans
+
+
+_QUIET = 10 ** (-30 / 10)  # of the loud frames
+_MOST_FRAMES = 6_000  # of a voice
+_SURELY = 2.0  # the logarithm by which two voices are likelier than one
+
+
+def check_voices(recordings: Iterable[Recording], features: FeatureSet) -> None:
+    """Check that nobody is enrolled with two voices.
+
+    Raise `DataError` if two voices are heard in what is enrolled as one.
+    """
+    if not has_voices(features.feature_names):
+        return
+    by_name: dict[str, list[Recording]] = {}
+    for one in recordings:
+        if is_voice(one.label):
+            by_name.setdefault(one.label, []).append(one)
+    for name, own in by_name.items():
+        if is_of_two(np.concatenate([_loud(one.features, features) for one in own]), features):
+            times = ", ".join(sorted(time_text(one.span[0])[:19] for one in own if one.span))
+            raise DataError(
+                f"{name}: two voices are heard in what is enrolled ({times}); delete what is of "
+                "another person, or enrol the other voice under a name of its own"
+            )
+
+
+def is_of_two(values: Float32, features: FeatureSet) -> bool:
+    """Tell whether two voices are heard in speech; in less than a window there is one."""
+    if len(values) < WINDOW_FRAMES:
+        return False
+    of, points = voices_of(values[:_MOST_FRAMES], features.feature_names)
+    voices = summed(points, of, int(of.max()) + 1)
+    for row in range(1, len(voices.counts)):
+        rest = voices.rows(np.arange(row))
+        ratio = same_voice(voices.rows(np.array([row])), rest, voice_space().spread)
+        if ratio.min() < -_SURELY:
+            return True
+    return False
+
+
+def _loud(values: Float32, features: FeatureSet) -> Float32:
+    power = features.power(values)
+    return values[power > np.percentile(power, 90) * _QUIET]
+
+
+_LEAST = 2 * NANOSECONDS  # of a turn
+_ENOUGH = 60 * NANOSECONDS
+
+
+def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list[Enrolled]:
+    """Enrol the longest turns of a voice, a minute of them, in a training set of voices.
+
+    They are of as many times as there are. What is there already counts.
+
+    Parameters
+    ----------
+    rows : np.ndarray [shape=(n,)], int64
+        Its turns.
+
+    Raises
+    ------
+    DataError
+        If it never speaks for two seconds.
+    LogError
+        If a log is damaged, or nothing can be written.
+    """
+    lengths = (speech.turns.ends - speech.turns.starts)[rows]
+    enrolled: dict[Path, Enrolled] = {}
+    left = _ENOUGH
+    for row in _of_all_times(speech, rows[lengths >= _LEAST]).tolist():
+        turn = turn_at(speech, row)
+        path = cut_path(home, label, turn.start)
+        if path in enrolled:  # another microphone heard it, too
+            continue
+        if left < _LEAST:
+            break
+        end = min(turn.end, turn.start + left)
+        if path.exists():
+            enrolled[path] = Enrolled(path, (end - turn.start) / NANOSECONDS)
+        else:
+            enrolled[path] = enrol_log(home, label, turn.log, turn.start, end, turn.microphone)
+        left -= end - turn.start
+    if not enrolled:
+        raise DataError(f"{label} never speaks for two seconds without a pause; enrol a file")
+    return list(enrolled.values())
+
+
+def _of_all_times(speech: HomeSpeech, rows: Int64) -> Int64:
+    """Order turns: the longest of each time, the second longest of each, and so on."""
+    rows = longest(speech, rows)
+    starts = speech.turns.starts[rows]
+    order = np.argsort(starts, kind="stable")
+    time = np.empty(len(rows), np.int64)
+    time[order] = np.cumsum(np.diff(starts[order], prepend=starts[order][:1]) >= APART)
+    by_time = np.argsort(time, kind="stable")
+    first = np.searchsorted(time[by_time], time[by_time])
+    place = np.empty(len(rows), np.int64)
+    place[by_time] = np.arange(len(rows)) - first
+    return rows[np.argsort(place, kind="stable")]

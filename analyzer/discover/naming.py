@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.discover.groups import Groups
-from hearthlog.analyzer.discover.read_sounds import lost_text, read_log_sounds
+from hearthlog.analyzer.discover.sounds import lost_text, read_log_sounds
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.marks.marks import (
     Mark,

@@ -1,10 +1,14 @@
-"""Which points of speech are of one voice: by how much likelier that is than two voices."""
+"""Voices: seconds of speech as points of a learned space, and how alike they are."""
 
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
 from typing import NamedTuple
 
 import numpy as np
+from safetensors.numpy import load
 
-from hearthlog.schemas.arrays import Bool, Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 
 _INDEPENDENT = 0.2  # of a window: windows overlap, and what is said lasts
 _MOST_CERTAIN = 4.0  # windows: nobody sounds the same twice, however long one speaks
@@ -12,7 +16,7 @@ _SMOOTHED = 1  # windows at either side
 _ROUNDS = 2
 
 
-class Evidence(NamedTuple):
+class VoiceEvidence(NamedTuple):
     """Points of speech, taken together.
 
     Attributes
@@ -26,12 +30,12 @@ class Evidence(NamedTuple):
     counts: Float64
     sums: Float64
 
-    def rows(self, rows: Int64 | Bool) -> "Evidence":
+    def rows(self, rows: Int64 | Bool) -> "VoiceEvidence":
         """Return some of it."""
-        return Evidence(self.counts[rows], self.sums[rows])
+        return VoiceEvidence(self.counts[rows], self.sums[rows])
 
 
-def summed(points: Float64, of: Int64, count: int) -> Evidence:
+def summed(points: Float64, of: Int64, count: int) -> VoiceEvidence:
     """Take points together.
 
     Parameters
@@ -41,10 +45,10 @@ def summed(points: Float64, of: Int64, count: int) -> Evidence:
         What each is of, from 0 to `count`, which is left out.
     """
     own = (of == np.arange(count)[:, np.newaxis]).astype(np.float64)
-    return Evidence(own.sum(axis=1), own @ points)
+    return VoiceEvidence(own.sum(axis=1), own @ points)
 
 
-def same_voice(one: Evidence, others: Evidence, spread: Float64) -> Float64:
+def same_voice(one: VoiceEvidence, others: VoiceEvidence, spread: Float64) -> Float64:
     """Return by how much likelier one voice is than two: the logarithm of the ratio.
 
     Both are means of points of which those of a voice have variance 1 around its own mean, and
@@ -73,7 +77,7 @@ class _Weighed(NamedTuple):
         return _Weighed(self.counts[rows], self.sums[:, rows], self.likelihood[rows])
 
 
-def _weighed(evidence: Evidence, spread: Float64) -> _Weighed:
+def _weighed(evidence: VoiceEvidence, spread: Float64) -> _Weighed:
     """Return evidence of the same means by as many independent points as it is worth."""
     counts = _INDEPENDENT * evidence.counts
     counts = counts / (1.0 + counts / _MOST_CERTAIN)
@@ -95,7 +99,7 @@ def _likelihood(counts: Float64, sums: Float64, spread: Float64) -> Float64:
     return likelihood
 
 
-def joined(evidence: Evidence, spread: Float64) -> Int64:
+def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
     """Join what is likelier of one voice than of two, the likeliest first.
 
     Parameters
@@ -126,7 +130,7 @@ def joined(evidence: Evidence, spread: Float64) -> Int64:
         stale = np.isfinite(best) & ((ratios[row] == best) | (ratios[other] == best))
         ratios[other] = ratios[:, other] = -np.inf
         there = np.flatnonzero(np.isfinite(ratios[row]))
-        now = _weighed(Evidence(counts[[row]], sums[[row]]), spread)
+        now = _weighed(VoiceEvidence(counts[[row]], sums[[row]]), spread)
         for kept, value in zip(weighed, now, strict=True):
             kept[..., row] = value[..., 0]
         ratios[row, there] = ratios[there, row] = _ratio(now, weighed.rows(there), spread)
@@ -151,7 +155,7 @@ def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
     np.ndarray [shape=(n,)], int64
         The voice of each window, from 0 on.
     """
-    of = joined(Evidence(np.ones(len(points)), points), spread)
+    of = merged_voices(VoiceEvidence(np.ones(len(points)), points), spread)
     for _ in range(_ROUNDS):
         counts = np.bincount(of)
         kept = np.flatnonzero(counts >= min(least, counts.max()))
@@ -161,7 +165,7 @@ def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
     return of.astype(np.int64)
 
 
-def _likeness(points: Float64, voices: Evidence, spread: Float64) -> Float64:
+def _likeness(points: Float64, voices: VoiceEvidence, spread: Float64) -> Float64:
     """Return the expected log likelihoods of points, but for what all voices have in common."""
     counts, sums = _INDEPENDENT * voices.counts, _INDEPENDENT * voices.sums
     variance = spread / (1.0 + counts[:, np.newaxis] * spread)
@@ -176,3 +180,86 @@ def _smoothed(values: Float64) -> Float64:
     padded = np.pad(values, ((_SMOOTHED, _SMOOTHED), (0, 0)), "edge")
     smoothed: Float64 = np.lib.stride_tricks.sliding_window_view(padded, width, 0).mean(axis=-1)
     return smoothed
+
+
+FILE = "voice_space.safetensors"
+WINDOW_FRAMES = 30
+HOP_FRAMES = 10
+_NAMES = (
+    *("zero_crossing_rate", "energy_entropy", "spectral_centroid", "spectral_spread"),
+    *("spectral_entropy", "spectral_flux", "spectral_rolloff"),
+    *(f"mfcc_{number}" for number in range(2, 14)),  # the first one is the level
+)
+ENERGY = "energy"
+_LOUD_PERCENTILE = 90
+_LOUD = 10 ** (-20 / 10)  # of the energy at that percentile
+_LEAST_DEVIATION = 0.05
+_TINY = 1e-9
+
+
+class VoiceSpace(NamedTuple):
+    """A space in which seconds of one voice scatter alike in all directions.
+
+    Attributes
+    ----------
+    mean : np.ndarray [shape=(width,)], float64
+        Of descriptions of speech.
+    axes : np.ndarray [shape=(d, width)], float64
+        Along each of them the variance of one voice is 1.
+    spread : np.ndarray [shape=(d,)], float64
+        Variance of the means of voices along each axis, descending.
+    """
+
+    mean: Float64
+    axes: Float64
+    spread: Float64
+
+    def points(self, described: Float64) -> Float64:
+        """Return where described windows lie, shape (n, d)."""
+        points: Float64 = (described - self.mean) @ self.axes.T
+        return points
+
+
+@cache
+def voice_space() -> VoiceSpace:
+    """Return the space that comes with hearthlog."""
+    arrays = load((files(__package__) / FILE).read_bytes())
+    return VoiceSpace(*(arrays[name].astype(np.float64) for name in VoiceSpace._fields))
+
+
+def has_voices(names: Sequence[str]) -> bool:
+    """Tell whether features of these names can tell voices apart."""
+    return {ENERGY, *_NAMES} <= set(names)
+
+
+def window_starts(frames: int) -> Int64:
+    """Return where windows of some frames begin: one at least, if there is a frame."""
+    return np.arange(0, max(frames - WINDOW_FRAMES, 0) + 1, HOP_FRAMES)
+
+
+def describe_speech(values: Float32, names: Sequence[str]) -> Float64:
+    """Describe windows of speech: means and deviations of its features, in its loud frames.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(frames, f)], float32
+        Features of speech, at least one frame.
+
+    Returns
+    -------
+    np.ndarray [shape=(windows, 38)], float64
+        Means, and logarithms of standard deviations, of each window of `window_starts`.
+    """
+    columns = [list(names).index(name) for name in _NAMES]
+    length = min(WINDOW_FRAMES, len(values))
+    view = np.lib.stride_tricks.sliding_window_view(values, length, axis=0)
+    windows = view[window_starts(len(values))].astype(np.float64)
+    energy = windows[:, list(names).index(ENERGY)]
+    loudest = np.percentile(energy, _LOUD_PERCENTILE, axis=1, keepdims=True)
+    weights = (energy >= loudest * _LOUD)[:, np.newaxis]
+    weights = weights / weights.sum(axis=2, keepdims=True)
+    x = windows[:, columns]
+    mean = (weights * x).sum(axis=2)
+    variance = (weights * (x - mean[:, :, np.newaxis]) ** 2).sum(axis=2)
+    deviation = np.log(np.sqrt(variance + _TINY) + _LEAST_DEVIATION)
+    return np.concatenate([mean, deviation], axis=1)

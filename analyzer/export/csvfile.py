@@ -168,4 +168,4 @@ def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
     return [pa.array(column, type_of(element)) for column in columns]
 
 
-EXPORTER = table_exporter(CsvFile)
+CSV = table_exporter(CsvFile)

@@ -1,4 +1,4 @@
-"""Tables of topics and their files, which the modules of export formats share."""
+"""Export of a selection: tables of topics, their files, and the run of a format."""
 
 import io
 import os
@@ -6,14 +6,28 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Protocol, cast
 
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.export.file_names import file_stem, unused_name
-from hearthlog.analyzer.logs.selection import Described, LogSelection, TypedColumns, decode_all
-from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, abridged, listed
+from hearthlog.analyzer.export.formats import ExportFormat, file_stem, unused_name
+from hearthlog.analyzer.logs.selection import (
+    Described,
+    LogSelection,
+    TypedColumns,
+    decode_all,
+    is_compatible,
+)
+from hearthlog.schemas.errors import (
+    HearthlogWarning,
+    LogError,
+    Progress,
+    abridged,
+    ignore_progress,
+    listed,
+)
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import (
     DURATION,
@@ -25,6 +39,7 @@ from hearthlog.schemas.messages.fields import (
 )
 from hearthlog.schemas.messages.message_types import number_type
 from hearthlog.schemas.messages.type_definitions import message_type
+from hearthlog.schemas.new_files import new_file, new_folder
 
 MOST_COLUMNS = 4096  # of an array whose elements have no names; images have more
 _NAMED = 8  # fields in a line
@@ -444,3 +459,57 @@ def table_exporter(
         write_tables(selection, files, progress, opened, type_)
 
     return Exporter(save, type_, fields)
+
+
+def exportable(selection: LogSelection, format_: ExportFormat) -> LogSelection:
+    """Leave out the topics that a format is not for, as WAV is for clips of sound.
+
+    Raise `LogError` if the selection has logs, and no topic is left.
+    """
+    exporter = _exporter(format_)
+    if not exporter.type:
+        return selection
+    topics = {
+        topic
+        for topic, same in selection.channels.items()
+        if any(is_compatible(*described, exporter.type, exporter.fields) for described in same)
+    }
+    if selection.logs and not topics:
+        names = abridged(list(selection.channels))
+        raise LogError(f"no topic of type {exporter.type}; there are {names}")
+    return selection.only(topics)
+
+
+def export(
+    selection: LogSelection,
+    output: Path,
+    format_: ExportFormat,
+    progress: Progress = ignore_progress,
+    *,
+    folder: bool,
+) -> int:
+    """Write messages in another format.
+
+    Parameters
+    ----------
+    progress : callable
+        Is told the share that is done, 0 to 1.
+    folder : bool
+        Make a folder with one file for each topic (WAV: for each clip); otherwise one file, of one
+        topic if the format is `by_topic`.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, if there is no message, or one that the format has no place for, or
+        if the output cannot be written; there is no output then.
+    """
+    new = new_folder if folder or format_.is_folder else new_file
+    with new(output) as temporary:
+        files = OutputFiles(temporary, output, format_.name)
+        return _exporter(format_).save(selection, files, progress) or 0
+
+
+def _exporter(format_: ExportFormat) -> Exporter:
+    module = import_module(f"{__package__}.{format_.module}")
+    return cast(Exporter, getattr(module, format_.exporter))

@@ -147,4 +147,4 @@ def _texts(path: str, values: NDArray[Any]) -> NDArray[np.str_]:
     return values.astype(f"U{max(longest, 1)}")
 
 
-EXPORTER = Exporter(_save)
+NPZ = Exporter(_save)

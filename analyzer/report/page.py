@@ -1,25 +1,23 @@
 """The page of a report."""
 
+import base64
 import re
 from collections.abc import Iterator, Sequence
+from importlib.resources import files
 from typing import Any, NamedTuple
 
+import jinja2
+
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.report import class_words, interrai
-from hearthlog.analyzer.report.baseline import DAYS
-from hearthlog.analyzer.report.class_words import (
-    clock_text,
-    several_in_words,
-    times_in_words,
-)
-from hearthlog.analyzer.report.daily_metrics import MOST, Day
-from hearthlog.analyzer.report.html import Cell, PageTable, TableRow, fill_page
-from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.sections import (
-    Figure,
+from hearthlog.analyzer.report.daily_metrics import MOST, DayMetrics
+from hearthlog.analyzer.report.report_data import (
+    ASSESSED_DAYS,
+    ASSESSED_ITEMS,
+    Account,
     FigureSection,
-    events_of,
-    minutes_of,
+    ReportFigure,
+    event_figure,
+    minutes_figure,
     sections,
 )
 from hearthlog.analyzer.report.summary_text import (
@@ -31,15 +29,69 @@ from hearthlog.analyzer.report.summary_text import (
     percent,
     plain,
 )
-from hearthlog.analyzer.report.values import Count, Minutes, Value
+from hearthlog.analyzer.report.values import BASELINE_DAYS, Count, Duration, Value
+from hearthlog.analyzer.report.wording import (
+    clock_text,
+    date_in_words,
+    day_in_words,
+    several_in_words,
+    short_day,
+    times_in_words,
+)
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, in_words
 from hearthlog.schemas.errors import listed
+
+
+class Cell(NamedTuple):
+    """A cell of a table: a colour before its text, a change behind it; `whole` is one line."""
+
+    text: str
+    change: str = ""
+    colour: tuple[int, int, int] | None = None
+    whole: bool = False
+
+
+class TableRow(NamedTuple):
+    """A row of a table, whose first cell is its head."""
+
+    cells: Sequence[Cell]
+    kind: str = ""
+
+
+class PageTable(NamedTuple):
+    """A table and its class in the style."""
+
+    heads: Sequence[str]
+    rows: Sequence[TableRow]
+    kind: str = ""
+
+
+def fill_page(picture: bytes, **parts: Any) -> str:
+    """Fill the template; all text is escaped, and the picture is in the page itself.
+
+    Parameters
+    ----------
+    **parts
+        By the names that the template has for them; none may be lacking.
+    """
+    environment = jinja2.Environment(
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    template = files("hearthlog.analyzer.report").joinpath("page.html").read_text("utf-8")
+    return environment.from_string(template).render(
+        picture=base64.b64encode(picture).decode(), **parts
+    )
+
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
 
 
-class Part(NamedTuple):
+class PageSection(NamedTuple):
     """A section of the page: its table, and what is remarked on it."""
 
     section: FigureSection
@@ -60,7 +112,7 @@ def day_page(account: Account, picture: bytes) -> str:
     return _page(
         account,
         picture,
-        title=class_words.day_in_words(day.day),
+        title=day_in_words(day.day),
         gist=list(gist_of_day(account, day)),
         overview=[("What was heard", _sounds(account, day))],
         absent=[name for name in names if not _was_heard(account, name)],
@@ -77,7 +129,7 @@ def week_page(account: Account, picture: bytes) -> str:
         Of seven days.
     """
     first, last = account.days[0].day, account.days[-1].day
-    spoken = f"{class_words.date_in_words(first)} to {class_words.date_in_words(last)}"
+    spoken = f"{date_in_words(first)} to {date_in_words(last)}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
     return _page(
         account,
@@ -85,12 +137,16 @@ def week_page(account: Account, picture: bytes) -> str:
         title=f"Week {first.isocalendar().week}, {spoken}",
         gist=list(gist_of_week(account)),
         overview=[
-            ("How long it was heard, as labelled", _week(account, list(map(minutes_of, names)))),
-            ("How often it was heard", _week(account, list(map(events_of, names)))),
+            (
+                "How long it was heard, as labelled",
+                _week(account, list(map(minutes_figure, names))),
+            ),
+            ("How often it was heard", _week(account, list(map(event_figure, names)))),
         ],
         absent=[name for name in account.classes if name not in (*names, SILENCE)],
         parts=[
-            Part(section, _week(account, section.figures)) for section in sections(account.classes)
+            PageSection(section, _week(account, section.figures))
+            for section in sections(account.classes)
         ],
     )
 
@@ -106,15 +162,15 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
         absent=listed([in_words(name).lower() for name in absent], "and"),
         television=_television(account),
         scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],
-        days_before=DAYS,
+        days_before=BASELINE_DAYS,
         interrai=_interrai(account, days),
-        interrai_days=interrai.DAYS,
+        interrai_days=ASSESSED_DAYS,
         interrai_heard=_heard(days),
         **parts,
     )
 
 
-def _heard(days: Sequence[Day]) -> str:
+def _heard(days: Sequence[DayMetrics]) -> str:
     """Say how many days were heard, and how many of them in part: `2 of them heard`."""
     partly = sum(day.share < MOST for day in days)
     return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
@@ -145,16 +201,16 @@ def _scenario(account: Account, name: str) -> PageTable:
         )
         for label in classes
     ]
-    dates = [class_words.short_day(day.day) for day in account.days]
+    dates = [short_day(day.day) for day in account.days]
     return PageTable(["Sound", *(dates if len(days) > 1 else ["How long, as labelled"])], rows)
 
 
-def _scenario_text(minutes: float, day: Day) -> str:
+def _scenario_text(minutes: float, day: DayMetrics) -> str:
     """Say how long a class of a scenario was heard on a day."""
-    return Minutes(minutes).text if minutes or day.share >= MOST else _NOTHING
+    return Duration(minutes).text if minutes or day.share >= MOST else _NOTHING
 
 
-def _sounds(account: Account, day: Day) -> PageTable:
+def _sounds(account: Account, day: DayMetrics) -> PageTable:
     """Tell minutes and events of each class but those that were not heard at all."""
     usually = ["Usually"] * account.comparable
     often = "How often" if account.checked else "How often, as labelled"
@@ -164,18 +220,18 @@ def _sounds(account: Account, day: Day) -> PageTable:
     rows = []
     for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
         cells = [Cell(in_words(name), colour=colour_on_paper(name))]
-        cells += _cells(account, minutes_of(name), day)
+        cells += _cells(account, minutes_figure(name), day)
         if name == SILENCE:
             cells += [Cell("")] * (1 + account.comparable)
         else:
-            cells += _cells(account, events_of(name), day)
+            cells += _cells(account, event_figure(name), day)
         rows.append(TableRow(cells + [Cell(account.rightness(name))] * account.checked))
     return PageTable(heads, rows)
 
 
 def _was_heard(account: Account, name: str) -> bool:
     """Tell whether there is something to say of a class: now, or that it is usual."""
-    baseline = account.baseline(events_of(name))
+    baseline = account.baseline(event_figure(name))
     values = [day.count(name) for day in account.days]
     missing = all(value is None for value in values)
     apart = any(day.beside_television(name) for day in account.days)
@@ -183,7 +239,7 @@ def _was_heard(account: Account, name: str) -> bool:
     return missing or apart or now or bool(baseline and baseline[0].highest)
 
 
-def _cells(account: Account, figure: Figure, day: Day) -> list[Cell]:
+def _cells(account: Account, figure: ReportFigure, day: DayMetrics) -> list[Cell]:
     """Return a figure, and what is usual if anything is compared."""
     cells = [Cell(_text(figure.value(day)), whole=True)]
     if account.comparable:
@@ -195,13 +251,13 @@ def _text(value: Value | None) -> str:
     return "not known" if value is None else value.text
 
 
-def _part(account: Account, section: FigureSection, day: Day) -> Part:
+def _part(account: Account, section: FigureSection, day: DayMetrics) -> PageSection:
     heads = ["", "This day", *["Usually"] * account.comparable]
     rows = [TableRow([Cell(f.title), *_cells(account, f, day)]) for f in section.figures]
-    return Part(section, PageTable(heads, rows), list(_remarks(section, day)))
+    return PageSection(section, PageTable(heads, rows), list(_remarks(section, day)))
 
 
-def _remarks(section: FigureSection, day: Day) -> Iterator[str]:
+def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
     share = _share(section.figures, day)
     if share < _PARTLY * day.share:
         yield f"These sounds could be heard for {percent(share)} of the day only."
@@ -216,7 +272,7 @@ def _remarks(section: FigureSection, day: Day) -> Iterator[str]:
         yield longest_quiet(day)
 
 
-def _coughing(day: Day) -> str:
+def _coughing(day: DayMetrics) -> str:
     """Say in which hours of the night there was coughing, as labelled."""
     starts = day.night_events(COUGHING)
     if not len(starts) or not day.night_hours:
@@ -227,14 +283,14 @@ def _coughing(day: Day) -> str:
     return f"Coughing as labelled: {', '.join(each)}. {rate:.1f} an hour."
 
 
-def _week(account: Account, figures: Sequence[Figure]) -> PageTable:
+def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
     """Tell figures of seven days, their total, and what is usual on a day."""
     rows = []
     for day in account.days:
         share = _share(figures, day)
         share_text = percent(share) if share else "not heard"
         values = [figure.value(day) if day.coverage.length else None for figure in figures]
-        rows.append(_row(class_words.short_day(day.day), share_text, *map(_short, values)))
+        rows.append(_row(short_day(day.day), share_text, *map(_short, values)))
     totals = (_total(account.days, figure) for figure in figures)
     rows.append(_row("All days", "", *totals, kind="sum"))
     if account.comparable:
@@ -247,7 +303,7 @@ def _row(*texts: str, kind: str = "") -> TableRow:
     return TableRow([Cell(text) for text in texts], kind)
 
 
-def _share(figures: Sequence[Figure], day: Day) -> float:
+def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
     """Return for how much of a day all that these figures are about would have been heard."""
     return min([day.share, *(day.share_of(f.name) for f in figures if f.name)])
 
@@ -262,26 +318,26 @@ def _dense(text: str) -> str:
     return text.replace(" to ", _TO)
 
 
-def _total(days: Sequence[Day], figure: Figure) -> str:
+def _total(days: Sequence[DayMetrics], figure: ReportFigure) -> str:
     values = [figure.value(day) for day in days if day.coverage.length]
     return _short(_sum(values)) if figure.sums else ""
 
 
-def _sum(values: Sequence[Value | None]) -> Count | Minutes | None:
+def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
     """Add figures of days, of which some may not be known; None if a 0 cannot be known."""
     counts = [value for value in values if isinstance(value, Count)]
-    minutes = [value for value in values if isinstance(value, Minutes)]
+    minutes = [value for value in values if isinstance(value, Duration)]
     known = counts or minutes
     if not known:
         return None
-    total = sum(counts, Count()) if counts else sum(minutes, Minutes())
+    total = sum(counts, Count()) if counts else sum(minutes, Duration())
     return total if total.middle or len(known) >= MOST * len(values) else None
 
 
-def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
+def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
     """Tell what sound can say to an assessment."""
     rows = []
-    for item in interrai.ITEMS:
+    for item in ASSESSED_ITEMS:
         audible = not item.needs or item.needs in account.classes
         number = _sum([item.value(day) for day in days])
         text = _text(number) if audible else "this model does not know the sound"
@@ -292,6 +348,6 @@ def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
     return PageTable(["The form asks about", "Heard here", count, "What sound cannot tell"], rows)
 
 
-def _is_checked(value: Count | Minutes) -> bool:
+def _is_checked(value: Count | Duration) -> bool:
     """Tell whether checked minutes say what the right number is."""
     return isinstance(value, Count) and value.rates is not None

@@ -12,15 +12,18 @@ from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import common, joined, one
-from hearthlog.analyzer.report.baseline import DAYS
-from hearthlog.analyzer.report.daily_metrics import HOUR, day_of
-from hearthlog.analyzer.report.home_metrics import home_sound, whole_home
-from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
+from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, home_sound, whole_home
 from hearthlog.analyzer.report.page import day_page, week_page
-from hearthlog.analyzer.report.read_home import HomeData, read_home
+from hearthlog.analyzer.report.read_home import (
+    HomeData,
+    ScenarioMinutes,
+    read_home,
+    read_scenario_minutes,
+)
+from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.scenario_minutes import ScenarioMinutes, read_scenario_minutes
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
+from hearthlog.analyzer.report.values import BASELINE_DAYS
 from hearthlog.analyzer.routine.day_anomaly import Routines
 from hearthlog.analyzer.routine.day_profile import Profiles
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -79,7 +82,7 @@ def make_report(
     days = [first + timedelta(days=number) for number in range(count)]
     check_day(logs, days[0], days[-1], zone)
     close = day_span(days[0], zone)[0], day_span(days[-1], zone)[1]
-    earlier = [first - timedelta(days=number) for number in range(DAYS, 0, -1)]
+    earlier = [first - timedelta(days=number) for number in range(BASELINE_DAYS, 0, -1)]
     since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
     data = read_home(logs, labelling, since, close, progress)
     model = _model(logs, close) if labelling == LIVE else ""

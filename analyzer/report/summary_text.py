@@ -7,15 +7,17 @@ import numpy as np
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import joined, without
-from hearthlog.analyzer.report.class_words import (
+from hearthlog.analyzer.report.daily_metrics import HOUR, MOST, DayMetrics
+from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.values import Duration
+from hearthlog.analyzer.report.wording import (
+    WEEK,
     clock_text,
+    judgement_text,
     several_in_words,
     short_day,
+    too_few_text,
 )
-from hearthlog.analyzer.report.daily_metrics import HOUR, MOST, Day
-from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.routine_text import WEEK, judgement_text, too_few_text
-from hearthlog.analyzer.report.values import Minutes
 from hearthlog.analyzer.routine.day_anomaly import FEWEST
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
 from hearthlog.schemas.errors import listed
@@ -24,15 +26,15 @@ _MOST = 6  # kinds of gaps, or of trouble
 _MINUTE = HOUR // 60
 
 
-def gist_of_day(account: Account, day: Day) -> Iterator[str]:
+def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     """Sum up a day in a few sentences, and compare it with earlier days.
 
     Parameters
     ----------
-    day : Day
+    day : DayMetrics
         One of its days.
     """
-    minutes = Minutes(day.coverage.length / _MINUTE).text
+    minutes = Duration(day.coverage.length / _MINUTE).text
     yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
     yield _changes(account, day)
     if day.night_hours:
@@ -77,14 +79,14 @@ def not_heard(account: Account) -> Iterator[str]:
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
     if missing >= _MINUTE:
-        text = Minutes(missing / _MINUTE).text
+        text = Duration(missing / _MINUTE).text
         yield f"Not heard: {text} ({percent(missing / length)}). The report knows nothing of it."
     for microphone, hours in account.unheard.items():
         if hours * HOUR > missing + _MINUTE:  # another one heard
-            text = Minutes(hours * 60).text
+            text = Duration(hours * 60).text
             yield f"The microphone {plain(microphone)} heard nothing for {text}."
     if (unsaid := _unexplained(account)) >= _MINUTE:
-        text = Minutes(unsaid / _MINUTE).text
+        text = Duration(unsaid / _MINUTE).text
         yield f"Nothing was recorded for {text}: the recorder was off, or its logs are not here."
     for reason, same in _by_lasting(account.gaps, lambda gap: gap.text):
         yield f"{reason[:1].upper()}{reason[1:]}: {_when(account, same)}."
@@ -112,7 +114,7 @@ def not_well(account: Account) -> Iterator[str]:
         yield f"{plain(name)}: {_when(account, same)}."
 
 
-def longest_quiet(day: Day) -> str:
+def longest_quiet(day: DayMetrics) -> str:
     """Say when the longest quiet stretch of the day was.
 
     Returns
@@ -145,7 +147,7 @@ def plain(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _loudest(day: Day) -> str:
+def _loudest(day: DayMetrics) -> str:
     names = [name for name in day.home.classes if name != SILENCE]
     lasting = ((minutes.minutes, name) for name in names if (minutes := day.minutes(name)))
     most = [
@@ -156,7 +158,7 @@ def _loudest(day: Day) -> str:
     return f"Most of the sound, as labelled: {sounds}." if most else quiet
 
 
-def _changes(account: Account, day: Day) -> str:
+def _changes(account: Account, day: DayMetrics) -> str:
     if not account.comparable:
         return account.too_few
     judged = account.judged[day.day]
@@ -167,7 +169,7 @@ def _changes(account: Account, day: Day) -> str:
     return "Too little was heard to compare it with other days."
 
 
-def _night(day: Day) -> str:
+def _night(day: DayMetrics) -> str:
     parts = []
     for name in (FLUSHING_WATER, COUGHING):
         count = day.night_count(name)
@@ -212,5 +214,5 @@ def _when(account: Account, troubles: Sequence[Trouble]) -> str:
         day = local_time(trouble.start, account.zone).date()
         shown.append((f"{short_day(day)} " if len(account.days) > 1 else "") + " to ".join(times))
     more = " …" if len(troubles) > len(shown) else ""
-    length = Minutes(_lasting(troubles) / _MINUTE).text
+    length = Duration(_lasting(troubles) / _MINUTE).text
     return f"{length}, {how_often} ({', '.join(shown)}{more})"

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
 from hearthlog.analyzer.logs.spans import Spans, lengths, without
-from hearthlog.analyzer.report.baseline import Usual, usual
-from hearthlog.analyzer.report.class_words import short_day
-from hearthlog.analyzer.report.daily_metrics import HOUR, Day
-from hearthlog.analyzer.report.values import Minutes
+from hearthlog.analyzer.report.daily_metrics import HOUR, DayMetrics
+from hearthlog.analyzer.report.values import Duration, UsualRange, usual_range
+from hearthlog.analyzer.report.wording import short_day
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Int64
 
@@ -25,7 +24,7 @@ _INK, _PALE, _NIGHT = "#1d2733", "#8a94a0", "#e9ecf1"
 _DOTS = 150  # an inch
 
 
-def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
+def save_day(path: Path, day: DayMetrics, earlier: Sequence[DayMetrics]) -> None:
     """Draw a day: a lane for each class, and the minutes with sound in each hour."""
     names = _names(day)
     heights = [0.34 * len(names) + 0.1, 1.15]
@@ -37,7 +36,7 @@ def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
     _save(figure, path)
 
 
-def save_week(path: Path, days: Sequence[Day]) -> None:
+def save_week(path: Path, days: Sequence[DayMetrics]) -> None:
     """Draw a week: for each class seven lanes, the first day at the top."""
     names = _names(*days)
     figure = Figure(figsize=(10, 0.66 * len(names) + 0.6), layout="constrained")
@@ -47,11 +46,11 @@ def save_week(path: Path, days: Sequence[Day]) -> None:
     _save(figure, path)
 
 
-def _names(*days: Day) -> list[str]:
+def _names(*days: DayMetrics) -> list[str]:
     return [name for name in days[0].home.classes if name != SILENCE]
 
 
-def _lanes(axes: Any, names: Sequence[str], days: Sequence[Day], bins: int) -> None:
+def _lanes(axes: Any, names: Sequence[str], days: Sequence[DayMetrics], bins: int) -> None:
     """Draw a block for each class, and in it a line for each day."""
     count = len(days)
     for place, name in enumerate(names):
@@ -81,7 +80,7 @@ def _lanes(axes: Any, names: Sequence[str], days: Sequence[Day], bins: int) -> N
         )
 
 
-def _hours(axes: Any, day: Day, earlier: Sequence[Day]) -> None:
+def _hours(axes: Any, day: DayMetrics, earlier: Sequence[DayMetrics]) -> None:
     """Draw the minutes with sound in each hour, and what is usual."""
     minutes = day.sound_by_hour
     places = np.arange(len(minutes))
@@ -108,15 +107,15 @@ def _hours(axes: Any, day: Day, earlier: Sequence[Day]) -> None:
     axes.tick_params(labelbottom=True)
 
 
-def _usual_hours(day: Day, earlier: Sequence[Day]) -> list[Usual | None]:
+def _usual_hours(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[UsualRange | None]:
     """Return what is usual in each hour; nothing where the clock was changed."""
     same = [each.sound_by_hour for each in earlier if len(each.hours) == len(day.hours)]
     columns: list[NDArray[np.float64]] = list(np.array(same).T) if same else []
-    hours = [usual([Minutes(float(number)) for number in column]) for column in columns]
+    hours = [usual_range([Duration(float(number)) for number in column]) for column in columns]
     return hours or [None] * (len(day.hours) - 1)
 
 
-def _unheard(axes: Any, day: Day, coverage: Spans, band: tuple[float, float]) -> None:
+def _unheard(axes: Any, day: DayMetrics, coverage: Spans, band: tuple[float, float]) -> None:
     """Hatch what was not heard, where that is long enough to be seen."""
     edges = _edges(day, _DAY_BINS)
     missing = without(day.span, coverage)
@@ -128,16 +127,16 @@ def _unheard(axes: Any, day: Day, coverage: Spans, band: tuple[float, float]) ->
         axes.broken_barh(wide, band, facecolor="white", edgecolor=_PALE, hatch="////", lw=0)
 
 
-def _edges(day: Day, bins: int) -> Int64:
+def _edges(day: DayMetrics, bins: int) -> Int64:
     start, end = int(day.span.starts[0]), int(day.span.ends[0])
     return np.append(np.arange(start, end, HOUR // bins), end)
 
 
-def _hours_of(day: Day, times: Int64) -> NDArray[np.float64]:
+def _hours_of(day: DayMetrics, times: Int64) -> NDArray[np.float64]:
     return (times - day.span.starts[0]) / HOUR
 
 
-def _dress(axes: Any, day: Day) -> None:
+def _dress(axes: Any, day: DayMetrics) -> None:
     """Mark hours and the night; on days of 23 or 25 hours by what the clock shows."""
     hours = day.hours
     clock = [local_time(int(time), day.zone).hour for time in hours[:-1]]

@@ -1,9 +1,12 @@
-"""What a report counts: a number of events, minutes, a time of day; and how they are said."""
+"""Quantities of a report (counts, durations, times of day), and their usual range."""
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
+
+import numpy as np
 
 from hearthlog.analyzer.accuracy.event_counts import NO_MINUTES, CheckedRates, Strata
 
@@ -96,13 +99,13 @@ def exactly(number: int) -> Count:
 
 
 @dataclass(frozen=True)
-class Minutes(_Quantity):
+class Duration(_Quantity):
     """A length of time."""
 
     minutes: float = 0.0
 
-    def __add__(self, other: Self) -> "Minutes":
-        return Minutes(self.minutes + other.minutes)
+    def __add__(self, other: Self) -> "Duration":
+        return Duration(self.minutes + other.minutes)
 
     @property
     def middle(self) -> float:
@@ -148,9 +151,53 @@ class Clock(_Quantity):
         return f"{hours:02}:{minutes:02}"
 
 
-Value = Count | Minutes | Clock
+Value = Count | Duration | Clock
 
 
 def whole(number: float) -> int:
     """Round to a whole number, halves upwards: 2.5 is 3."""
     return math.floor(number + 0.5)
+
+
+BASELINE_DAYS = 28
+FEWEST = 7
+
+
+class UsualRange(NamedTuple):
+    """Median, lowest and highest of some days."""
+
+    median: float
+    lowest: float
+    highest: float
+
+
+def usual_range(values: Sequence[Value | None]) -> UsualRange | None:
+    """Return what is usual; None if there are too few days.
+
+    Parameters
+    ----------
+    values : sequence of (Count, Duration, Clock or None)
+        The same figure on each day; None where it is not known.
+
+    Returns
+    -------
+    UsualRange or None
+        Of the `middle` of each value; None if fewer than seven days have one.
+    """
+    numbers = [value.middle for value in values if value is not None]
+    if len(numbers) < FEWEST:
+        return None
+    return UsualRange(float(np.median(numbers)), min(numbers), max(numbers))
+
+
+def compared(value: Value, baseline: UsualRange) -> int:
+    """Compare a figure, as labelled, with what is usual.
+
+    Returns
+    -------
+    int
+        1: more than on any of those days, or later; -1: less, or earlier; 0: as usual.
+    """
+    if whole(value.middle) > whole(baseline.highest):
+        return 1
+    return -1 if whole(value.middle) < whole(baseline.lowest) else 0

@@ -1,9 +1,10 @@
-"""`hearthlog annotate`: marks of a reviewer, from and to the label files of other programs."""
+"""`hearthlog annotate` and `enrol`: label files of other programs, and sounds to train on."""
 
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -11,17 +12,34 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
-from hearthlog.schemas.errors import listed, shortened
+from hearthlog.schemas.errors import HearthlogError, listed, shortened
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.tools.cli.options import LocalLog, Microphone, logs_folder, reviewer_name
-from hearthlog.tools.cli.table import NAME_WIDTH, print_table
-from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, number, tell, wrong_use
+from hearthlog.tools.cli.options import (
+    End,
+    LocalLog,
+    Microphone,
+    Start,
+    logs_folder,
+    parse_span,
+    reviewer_name,
+)
+from hearthlog.tools.cli.terminal import (
+    JUDGED_BY,
+    NAME_WIDTH,
+    end_with_warnings,
+    number,
+    print_table,
+    tell,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.layers import Coverage
+    from hearthlog.analyzer.marks.enrol import Enrolled
     from hearthlog.analyzer.marks.formats.labels import SkippedLabels
     from hearthlog.analyzer.marks.label_files import Folded
     from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
+
 
 _SCENARIO = "Scenario that the marks are of, by its name; else they are of the sounds of the home."
 _SHOWN = 10  # names, kinds of labels
@@ -270,3 +288,75 @@ def _print_amounts(marks: "Sequence[Mark]") -> None:
         for label, count in sorted(counts.items())
     ]
     print_table((), rows, words=2)
+
+
+def enrol(
+    label: Annotated[str, typer.Argument(metavar="CLASS", help="What is heard.")],
+    *,
+    home: Annotated[Path, typer.Option(help="Folder of the home's training set.")],
+    file: Annotated[
+        list[Path] | None, typer.Option(help="Audio file to enrol; may be given again.")
+    ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option(help="Log, or folder of logs, to enrol a span of.", readable=False),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    microphone: Annotated[
+        str | None, typer.Option(help="Microphone to listen to, as `hearthlog devices` lists it.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="How much of a file (default: all) or of a microphone (default: 5)."),
+    ] = None,
+) -> None:
+    """Take seconds of a sound from a file, a log or a microphone to learn from.
+
+    Features are kept, and no sound: a log in the folder `enrolled` of the home, all of it marked.
+    Exit status 3: a file was damaged, or of several some could not be enrolled.
+    """
+    from hearthlog.analyzer.marks import enrol as enrolment
+
+    least, most = enrolment.LEAST_SECONDS, enrolment.MOST_SECONDS
+    if sum(given not in {None, ()} for given in (tuple(file or ()), log, microphone)) != 1:
+        wrong_use("enrol one of --file, --log with --start and --end, or --microphone")
+    if seconds is not None and not least <= seconds <= most:
+        wrong_use(f"--seconds {seconds}: enrol from {least:.0f} to {most:.0f} s")
+    if log is None and (start, end) != (None, None):
+        wrong_use("--start and --end go with --log")
+    first, last = parse_span(start, end)
+    refused: list[str] = []
+    if file:
+        done = _enrol_files(home, label, file, seconds, refused)
+    elif log is None:
+        seconds = seconds or enrolment.SECONDS
+        listening = partial(tell, f"listening for {seconds:g} s")
+        done = enrolment.enrol_microphone(home, label, microphone or "", seconds, listening)
+    elif first is None or last is None or seconds is not None:
+        wrong_use("--log wants --start and --end, and no --seconds")
+    else:
+        done = [enrolment.enrol_log(home, label, log, first, last)]
+    for enrolled in done:
+        print(f"{enrolled.log}: {enrolled.seconds:.2f} s of {label}")
+    end_with_warnings([*refused, *dict.fromkeys(each.warning for each in done if each.warning)])
+
+
+def _enrol_files(
+    home: Path, label: str, files: list[Path], seconds: float | None, refused: list[str]
+) -> "list[Enrolled]":
+    """Enrol several files; say why some are not enrolled, unless none is."""
+    from hearthlog.analyzer.marks.enrol import enrol_file
+
+    done: list[Enrolled] = []
+    for path in files:
+        try:
+            done += enrol_file(home, label, path, seconds)
+        except HearthlogError as error:
+            if len(files) == 1:
+                raise
+            text = str(error)
+            refused.append(text if str(path) in text else f"{path}: {text}")
+    if not done:
+        raise HearthlogError("; ".join(refused))
+    return done

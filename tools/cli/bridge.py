@@ -1,13 +1,30 @@
-"""`hearthlog bridge`: what is heard, told to the systems of the home."""
+"""`hearthlog bridge` and `hearthlog alerts`: events for other systems, and alert rules on logs."""
 
 import signal
+from collections.abc import Sequence
+from datetime import tzinfo
 from pathlib import Path
 from threading import Event
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.tools.cli.text import tell, wrong_use
+from hearthlog.tools.cli.options import End, Json, Start, Timezone, log_location, parse_span
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    number,
+    print_json,
+    print_lines,
+    print_table,
+    share_done,
+    tell,
+    wrong_use,
+)
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.bridge.alerts.ring import Ring
+    from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+    from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 
 def bridge(
@@ -52,8 +69,8 @@ def bridge(
         lacking = [name for name, is_there in modules.items() if not is_there]
         require(*lacking)  # what else there is goes on without them
     stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop.set())
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, lambda *_: stop.set())
     home = Home(logs or settings.output, settings.node, time_zone(settings.timezone))
     say = Saying(tell)
     state = state_folder(own.state, home.folder)
@@ -64,3 +81,169 @@ def bridge(
         say(f"alerts: {line}")
     outputs, since = open_outputs(own, home, state, say)
     Bridge(home, since, outputs, say).run(stop)
+
+
+_WEEK = 7 * 86_400 * 1_000_000_000
+
+alerts = typer.Typer(no_args_is_help=True, help="Try the rules of alerts on logs.")
+
+
+@alerts.callback()
+def _group() -> None:
+    """Try the rules of alerts on logs."""
+
+
+@alerts.command()
+def replay(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Logs, or folders of logs, or URLs such as s3://bucket/home.",
+            parser=log_location,
+            show_default="those of the configuration",
+        ),
+    ] = None,
+    *,
+    config: Annotated[
+        Path, typer.Option(help="Configuration, a TOML file with tables `bridge.alert`.")
+    ],
+    start: Start = None,
+    end: End = None,
+    timezone: Timezone = None,
+    as_json: Json = False,
+) -> None:
+    """Show when the rules of a configuration would have rung, and how often.
+
+    Exit status 3: a log is damaged or unfinished; what could be read was used.
+    """
+    from hearthlog.analyzer.bridge.alerts.evaluate import rings
+    from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
+    from hearthlog.analyzer.bridge.alerts.rules import history, unknown_class, unknown_microphone
+    from hearthlog.analyzer.bridge.listeners import microphone_of_listener
+    from hearthlog.analyzer.bridge.settings import load_bridge_settings
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.local_time import home_zone
+
+    first, last = parse_span(start, end)
+    settings, own = load_bridge_settings(config)
+    if not own.alert:
+        wrong_use(f"{config}: has no rule; docs/alerts.md says how to write a [[bridge.alert]]")
+    home = find_home_logs(logs or [settings.output])
+    _check_node(home, settings.node)
+    if timezone is None and "timezone" in settings.model_fields_set:
+        timezone = settings.timezone  # by which the bridge goes
+    zone = home_zone(timezone, home.records())
+    first, last = _span(home, settings.node, first, last)
+    losses = list(home.losses)
+    longest = max(history(rule) for rule in own.alert)
+    with share_done("reading what was heard") as progress:
+        heard = read_heard(home, settings.node, first - longest, last, losses.append, progress)
+    found = {rule.name: rings(rule, heard, first, last, zone)[0] for rule in own.alert}
+    microphones = {microphone_of_listener(name) for name in heard.coverage}
+    for rule in own.alert:
+        unheard = unknown_microphone(rule, microphones, recorded=True)
+        if text := unheard or unknown_class(rule, heard.classes):
+            tell(text)
+    if as_json:
+        print_json(_as_json(found, (first, last), zone))
+    else:
+        _print(own.alert, found, (first, last), zone)
+    end_with_warnings(losses)
+
+
+def _check_node(home: "HomeLogs", node: str) -> None:
+    from hearthlog.analyzer.bridge.alerts.read_logs import nodes_of
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.schemas.errors import listed
+
+    nodes = nodes_of(home)
+    if node not in nodes:
+        there = f"there are those of {listed(nodes, 'and')}" if nodes else "there is no log at all"
+        raise DataError(f"no logs of the recorder {node!r} (node in the configuration); {there}")
+
+
+def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> tuple[int, int]:
+    """Return the span that is asked for, within what the logs have."""
+    from hearthlog.analyzer.bridge.alerts.read_logs import span_of
+
+    begin, until = span_of(home, node)
+    first = begin if first is None else first
+    last = until if last is None else last
+    if first >= last or first >= until or last <= begin:
+        there = f"{_utc(begin)} to {_utc(until)}"
+        wrong_use(f"the logs are of {there}; --start and --end leave nothing")
+    return first, last
+
+
+def _utc(time: int) -> str:
+    from hearthlog.schemas.frames import millisecond_text
+
+    return f"{millisecond_text(time)[:16]}Z"
+
+
+def _print(
+    rules: "Sequence[AlertRule]",
+    found: "dict[str, list[Ring]]",
+    span: tuple[int, int],
+    zone: tzinfo,
+) -> None:
+    every = sorted((ring for own in found.values() for ring in own), key=lambda ring: ring.time)
+    print_lines(_line(ring, zone) for ring in every)
+    if every:
+        print()
+    weeks = (span[1] - span[0]) / _WEEK
+    rows = [
+        (
+            rule.name,
+            rule.rule,
+            str(len(own)),
+            f"{len(own) / weeks:.1f}" if weeks >= 1 / 7 else "",  # of minutes it would say nothing
+            str(_unknown(own)),
+        )
+        for rule in rules
+        for own in [found[rule.name]]
+    ]
+    print_table(("name", "rule", "rings", "a week", "not known"), rows, words=2)
+    print(f"{_days(weeks)}, {_local(span[0], zone)} to {_local(span[1], zone)}, {zone}")
+
+
+def _days(weeks: float) -> str:
+    hours = 7 * 24 * weeks
+    return number(round(hours / 24), "day") if hours >= 24 else f"{hours:.1f} hours"
+
+
+def _line(ring: "Ring", zone: tzinfo) -> str:
+    told = f" (told at {_local(ring.due, zone)})" if ring.due > ring.time else ""
+    return f"{_local(ring.time, zone)}  {ring.rule}: {ring.text}{told}"
+
+
+def _local(time: int, zone: tzinfo) -> str:
+    from hearthlog.analyzer.logs.local_time import local_time
+
+    return f"{local_time(time, zone):%Y-%m-%d %H:%M}"
+
+
+def _unknown(rings: "Sequence[Ring]") -> int:
+    return sum(not ring.is_known for ring in rings)
+
+
+def _as_json(found: "dict[str, list[Ring]]", span: tuple[int, int], zone: tzinfo) -> dict[str, Any]:
+    from hearthlog.analyzer.bridge.day import iso_time
+
+    return {
+        "start": iso_time(span[0], zone),
+        "end": iso_time(span[1], zone),
+        "timezone": str(zone),
+        "rules": {
+            name: [
+                {
+                    "time": iso_time(ring.time, zone),
+                    "due": iso_time(ring.due, zone),
+                    "text": ring.text,
+                    "known": ring.is_known,
+                }
+                for ring in own
+            ]
+            for name, own in found.items()
+        },
+    }

@@ -1,14 +1,25 @@
-"""`hearthlog export`: logs in other formats."""
+"""`hearthlog export`, `cat`, `cut` and `merge`: messages of logs in other files."""
 
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from hearthlog.analyzer.export.formats import FORMATS
 from hearthlog.schemas.errors import abridged, listed
-from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
-from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
+from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_output, parse_span
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    number,
+    tell,
+    unfinished_lines,
+    wrong_use,
+)
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.logs.selection import LogSelection
+
 
 _FILES = [each.pattern for each in FORMATS.values() if not each.is_folder]
 _BY_TOPIC = [each.name for each in FORMATS.values() if each.by_topic]
@@ -50,10 +61,10 @@ def export(
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from hearthlog.analyzer.export.save import export as save
-    from hearthlog.analyzer.export.save import exportable
+    from hearthlog.analyzer.export.exporter import export as save
+    from hearthlog.analyzer.export.exporter import exportable
     from hearthlog.analyzer.logs.selection import select
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     if in_place:
         if output_format != "rosbag2" or output or topics or start or end:
@@ -84,8 +95,8 @@ def export(
 
 
 def _describe_as_bag(logs: list[Path]) -> None:
-    from hearthlog.analyzer.export.bag_in_place import describe_as_bag
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.analyzer.export.bags import describe_as_bag
+    from hearthlog.tools.cli.terminal import share_done
 
     if len(logs) != 1:
         wrong_use("--in-place: name one folder of logs")
@@ -102,3 +113,94 @@ def _describe_as_bag(logs: list[Path]) -> None:
             "other; --output BAG instead of --in-place puts all in the order of time"
         )
     end_with_warnings(warnings)
+
+
+def cat(
+    logs: Logs,
+    *,
+    output_format: Annotated[
+        Literal["text", "ndjson", "csv"], typer.Option("--format", help="csv is for one topic.")
+    ] = "text",
+    topics: Topics = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """Print the messages of logs in the order of their log times.
+
+    Exit status 3: a log is unfinished.
+    """
+    from hearthlog.analyzer.export.text import in_order, json_lines, text_lines
+    from hearthlog.analyzer.logs.selection import decode_all, select
+
+    selection = select(logs, topics or [], *parse_span(start, end)).decodable()
+    if output_format == "csv" and len(selection.channels) > 1:
+        names = abridged(sorted(selection.channels))
+        wrong_use(f"csv is for one topic: choose one with --topics ({names})")
+    if output_format == "csv":
+        _print_table(selection)
+    else:
+        lines = json_lines if output_format == "ndjson" else text_lines
+        for batch in selection.messages():
+            sys.stdout.write("\n".join([*in_order(decode_all(batch), lines), ""]))
+    end_with_warnings(unfinished_lines(selection.unfinished))
+
+
+def _print_table(selection: "LogSelection") -> None:
+    from hearthlog.analyzer.export.csvfile import CsvFile
+    from hearthlog.analyzer.export.exporter import one_table, tables_of
+    from hearthlog.analyzer.logs.selection import decode_all
+
+    for topic, channels in selection.channels.items():
+        remedy = "choose other logs, or export --format csv, which makes a file for each"
+        table = CsvFile(sys.stdout.buffer, one_table(tables_of(topic, channels), remedy), selection)
+        for batch in selection.messages():
+            if pieces := decode_all(batch):
+                table.write(pieces)
+
+
+def cut(
+    logs: Logs,
+    *,
+    output: NewLog,
+    topics: Topics = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """Cut a span of time out of logs, message for message.
+
+    It begins with what describes the streams (`/mic/info`) as it was at the start of the span.
+    Exit status 3: a log is unfinished; what is there of it is part of the output.
+    """
+    from hearthlog.analyzer.export.merge import merge_logs
+    from hearthlog.analyzer.logs.selection import select
+    from hearthlog.tools.cli.terminal import share_done
+
+    check_output("--output", output, ".mcap", "a log")
+    selection = select(logs, topics or [], *parse_span(start, end))
+    with share_done("cutting") as progress:
+        repeated = merge_logs(selection, output, progress, latched=True)
+    print(output)
+    if repeated:
+        tell(f"{number(repeated, 'message')} left out that the logs have twice")
+    end_with_warnings(unfinished_lines(selection.unfinished))
+
+
+def merge(logs: Logs, *, output: NewLog) -> None:
+    """Put logs together, message for message, in the order of their log times.
+
+    What they have twice, with the same topic, times and bytes, is there once.
+
+    Exit status 3: a log is unfinished; what is there of it is part of the output.
+    """
+    from hearthlog.analyzer.export.merge import merge_logs
+    from hearthlog.analyzer.logs.selection import select
+    from hearthlog.tools.cli.terminal import share_done
+
+    check_output("--output", output, ".mcap", "a log")
+    selection = select(logs)
+    with share_done("merging") as progress:
+        repeated = merge_logs(selection, output, progress)
+    print(output)
+    if repeated:
+        tell(f"{number(repeated, 'message')} left out that the logs have twice")
+    end_with_warnings(unfinished_lines(selection.unfinished))

@@ -25,8 +25,7 @@ from typer.core import TyperArgument, TyperOption
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.schemas.files import denied_text, is_denied
-from hearthlog.tools.cli.output import OutputClosedError, checked_output
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, tell
 
 # As the help shows them; each is a function, or an app of its own, in the module of its name.
 PANELS = {
@@ -39,7 +38,19 @@ PANELS = {
     "Research": ("replay", "diff", "manifest", "evaluate"),
 }
 VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
-_MODULES = {"resume": "pause"}  # of a verb that shares one
+_MODULES = {  # of verbs that share one
+    **dict.fromkeys(("alerts",), "bridge"),
+    **dict.fromkeys(("catalog",), "info"),
+    **dict.fromkeys(("cat", "cut", "merge"), "export"),
+    **dict.fromkeys(
+        ("config", "devices", "install_service", "pause", "resume", "retain"), "recorder"
+    ),
+    **dict.fromkeys(("diff",), "relabel"),
+    **dict.fromkeys(("enrol",), "annotate"),
+    **dict.fromkeys(("manifest",), "train"),
+    **dict.fromkeys(("recover",), "doctor"),
+    **dict.fromkeys(("voices",), "discover"),
+}
 _TYPES = {"str": "TEXT", "int": "NUMBER", "float": "NUMBER"}
 _TYPES |= dict.fromkeys(("Path", "path", "file", "directory"), "PATH")
 _NAMED = 10  # of many files with the same fault

@@ -1,4 +1,4 @@
-"""`hearthlog models`: a folder of model files, and which of them labels."""
+"""`hearthlog models`: models of a folder, their promotion, and networks to download."""
 
 import json
 from dataclasses import asdict
@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
-from hearthlog.tools.cli.fetch import fetch
 from hearthlog.tools.cli.options import (
     CLIPS,
     Json,
@@ -16,17 +15,130 @@ from hearthlog.tools.cli.options import (
     models_folder,
     starter_here,
 )
-from hearthlog.tools.cli.scores import share
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong_use
-from hearthlog.tools.cli.verdict import print_verdict, refusal
+from hearthlog.tools.cli.tables import share
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    print_lines,
+    print_table,
+    tell,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.model_scores import Comparison
     from hearthlog.analyzer.training.dataset import Recording
     from hearthlog.analyzer.training.manifest import Scenario, SkippedClip
     from hearthlog.models.classifiers.model import Model
+    from hearthlog.models.embedding.networks import EmbeddingNetwork
     from hearthlog.models.modelfile.registry import ModelEntry
+
+
+def fetch(
+    name: Annotated[
+        str | None, typer.Argument(help="A network, as yamnet; without any they are listed.")
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", help="A file of the network that you have, instead of a download."),
+    ] = None,
+) -> None:
+    """Fetch a network of sounds, with which labels are truer in a home that nobody has heard.
+
+    This is the only command of hearthlog that downloads. It says whose the network is, checks that
+    the file is the one that is known, and tries it. Exit status 3: it is there, and cannot be used.
+    """
+    from hearthlog.models.embedding.networks import NETWORKS, network_folders
+    from hearthlog.tools.service.unit import NAME, SYSTEM_UNITS
+
+    if name is None:
+        if source is not None:
+            wrong_use("say which network it is: hearthlog models fetch NAME --from FILE")
+        _list()
+        return
+    network = NETWORKS.get(name)
+    tell(f"{network.attribution}; its licence is {network.licence}")
+    path = _put(network) if source is None else _put_from(network, source)
+    print(path)
+    if path.is_relative_to(network_folders()[0]) and (SYSTEM_UNITS / NAME).exists():
+        tell("the service of this machine does not look there: for it, run this with sudo")
+    end_with_warnings(_tried(network, path))
+
+
+def _put(network: "EmbeddingNetwork") -> Path:
+    """Download a network, unless it is there; return where it is."""
+    from hearthlog.models.embedding.networks import folder_for_new, read_network_file
+    from hearthlog.models.errors import ModelError
+    from hearthlog.tools.cli.terminal import share_done
+    from hearthlog.tools.download import DownloadError, download
+
+    path = folder_for_new() / network.filename
+    try:
+        read_network_file(network, path)
+    except ModelError:
+        pass
+    else:
+        tell("it is there already")
+        return path
+    file = network.files[0]
+    if not file.url:
+        raise ModelError(f"{network.name}: there is no address of it; bring its file with --from")
+    what = f"fetching {file.size / 1e6:.1f} MB from {file.url.split('/')[2]}"
+    try:
+        with share_done(what, announce=True) as report:
+            download(file.url, path, file.size, file.sha256, report)
+    except DownloadError as error:
+        raise DownloadError(f"{error}; or bring its file: models fetch NAME --from FILE") from error
+    return path
+
+
+def _put_from(network: "EmbeddingNetwork", source: Path) -> Path:
+    from hearthlog.models.embedding.networks import folder_for_new, read_network_file
+    from hearthlog.tools.download import put
+
+    data, _ = read_network_file(network, source)
+    path = folder_for_new() / network.filename
+    put(data, path)
+    return path
+
+
+def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
+    """Try a network as a recorder will; return what is wrong with it."""
+    from hearthlog.analyzer.extras import missing
+    from hearthlog.models.embedding.networks import missing_modules
+    from hearthlog.models.errors import ModelError
+    from hearthlog.recorder.labelling.embedder_probe import check_pace, probe_network
+
+    if absent := missing_modules(network.suffix):
+        return [missing(*absent)]
+    try:
+        probe = probe_network(network.name, path)
+        check_pace(path, probe)
+    except ModelError as error:
+        return [str(error)]
+    if probe.different_answers:
+        first = probe.different_answers[0]
+        return [f"{path}: hears otherwise than models were made with ({first}): labels are worse"]
+    tell(f"it works: {1000 * probe.seconds:.2g} ms for a window; recorders take it when they start")
+    return []
+
+
+def _list() -> None:
+    from hearthlog.models.embedding.networks import NETWORKS, find_network
+    from hearthlog.models.errors import ModelError
+
+    problems = []
+    for name in NETWORKS.names():
+        try:
+            network = NETWORKS.get(name)
+        except ModelError as error:
+            problems.append(str(error))
+            continue
+        size = f"{network.files[0].size / 1e6:.1f} MB"
+        there = find_network(name) or "not there"
+        line = f"{name}: {there} ({size}, {network.licence}; {network.attribution})"
+        print_lines([line])
+    end_with_warnings(problems)
+
 
 models = typer.Typer(
     no_args_is_help=True, help="Keep models in a folder: compare them, and choose which one labels."
@@ -212,7 +324,7 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     model, first = load(folder, name), first_starter(folder)
     pairs = ((one, with_network(one)) for one in BY_FEATURES)
@@ -226,9 +338,13 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
         with share_done(f"judging {model.name}", announce=True) as report:
             verdict = judge(folder, model, home, report)
         own = folder == models_folder()
+        from hearthlog.tools.cli.promotion import print_verdict
+
         print_verdict(verdict, home, model.name if own else str(folder / model.name))
         judgement = verdict.judgement
     if not judgement.may_label:
+        from hearthlog.tools.cli.promotion import refusal
+
         raise ModelError(refusal(judgement, model.name))
 
 
@@ -270,7 +386,7 @@ def _check_beside_champion(folder: Path, name: str) -> None:
 
 def _compare_live(logs: Path, *, as_json: bool) -> None:
     from hearthlog.analyzer.gate.comparison import compare_on_trial
-    from hearthlog.tools.cli.trial import print_trial, trial_as_json
+    from hearthlog.tools.cli.promotion import print_trial, trial_as_json
 
     trial = compare_on_trial([logs])
     if as_json:
@@ -298,7 +414,7 @@ def _recordings(
     from hearthlog.analyzer.training.home_recordings import home_recordings
     from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.models.features.installed import feature_set
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     features = feature_set(model.description.feature_set)
     if logs is not None:
@@ -343,7 +459,7 @@ def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
     from hearthlog.analyzer.gate.comparison import gather_evidence
     from hearthlog.analyzer.gate.paired_labels import time_words
     from hearthlog.analyzer.gate.recent_time import recent_logs
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     with share_done("listening to the logs with both") as report:
         evidence = gather_evidence(a, b, recent_logs([logs]), report)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.text import wrong_use
+from hearthlog.tools.cli.terminal import wrong_use
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence

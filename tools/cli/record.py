@@ -21,7 +21,7 @@ from hearthlog.tools.cli.options import (
     parse_time,
     scenario_files,
 )
-from hearthlog.tools.cli.text import number, tell, wrong_use
+from hearthlog.tools.cli.terminal import number, tell, wrong_use
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -131,7 +131,7 @@ def record(
     """
     from hearthlog.recorder.config import NO_MODEL, exposed_passwords, load_settings
     from hearthlog.recorder.recording import record_files
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     given = {
         "output": output,
@@ -202,7 +202,7 @@ def _listen(
 def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
     """Show in a line what is heard, from the state that is yielded."""
     from hearthlog.recorder.recording_session import RecorderState
-    from hearthlog.tools.cli.living_line import living_line
+    from hearthlog.tools.cli.status_line import living_line
 
     tell("Ctrl-C ends it, and completes the log")
     state = RecorderState()

@@ -1,18 +1,46 @@
-"""`hearthlog relabel`: logs labelled anew by a model."""
+"""`hearthlog relabel` and `diff`: labels of another model, and how two labellings differ."""
 
 import json
 import os
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from hearthlog.schemas.errors import listed
-from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location, starter_of
-from hearthlog.tools.cli.text import first_of, number, tell
+from hearthlog.tools.cli.options import (
+    LOG_HELP,
+    End,
+    Json,
+    Logs,
+    Microphone,
+    Scheduler,
+    Start,
+    check_output,
+    log_location,
+    logs_folder,
+    parse_span,
+    starter_of,
+)
+from hearthlog.tools.cli.tables import print_difference, print_queue
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    first_of,
+    number,
+    share_done,
+    tell,
+    unfinished_lines,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
     from hearthlog.analyzer.relabel.relabel import Relabelled
+    from hearthlog.analyzer.review.review_list import ReviewSpan
+
 
 _TASKS = "hearthlog.analyzer.relabel.layer"
 
@@ -42,7 +70,7 @@ def relabel(
     Exit status 3: a log is damaged, or was not relabelled; the others are done.
     """
     from hearthlog.analyzer.workers import open_workers
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler, _TASKS) as pool:
@@ -99,3 +127,123 @@ def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]
         "left_out": result.left_out,
         "by_features": [str(log) for log in result.by_features],
     }
+
+
+_SHOWN, _QUEUED = 10, 60
+
+
+def diff(
+    log: Annotated[
+        str, typer.Argument(help=f"{LOG_HELP} It may be left out, if it is the folder logs.")
+    ],
+    a: Annotated[
+        str | None,
+        typer.Argument(help="A labelling: live, review, or the model of a relabel layer."),
+    ] = None,
+    b: Annotated[str | None, typer.Argument(help="Another one; --queue needs none.")] = None,
+    *,
+    queue: Annotated[
+        bool,
+        typer.Option("--queue", help="Choose spans of a to review: unsure, differing, novel."),
+    ] = False,
+    spans: Annotated[
+        int | None,
+        typer.Option(min=1, help=f"How many to show ({_SHOWN}), or to queue ({_QUEUED})."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--list", help="File to make, *.csv: the queue, or all disagreements."),
+    ] = None,
+    microphone: Microphone = None,
+    start: Start = None,
+    end: End = None,
+    as_json: Json = False,
+) -> None:
+    """Compare two labellings of some logs, or choose what to review next.
+
+    Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
+    """
+    from hearthlog.analyzer.logs.labelling import find_labellings
+    from hearthlog.analyzer.review.review_list import write_list
+    from hearthlog.schemas.messages.topics import labelling_topic
+
+    place = log_location(log)
+    if a is None or (b is None and not place.exists()):
+        place, a, b = log_location(logs_folder()), log, a
+    if b is None and not queue:
+        wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
+    check_output("--list", output, ".csv", "a list of spans")
+    limits = parse_span(start, end)
+    sources = find_labellings(place)
+    name = sources.microphone(microphone)
+    chosen = [sources.find(name, labelling) for labelling in (a, b) if labelling is not None]
+    if len(set(chosen)) < len(chosen):
+        wrong_use(f"{a} and {b} are the same; there is {', '.join(sources.names(name))}")
+    with share_done("reading segments") as progress:
+        sides = [sources.read(name, each, *limits, progress) for each in chosen]
+    if queue:
+        result = _queue(sources, name, sides, spans or _QUEUED)
+    else:
+        result = _difference(name, sides, spans or _SHOWN)
+    if output is not None:
+        listed = result.spans()
+        write_list(output, listed)
+        tell(f"{len(listed)} spans are listed in {output}")
+    if as_json:
+        spans_as_text = [span.as_text() for span in result.spans()]
+        print(json.dumps({**result.figures, "spans": spans_as_text}, allow_nan=False))
+    else:
+        result.print_tables()
+    unfinished = sources.unfinished([labelling_topic(name, each, "segment") for each in chosen])
+    end_with_warnings([*sources.losses, *unfinished_lines(unfinished)])
+
+
+class _Result(NamedTuple):
+    figures: dict[str, Any]
+    spans: "Callable[[], list[ReviewSpan]]"
+    print_tables: Callable[[], None]
+
+
+def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
+    from hearthlog.analyzer.evaluation.event_scores import compare_labellings
+    from hearthlog.analyzer.review.review_list import disagreements
+
+    difference = compare_labellings(*sides)
+    figures = {"microphone": microphone, **asdict(difference)}
+    figures["disagreements"] = len(difference.disagreements.starts)
+    spans = partial(disagreements, difference, microphone)  # there may be a hundred thousand
+    return _Result(figures, spans, partial(print_difference, difference, shown))
+
+
+def _queue(
+    sources: "Labellings",
+    microphone: str,
+    sides: "list[NamedLabelling]",
+    count: int,
+) -> _Result:
+    from hearthlog.analyzer.review.candidates import reviewed_time
+    from hearthlog.analyzer.review.ranking import make_queue
+    from hearthlog.analyzer.review.review_list import queued
+    from hearthlog.schemas.messages.topics import is_review, scenario_name
+
+    names = [side.name for side in sides]
+    if any(map(is_review, names)):
+        wrong_use("a queue is of what is not reviewed yet: compare other labellings")
+    with share_done("reading labels") as progress:
+        ranked = make_queue(
+            sources,
+            microphone,
+            sides[0],
+            other=sides[1] if len(sides) > 1 else None,
+            reviewed=reviewed_time(sources, microphone, scenario_name(names[0])).spans,
+            count=count,
+            progress=progress,
+        )
+    if not ranked.has_uncertainty:
+        tell(
+            f"{names[0]}: no labels with probabilities, so how sure the model was is no part of "
+            "the score"
+        )
+    figures = {"microphone": microphone, "labelling": names[0], "candidates": ranked.candidates}
+    spans = partial(queued, ranked, microphone, *names)
+    return _Result(figures, spans, partial(print_queue, ranked))

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.tools.cli.browser import print_recording
 from hearthlog.tools.cli.options import Json, LocalLog, Microphone, scenario_files
-from hearthlog.tools.cli.text import moment, tell, wrong_use
+from hearthlog.tools.cli.terminal import moment, print_recording, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
@@ -211,7 +210,7 @@ def _check_output(output: Path | None, source: Path) -> None:
 
 def _run(logs: "LogSet", options: "ReplayOptions", stop: Flag) -> "Replay":
     from hearthlog.analyzer.replay.replay import replay as replay_logs
-    from hearthlog.tools.cli.progress import share_done
+    from hearthlog.tools.cli.terminal import share_done
 
     def run(options: "ReplayOptions") -> "Replay":
         with share_done("replaying") as progress:

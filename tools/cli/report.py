@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.tools.cli.options import Logs, Timezone
-from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.text import end_with_warnings, wrong_use
+from hearthlog.tools.cli.terminal import end_with_warnings, share_done, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.home_logs import HomeLogs

@@ -14,8 +14,7 @@ from typer.core import TyperCommand
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
 from hearthlog.schemas.errors import HearthlogError, printable
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.tools.cli.browser import print_recording, show_page
-from hearthlog.tools.cli.keys import read_keys
+from hearthlog.tools.cli.discover import add_groups, add_voices
 from hearthlog.tools.cli.options import (
     End,
     LocalLogs,
@@ -26,10 +25,17 @@ from hearthlog.tools.cli.options import (
     parse_span,
     reviewer_name,
 )
-from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.recurring_lanes import add_groups, add_voices
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import JUDGED_BY, end_with_warnings, tell, wrong_use
+from hearthlog.tools.cli.terminal import (
+    JUDGED_BY,
+    end_with_warnings,
+    print_recording,
+    print_table,
+    read_keys,
+    share_done,
+    show_page,
+    tell,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -285,7 +291,7 @@ def _say_next(logs: list[Path], scenario: str) -> None:
 def _say_how_right(logs: list[Path]) -> None:
     """Print what the minutes that were drawn at random tell by now."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.tools.cli.accuracy_text import Accuracy
+    from hearthlog.tools.cli.info_summary import Accuracy
 
     accuracy = Accuracy(find_home_logs(logs))
     if len(accuracy.minutes):

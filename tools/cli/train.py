@@ -1,4 +1,4 @@
-"""`hearthlog train`: labelled sound to a model file."""
+"""`hearthlog manifest` and `hearthlog train`: collections of labelled sound, and models of them."""
 
 import json
 from collections.abc import Sequence
@@ -16,23 +16,33 @@ from hearthlog.tools.cli.options import (
     SCENARIO,
     Json,
     Scheduler,
+    check_output,
     chosen_method,
     labelled_clips,
     models_folder,
     starter_of,
 )
-from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.scores import print_counts, print_skipped
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import tell, wrong_use
-from hearthlog.tools.cli.verdict import print_verdict, refusal
+from hearthlog.tools.cli.tables import print_counts, print_skipped
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    number,
+    print_lines,
+    print_table,
+    share_done,
+    tell,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
+    from collections import Counter
+
+    from hearthlog.analyzer.collections.manifest_writer import ManifestSummary
     from hearthlog.analyzer.gate.promotion_check import Verdict
     from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.analyzer.training.method import Method
     from hearthlog.models.classifiers.model import Amount, Model
+
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
@@ -139,6 +149,8 @@ def train(
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
         if verdict is not None:
             own = output.parent == models_folder()
+            from hearthlog.tools.cli.promotion import print_verdict
+
             print_verdict(verdict, home or [], output.stem if own else str(output))
             _print_next(verdict, output)
         elif scenario and not (data or speakers):
@@ -183,6 +195,8 @@ def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
 
 def _print_next(verdict: "Verdict", output: Path) -> None:
     if not verdict.judgement.may_label:
+        from hearthlog.tools.cli.promotion import refusal
+
         print(f"\n{refusal(verdict.judgement, verdict.model)}")
     elif output.parent == models_folder():
         print(
@@ -318,7 +332,7 @@ def _learned_voices(
     left_out: "list[SkippedClip]",
 ) -> tuple["Model", "Dataset"]:
     """Learn who of those that are enrolled speaks."""
-    from hearthlog.analyzer.discover.enrolled_voices import check_voices
+    from hearthlog.analyzer.discover.home_voices import check_voices
     from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
     from hearthlog.analyzer.training.speakers import (
         others_of,
@@ -437,3 +451,86 @@ def print_figures(model: "Model") -> None:
 
 def _amounts(amount: "Amount") -> tuple[str, str, str]:
     return str(amount.sources), f"{amount.seconds:.1f}", str(amount.segments)
+
+
+_SHOWN = 12
+
+
+def manifest(
+    collection: Annotated[
+        str,
+        typer.Argument(
+            help="esc50, fsd50k, urbansound8k, desed, vocalsound, audioset-strong, ravdess, "
+            "emodb, voxceleb, or folder."
+        ),
+    ],
+    folder: Annotated[Path | None, typer.Argument(help="Folder of the collection.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Manifest to make, *.csv.")
+    ] = None,
+    map_file: Annotated[
+        Path | None,
+        typer.Option("--map", help="Labels of its categories (TOML), as --print-map prints them."),
+    ] = None,
+    source: Annotated[
+        str | None, typer.Option(help="Name of the sounds in a `folder`; by default its own.")
+    ] = None,
+    licence: Annotated[
+        str | None, typer.Option(help="Licence of the sounds in a `folder`, such as CC0.")
+    ] = None,
+    print_map: Annotated[
+        bool, typer.Option("--print-map", help="Only print the map of the collection, to edit it.")
+    ] = False,
+) -> None:
+    """List the clips of a collection, with labels, sources and licences, to learn from.
+
+    Exit status 3: some audio files of the collection are not there.
+    """
+    from hearthlog.analyzer.collections.manifest_writer import make_manifest, shipped_map
+    from hearthlog.analyzer.collections.readers import FOLDER, NAMES, find_collection
+
+    chosen = find_collection(collection)
+    if chosen is None:
+        wrong_use(f"{collection}: no such collection; choose one of {', '.join(NAMES)}")
+    if (source or licence) and chosen != FOLDER:
+        wrong_use(f"--source and --licence are for a folder; {chosen.title} says its own")
+    if print_map:
+        print(shipped_map(chosen.name), end="")
+        return
+    if folder is None or output is None:
+        wrong_use("give the folder of the collection, and --output; or --print-map")
+    check_output("--output", output, ".csv", "a manifest")
+    with share_done(f"looking at {folder}") as report:
+        made = make_manifest(chosen, folder, output, report, map_file, source or "", licence or "")
+    _print_manifest(made)
+    print(f"\n{output}: {number(made.clips.total(), 'clip')}")
+    alone = [label for label, count in made.clips.items() if len(made.groups[label]) == 1 < count]
+    if chosen == FOLDER and alone:
+        tell(
+            f"{', '.join(alone)}: all files count as one recording, for their names differ in a "
+            "number only, and training wants several; give each recording or person a sub-folder"
+        )
+    if made.missing:
+        files = number(made.files, "audio file")
+        lost = f"{made.missing:,} of {files} are not there, such as {made.first_missing}"
+        end_with_warnings([f"{folder}: {lost}; left out"])
+
+
+def _print_manifest(made: "ManifestSummary") -> None:
+    rows = [
+        (label, f"{count:,}", f"{len(made.groups[label]):,}")
+        for label, count in sorted(made.clips.items())
+    ]
+    print_table(("label", "clips", "sources"), rows)
+    print()
+    print_lines(_counts("licences", made.licences, "unstated"))
+    print_lines(_counts("other_negative is", made.negatives))
+    print_lines(f"left out: {count:,}, {why}" for why, count in made.left_out.most_common())
+    print_lines(_counts("those that may be one of ours are", made.skipped))
+
+
+def _counts(what: str, counts: "Counter[str]", unnamed: str = "") -> list[str]:
+    """List what is most frequent in a line, if there is anything."""
+    named = [f"{name or unnamed} {count:,}" for name, count in counts.most_common(_SHOWN)]
+    more = [f"and {len(counts) - _SHOWN:,} more"] if len(counts) > _SHOWN else []
+    return [f"{what}: {', '.join(named + more)}"] if named else []

@@ -25,10 +25,9 @@ from hearthlog.analyzer.workers.workers import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.errors import Progress
-from hearthlog.tools.cli.evaluate import Scenario, end_with_left_out, learning
+from hearthlog.tools.cli.evaluate import ScenarioOption, end_with_left_out, learning
 from hearthlog.tools.cli.options import Clips, Json, Scheduler
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import print_json
+from hearthlog.tools.cli.terminal import print_json, print_table
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.grid_search import OfFeatures, by_features
 
@@ -201,7 +200,7 @@ def main(
     method: OfFeatures = None,
     *,
     data: Clips,
-    scenario: Scenario,
+    scenario: ScenarioOption,
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:

@@ -47,7 +47,7 @@ from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.terminal import print_table
 from hearthlog.tools.lab.bench.timing import best_of
 
 METHODS = (  # those behind svm are of examples/classifiers

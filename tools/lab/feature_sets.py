@@ -38,7 +38,7 @@ from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.terminal import print_table
 from hearthlog.tools.lab.command import run
 
 _STATISTICS = "statistics"

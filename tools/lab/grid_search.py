@@ -16,11 +16,10 @@ from hearthlog.analyzer.training.method import Method, prepare
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.analyzer.training.train import DEFAULT, check_varied
 from hearthlog.schemas.errors import Progress
-from hearthlog.tools.cli.evaluate import Folds, Scenario, end_with_left_out, learning
+from hearthlog.tools.cli.evaluate import Folds, ScenarioOption, end_with_left_out, learning
 from hearthlog.tools.cli.options import Clips, Json, Scheduler, chosen_method
-from hearthlog.tools.cli.scores import between
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import print_json, wrong_use
+from hearthlog.tools.cli.tables import between
+from hearthlog.tools.cli.terminal import print_json, print_table, wrong_use
 from hearthlog.tools.lab.command import run
 
 OfFeatures = Annotated[
@@ -73,7 +72,7 @@ def main(
     method: OfFeatures = None,
     *,
     data: Clips,
-    scenario: Scenario,
+    scenario: ScenarioOption,
     folds: Folds = "source",
     scheduler: Scheduler = None,
     as_json: Json = False,

@@ -36,10 +36,15 @@ from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import DEFAULT, check_varied
 from hearthlog.schemas.errors import Progress, ignore_progress, shortened
 from hearthlog.tools.cli.options import Clips, Json, labelled_clips
-from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.scores import between, share
-from hearthlog.tools.cli.table import NAME_WIDTH, print_table
-from hearthlog.tools.cli.text import end_with_warnings, number, print_json
+from hearthlog.tools.cli.tables import between, share
+from hearthlog.tools.cli.terminal import (
+    NAME_WIDTH,
+    end_with_warnings,
+    number,
+    print_json,
+    print_table,
+    share_done,
+)
 from hearthlog.tools.lab.command import run
 
 PAPER_F1 = {"bathroom": 0.89, "general": 0.81}

@@ -19,10 +19,8 @@ import typer
 from numpy.typing import NDArray
 from sklearn.metrics import adjusted_rand_score
 
-from hearthlog.analyzer.discover.discover import discover
 from hearthlog.analyzer.discover.groups import NO_GROUP
-from hearthlog.analyzer.discover.read_sounds import HomeSounds, read_sounds
-from hearthlog.analyzer.discover.sound_spans import ALL
+from hearthlog.analyzer.discover.sounds import ALL, HomeSounds, discover, read_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.sources.decoding import read_audio

@@ -10,7 +10,7 @@ import numpy as np
 import soundfile
 from scipy.signal import fftconvolve
 
-from hearthlog.analyzer.discover.sound_spans import SoundSpans
+from hearthlog.analyzer.discover.sounds import SoundSpans
 from hearthlog.analyzer.evaluation.scenes import background
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings

@@ -49,12 +49,16 @@ from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.errors import Progress, ignore_progress
-from hearthlog.tools.cli.evaluate_scenes import ModelFile, learned_lines, read_model_and_clips
+from hearthlog.tools.cli.evaluate import ModelFile, learned_lines, read_model_and_clips
 from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output
-from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.scores import between, print_skipped, share
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import end_with_warnings, number, print_json
+from hearthlog.tools.cli.tables import between, print_skipped, share
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    number,
+    print_json,
+    print_table,
+    share_done,
+)
 from hearthlog.tools.lab.command import run
 
 _SEED = 20_261_123

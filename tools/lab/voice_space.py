@@ -13,7 +13,7 @@ import typer
 from safetensors.numpy import save_file
 from scipy.linalg import eigh
 
-from hearthlog.analyzer.discover.voice_space import VoiceSpace, describe_speech
+from hearthlog.analyzer.discover.voices import VoiceSpace, describe_speech
 from hearthlog.analyzer.training.clips import clip_frames, in_room
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.features.installed import DEFAULT

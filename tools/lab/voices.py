@@ -17,7 +17,7 @@ from pyannote.core import Annotation, Segment, Timeline
 from pyannote.metrics.diarization import DiarizationErrorRate
 
 from hearthlog.analyzer.discover.home_voices import find_voices
-from hearthlog.analyzer.discover.read_speech import HomeSpeech, read_speech, speech_voices
+from hearthlog.analyzer.discover.speech import HomeSpeech, read_speech, speech_voices
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT

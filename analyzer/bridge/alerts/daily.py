@@ -11,8 +11,7 @@ from hearthlog.analyzer.bridge.alerts.rules import DailyRule, NoneBy, UnlikeUsua
 from hearthlog.analyzer.bridge.alerts.sound_events import events_of_rule
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span
 from hearthlog.analyzer.logs.spans import cut
-from hearthlog.analyzer.report.baseline import DAYS, Usual, usual
-from hearthlog.analyzer.report.values import Count, Minutes
+from hearthlog.analyzer.report.values import BASELINE_DAYS, Count, Duration, UsualRange, usual_range
 from hearthlog.schemas.frames import NANOSECONDS
 
 _MINUTE = 60 * NANOSECONDS
@@ -78,7 +77,9 @@ def unlike_alarms(
     alarms = []
     for day, time in days:
         own = figures.of(day)
-        baseline = usual([figures.of(day - timedelta(days=ago)) for ago in range(1, DAYS + 1)])
+        baseline = usual_range(
+            [figures.of(day - timedelta(days=ago)) for ago in range(1, BASELINE_DAYS + 1)]
+        )
         if own is not None and baseline is not None and _is_unlike(rule, own.middle, baseline):
             alarms.append(Alarm(time, time + 1, _unlike_text(rule, day, own, baseline)))
     return alarms
@@ -105,15 +106,15 @@ class _Figures:
         self._events = events_of_rule(rule, heard)
         self._heard = self._events.heard_counted()
         self._listened = heard.listened(rule.label, rule.microphone)
-        self._known: dict[date, Count | Minutes | None] = {}
+        self._known: dict[date, Count | Duration | None] = {}
 
-    def of(self, day: date) -> Count | Minutes | None:
+    def of(self, day: date) -> Count | Duration | None:
         """Return the figure that is judged on a day."""
         if day not in self._known:
             self._known[day] = self._figure(*_part(self._rule, day, self._zone))
         return self._known[day]
 
-    def _figure(self, start: int, end: int) -> Count | Minutes | None:
+    def _figure(self, start: int, end: int) -> Count | Duration | None:
         listened = cut(self._listened, start, end).length
         if listened < self._rule.least_share * (end - start):
             return None
@@ -122,7 +123,7 @@ class _Figures:
         if self._rule.of == "count":
             return Count(events)
         lump = self._rule.least_seconds / 60 * events
-        return Minutes(cut(self._heard, start, end).length / _MINUTE + lump)
+        return Duration(cut(self._heard, start, end).length / _MINUTE + lump)
 
 
 def _part(rule: UnlikeUsual, day: date, zone: tzinfo) -> tuple[int, int]:
@@ -132,13 +133,13 @@ def _part(rule: UnlikeUsual, day: date, zone: tzinfo) -> tuple[int, int]:
     return at_hour(before, EVENING, zone), at_hour(day, MORNING, zone)
 
 
-def _is_unlike(rule: UnlikeUsual, value: float, baseline: Usual) -> bool:
+def _is_unlike(rule: UnlikeUsual, value: float, baseline: UsualRange) -> bool:
     more = value > baseline.highest * (1 + rule.margin)
     less = value < baseline.lowest * (1 - rule.margin)
     return (more and rule.which != "less") or (less and rule.which != "more")
 
 
-def _unlike_text(rule: UnlikeUsual, day: date, own: Count | Minutes, baseline: Usual) -> str:
+def _unlike_text(rule: UnlikeUsual, day: date, own: Count | Duration, baseline: UsualRange) -> str:
     when = f"on {day - timedelta(days=1)}" if rule.part == "day" else f"in the night to {day}"
     times = " times" if rule.of == "count" else ""
     usually = own.spread(*baseline)

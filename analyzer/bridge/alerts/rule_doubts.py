@@ -11,7 +11,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     pause_of,
     unknown_microphone,
 )
-from hearthlog.analyzer.report.baseline import FEWEST as FEWEST_USUAL
+from hearthlog.analyzer.report.values import FEWEST as FEWEST_USUAL
 from hearthlog.analyzer.routine.day_anomaly import FEWEST as FEWEST_ROUTINE
 from hearthlog.recorder.config import Settings
 

@@ -10,8 +10,7 @@ from hearthlog.analyzer.bridge.alerts.ring import Alarm
 from hearthlog.analyzer.bridge.alerts.rules import ANY_SOUND, UnusualDay
 from hearthlog.analyzer.bridge.listeners import is_of_scenario
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.report.class_words import short_day
-from hearthlog.analyzer.report.routine_text import differences_text, rarity_text
+from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
 from hearthlog.analyzer.routine.day_anomaly import Routines
 from hearthlog.analyzer.routine.day_profile import HomeSegments, Profiles
 from hearthlog.models.classes import SILENCE

@@ -8,7 +8,7 @@ from hearthlog.analyzer.bridge.page.group_naming import GroupNaming
 from hearthlog.analyzer.bridge.page.recurring_list import Moment, recurring_list, shown_groups
 from hearthlog.analyzer.bridge.page.said import class_of
 from hearthlog.analyzer.bridge.page.words import told
-from hearthlog.analyzer.discover.summary_file import SUMMARY, HomeSummary, load_summary
+from hearthlog.analyzer.discover.summary import SUMMARY, GroupsSummary, load_summary
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError
@@ -30,7 +30,7 @@ class Recurring:
         self._file = folder / SUMMARY
         self._seen: tuple[int, ...] = ()
         self._looked = 0
-        self._summary: HomeSummary | None = None
+        self._summary: GroupsSummary | None = None
         self._naming = GroupNaming(folder)
         self._state: Any = None
         self._described: Any = _NOTHING

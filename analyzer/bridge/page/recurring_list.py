@@ -5,8 +5,7 @@ from datetime import tzinfo
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.bridge.page.words import class_words, length, room, times, when
-from hearthlog.analyzer.discover.hours import usual_hours
-from hearthlog.analyzer.discover.summary_file import GroupSummary, HomeSummary
+from hearthlog.analyzer.discover.summary import GroupsSummary, GroupSummary, busiest_hours
 from hearthlog.schemas.errors import listed
 from hearthlog.schemas.frames import read_time
 
@@ -22,7 +21,7 @@ class Moment(NamedTuple):
     zone: tzinfo
 
 
-def shown_groups(summary: HomeSummary) -> dict[str, GroupSummary]:
+def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
     """Choose the groups that are shown, by keys that no group of another file has."""
     unnamed = [each for each in summary.groups if not each.name][:_MOST_UNNAMED]
     named = [each for each in summary.groups if each.name][:_MOST_NAMED]
@@ -30,7 +29,7 @@ def shown_groups(summary: HomeSummary) -> dict[str, GroupSummary]:
 
 
 def recurring_list(
-    summary: HomeSummary, looked: int, said: Mapping[str, str], moment: Moment
+    summary: GroupsSummary, looked: int, said: Mapping[str, str], moment: Moment
 ) -> Any:
     """Describe the sounds that recur for JSON.
 
@@ -71,7 +70,7 @@ def _described(key: str, group: GroupSummary, said: str, moment: Moment, *, is_a
 
 def _how_often(group: GroupSummary) -> str:
     days = "one day" if group.days == 1 else f"{group.days} days"
-    hours = usual_hours(group.hours).replace(" to ", " and ")
+    hours = busiest_hours(group.hours).replace(" to ", " and ")
     usual = f", mostly between {hours} o'clock" if hours else ""
     often = times(group.times)
     return f"{often[0].upper()}{often[1:]} on {days}{usual}, {length(group.seconds)} each"

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hearthlog.recorder.config import Settings
     from hearthlog.recorder.recording_session import RecorderState
 
+
 _SECONDS = 0.5  # between two lines
 _LAST_FRAMES = 10  # half a second, over which probabilities are averaged
 _LOWEST = -120.0  # dB of full scale

@@ -1,4 +1,4 @@
-"""The speech of a home, conversation by conversation, with the voices in each told apart."""
+"""Speech of a home: its spans, the loudest microphone, and the turns of each voice."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,20 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.discover.common_speech import SpeechFrames, louder_elsewhere, speech_frames
-from hearthlog.analyzer.discover.speech_spans import is_doubtful, speech_spans
-from hearthlog.analyzer.discover.voice_space import (
+from hearthlog.analyzer.discover.voices import (
     ENERGY,
     WINDOW_FRAMES,
+    VoiceEvidence,
     describe_speech,
     has_voices,
+    summed,
+    tell_apart,
     voice_space,
     window_starts,
 )
-from hearthlog.analyzer.discover.voices import Evidence, summed, tell_apart
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
-from hearthlog.analyzer.logs.selection import checked_array_names
-from hearthlog.analyzer.logs.spans import Spans, rows_at
+from hearthlog.analyzer.logs.selection import array_names, checked_array_names
+from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
+from hearthlog.models.classes import SILENCE, SPEECH, class_name
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -28,6 +29,157 @@ from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, microphone_of, parse_topic, topic
+
+# Mean probability of speech in a segment of another label. Chosen by scenes of household sounds and
+# a model that had not heard them: at 0.3 no other sound becomes speech, at 0.15 twice as many do.
+_LIKELY = 0.3
+
+
+def is_doubtful(segments: Columns) -> Bool:
+    """Tell which segments are of a sound that is not labelled speech, and may be."""
+    return ~_is_of(segments, SPEECH) & ~_is_of(segments, SILENCE)
+
+
+def speech_spans(segments: Columns, labels: Columns | None = None) -> Spans:
+    """Return when somebody speaks.
+
+    Parameters
+    ----------
+    labels : Columns, optional
+        Of the frames. A sound to which they give a probability of speech of 0.3, in the mean, is
+        speech as well, whatever it is called: somebody who reads may pass for one who coughs.
+    """
+    starts = segments["header.stamp"]
+    ends = starts + segments["duration"]
+    rows = _is_of(segments, SPEECH)
+    if labels is not None and len(labels):
+        rows |= is_doubtful(segments) & (_speech_likelihood(labels, starts, ends) >= _LIKELY)
+    return joined(starts[rows], ends[rows])
+
+
+def _is_of(segments: Columns, kind: str) -> Bool:
+    labels = segments["label"]
+    names = {label for label in set(labels.tolist()) if class_name(label) == kind}
+    found: Bool = np.isin(labels.astype(str), sorted(names))
+    return found
+
+
+def _speech_likelihood(labels: Columns, starts: Int64, ends: Int64) -> Float64:
+    """Return the mean probability of speech in spans; 0 where labels have none."""
+    names = array_names(labels.metadata, "probabilities")
+    own = [place for place, name in enumerate(names) if class_name(name) == SPEECH]
+    probabilities = labels["probabilities"]
+    if not own or probabilities.shape[1:] != (len(names),):
+        return np.zeros(len(starts))
+    order = np.argsort(labels["header.stamp"], kind="stable")  # a clock may have been set back
+    stamps = labels["header.stamp"][order]
+    values = np.nan_to_num(probabilities[order][:, own].sum(axis=1, dtype=np.float64))
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    first, last = np.searchsorted(stamps, starts), np.searchsorted(stamps, ends)
+    means: Float64 = (sums[last] - sums[first]) / np.maximum(last - first, 1)
+    return means
+
+
+_ALIKE = 0.7  # correlation of loudness
+_LATE = (0, -1, 1, -2, 2, -3, 3)  # frames: clocks differ, and so does the way through a device
+_SHORT = 10  # frames, too few to compare: the time alone decides
+_LEAST_ENERGY = 1e-12
+_TINY = 1e-12
+
+
+class SpeechFrames(NamedTuple):
+    """Frames of speech of one microphone in one log.
+
+    Attributes
+    ----------
+    frames : np.ndarray [shape=(n,)], int64
+        When each begins, in frames since 1970; ascending.
+    loudness : np.ndarray [shape=(n,)], float64
+        In dB.
+    turn : np.ndarray [shape=(n,)], int64
+        The turn that each is of, from 0 on; ascending.
+    """
+
+    frames: Int64
+    loudness: Float64
+    turn: Int64
+
+    def rows(self, rows: Bool) -> "SpeechFrames":
+        """Return some of the frames."""
+        return SpeechFrames(self.frames[rows], self.loudness[rows], self.turn[rows])
+
+
+def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames:
+    """Return frames of speech as they are compared.
+
+    Parameters
+    ----------
+    stamps : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, ascending.
+    energy : np.ndarray [shape=(n,)], float32
+    starts : np.ndarray [shape=(turns,)], int64
+        Stamps of the frames at which turns begin.
+    """
+    loudness = 10.0 * np.log10(np.maximum(energy.astype(np.float64), _LEAST_ENERGY))
+    frames = (stamps + FRAME_NANOSECONDS // 2) // FRAME_NANOSECONDS
+    return SpeechFrames(frames, loudness, np.searchsorted(starts, stamps, side="right") - 1)
+
+
+def louder_elsewhere(speech: Sequence[SpeechFrames]) -> list[Bool]:
+    """Tell which turns another microphone hears as well, and louder.
+
+    That is so if in most of a turn's frames the other one hears speech, too, and if its loudness
+    and theirs correlate by more than 0.7; for a turn of less than half a second the first is
+    enough. Of what is as loud the first microphone's is kept.
+
+    Returns
+    -------
+    list of np.ndarray [shape=(turns,)], bool
+        For each microphone.
+    """
+    kept = list(speech)
+    louder: list[Bool] = []
+    for place, own in enumerate(speech):
+        counts = np.bincount(own.turn)
+        is_louder = np.zeros(len(counts), np.bool_)
+        for before, other in enumerate(kept):
+            if before != place and _is_of_one_time(own, other):
+                is_louder |= _is_louder(own, counts, other, or_as_loud=before < place)
+        louder.append(is_louder)
+        # what was left out is no reason to leave out others, or nobody would have heard it
+        kept[place] = own.rows(~is_louder[own.turn])
+    return louder
+
+
+def _is_of_one_time(own: SpeechFrames, other: SpeechFrames) -> bool:
+    """Tell whether some of the frames may be the same; most logs of a home are of other times."""
+    if not (len(own.frames) and len(other.frames)):
+        return False
+    early, late = min(_LATE), max(_LATE)
+    return bool(
+        own.frames[0] + early <= other.frames[-1] and other.frames[0] <= own.frames[-1] + late
+    )
+
+
+def _is_louder(own: SpeechFrames, counts: Int64, other: SpeechFrames, *, or_as_loud: bool) -> Bool:
+    best, is_louder = np.full(len(counts), _ALIKE), np.zeros(len(counts), np.bool_)
+    for late in _LATE:
+        times = own.frames + late
+        rows = np.minimum(np.searchsorted(other.frames, times), len(other.frames) - 1)
+        both = other.frames[rows] == times
+        turn, x, y = own.turn[both], own.loudness[both], other.loudness[rows[both]]
+        common = np.bincount(turn, minlength=len(counts))
+        per_frame = np.maximum(common, 1)
+        mean_x, mean_y = (np.bincount(turn, z, len(counts)) / per_frame for z in (x, y))
+        x, y = x - mean_x[turn], y - mean_y[turn]
+        xy, xx, yy = (np.bincount(turn, z, len(counts)) for z in (x * y, x * x, y * y))
+        alike = xy / np.sqrt(np.maximum(xx * yy, _TINY))
+        alike[counts < _SHORT] = 1.0
+        better = (2 * common > counts) & (alike > best)
+        is_louder[better] = (mean_y >= mean_x if or_as_loud else mean_y > mean_x)[better]
+        best[better] = alike[better]
+    return is_louder
+
 
 _FIELDS = {"header.stamp", "values", "duration", "label", "probabilities"}
 _NEVER = 1 << 62
@@ -74,7 +226,7 @@ class HomeSpeech:
     logs: list[Path]
     microphones: list[str]
     turns: Turns
-    voices: Evidence
+    voices: VoiceEvidence
     losses: list[str]
     without: int
 
@@ -118,7 +270,7 @@ class _Reader:
         self._recent: list[tuple[Turns, SpeechFrames]] = []  # of logs of one time
         self._recent_end = 0
         dimensions = len(voice_space().spread)
-        self._voices = [Evidence(np.empty(0), np.empty((0, dimensions)))]
+        self._voices = [VoiceEvidence(np.empty(0), np.empty((0, dimensions)))]
         self._count = self._without = 0
 
     def read(self, entry: HomeLog) -> None:
@@ -212,7 +364,7 @@ class _Reader:
     def speech(self, losses: Sequence[str]) -> HomeSpeech:
         self._settle()
         turns = Turns(*(np.concatenate(each) for each in zip(*self._turns, strict=True)))
-        voices = Evidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True)))
+        voices = VoiceEvidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True)))
         rows, voice = np.unique(turns.voice, return_inverse=True)
         return HomeSpeech(
             self._logs,

@@ -1,17 +1,27 @@
-"""Clips of sound as WAV files."""
+"""Clips of sound as WAV files, and segments as a label track of Audacity."""
 
 import wave
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import BinaryIO
 
-from hearthlog.analyzer.export.exporter import Exporter, OutputFiles, Table, write_tables
+from hearthlog.analyzer.export.exporter import (
+    Exporter,
+    OutputFiles,
+    Table,
+    table_exporter,
+    write_tables,
+)
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, LoggedClip, clips_of
-from hearthlog.analyzer.logs.selection import LogSelection, TypedColumns
-from hearthlog.schemas.errors import LogError, Progress
+from hearthlog.analyzer.logs.selection import Damages, LogSelection, TypedColumns
+from hearthlog.schemas.errors import LogError, Progress, printable
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns, iterate_columns
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
+from hearthlog.schemas.messages.topics import topic as topic_of
 
 _HOLE = 5_000_000  # ns: stamps are as good as 1 ms, and what is lost is a frame at least
 _FILE_LIMIT = 2 << 30  # bytes; WAV has no more than 4 GiB
@@ -72,7 +82,7 @@ class WavFiles:
         )
 
 
-def _save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
+def _save_wav(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
     def opened(table: Table) -> WavFiles:
         return WavFiles(lambda start: files.new(f"{table.stem}_{_moment(start)}"))
 
@@ -84,4 +94,59 @@ def _moment(time: int) -> str:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y%m%dT%H%M%S}.{rest // 1000:06}Z"
 
 
-EXPORTER = Exporter(_save, RAW_AUDIO, CLIP_FIELDS)
+WAV = Exporter(_save_wav, RAW_AUDIO, CLIP_FIELDS)
+
+
+class LabelTrack:
+    """A label track being written: start, end and label, separated by tabs.
+
+    Times are seconds since the first frame of the microphone in the span or, without frames, since
+    the first segment. A segment that began before is cut.
+    """
+
+    def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:
+        self._stream = stream
+        self._zero = _first_frame(table.topic, selection)
+
+    def write(self, pieces: Sequence[TypedColumns]) -> None:
+        """Append segments.
+
+        Raise `LogError` if one of these fields is missing.
+        """
+        for piece in pieces:
+            self._write(piece.columns)
+
+    def _write(self, columns: Columns) -> None:
+        starts = columns["header.stamp"]
+        if self._zero is None:
+            self._zero = int(starts.min())
+        ends = (starts + columns["duration"] - self._zero) / NANOSECONDS
+        rows = zip(
+            ((starts - self._zero) / NANOSECONDS).tolist(),
+            ends.tolist(),
+            columns["label"].tolist(),
+            strict=True,
+        )
+        lines = [
+            f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(printable(label).split())}\n"
+            for start, end, label in rows
+            if end > 0  # or it ended before, and was logged in the span
+        ]
+        self._stream.write("".join(lines).encode())
+
+    def finish(self) -> None:
+        """Complete the file, which needs nothing."""
+
+
+def _first_frame(topic: str, selection: LogSelection) -> int | None:
+    features = topic_of(topic.split("/")[1] if topic.startswith("/") else "", "features")
+    span = selection.start, selection.end
+    stamps = {"header.stamp"}
+    batches = iterate_columns(selection.logs, {features}, *span, stamps, on_damage=Damages().add)
+    first = next(batches, None)
+    return None if first is None else int(first[0]["header.stamp"].min())
+
+
+LABEL_TRACK = table_exporter(
+    LabelTrack, message_types.SEGMENT, {"header.stamp", "duration", "label"}
+)

@@ -1,9 +1,12 @@
-"""How unusual a day was, in words."""
+"""Days, times and classes in words, and how unusual a day was."""
 
 from dataclasses import replace
+from datetime import date, tzinfo
 
-from hearthlog.analyzer.report.class_words import several_in_words
-from hearthlog.analyzer.report.values import Clock, Count, Minutes, whole
+import numpy as np
+
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.report.values import Clock, Count, Duration, whole
 from hearthlog.analyzer.routine.day_anomaly import FEWEST, LONGEST, DayAnomaly, FigureDifference
 from hearthlog.analyzer.routine.day_profile import (
     CLOCK,
@@ -15,7 +18,62 @@ from hearthlog.analyzer.routine.day_profile import (
     STRETCHES,
     DayFigure,
 )
-from hearthlog.models.classes import in_words
+from hearthlog.models.classes import find_class, in_words
+from hearthlog.schemas.arrays import Int64
+
+_WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
+_MONTHS = (
+    *("January", "February", "March", "April", "May", "June"),
+    *("July", "August", "September", "October", "November", "December"),
+)
+
+
+def several_in_words(label: str) -> str:
+    """Name the events of a class as people who count them would."""
+    row = find_class(label)
+    return (row.several if row else "") or in_words(label)
+
+
+def day_in_words(day: date) -> str:
+    """Write a day: `Sunday, 1 March 2026`."""
+    return f"{_WEEKDAYS[day.weekday()]}, {date_in_words(day)}"
+
+
+def date_in_words(day: date) -> str:
+    """Write a date: `1 March 2026`."""
+    return f"{day.day} {_MONTHS[day.month - 1]} {day.year}"
+
+
+def short_day(day: date) -> str:
+    """Write a day: `Sun 1 Mar`."""
+    return f"{_WEEKDAYS[day.weekday()][:3]} {day.day} {_MONTHS[day.month - 1][:3]}"
+
+
+def clock_text(nanoseconds: int, zone: tzinfo) -> str:
+    """Write the time of day: `07:05`.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Of UTC.
+    """
+    return f"{local_time(nanoseconds, zone):%H:%M}"
+
+
+def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
+    """List times of day; where they are many, the first and how many more.
+
+    Parameters
+    ----------
+    starts : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, in any order.
+    most : int, optional
+        Number of times that are listed, at most.
+    """
+    shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
+    more = len(starts) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
+
 
 WEEK = 7.0  # days: what comes more often is as usual
 _MONTH = 30.0
@@ -68,14 +126,14 @@ def difference_text(difference: FigureDifference) -> str:
     figure, value = difference.figure, difference.value
     name = _name(figure)
     if figure.kind == CLOCK:
-        away = Minutes(abs(value - difference.middle)).text
+        away = Duration(abs(value - difference.middle)).text
         word = "later" if difference.deviation > 0 else "earlier"
         usual = _range(_clock(difference.low), _clock(difference.high))
         return f"{name} {_clock(value)}, {away} {word} than usual ({usual})"
     if figure.kind == COUNT:
         low, high = (Count.show(each) for each in (difference.low, difference.high))
         return f"{name} {Count.show(value)}, usually {_range(low, high)}"
-    low, high = (Minutes.show(each) for each in (difference.low, difference.high))
+    low, high = (Duration.show(each) for each in (difference.low, difference.high))
     return f"{_lasting(figure, value)}, usually {_range(low, high)}"
 
 
@@ -97,7 +155,7 @@ def _range(low: str, high: str) -> str:
 
 
 def _lasting(figure: DayFigure, minutes: float) -> str:
-    name, text = _name(figure), Minutes.show(minutes)
+    name, text = _name(figure), Duration.show(minutes)
     if figure.what == QUIET:
         return f"{name} {text}"
     return f"{name} for {text}" if minutes >= _HEARD else f"no {name}"

@@ -1,10 +1,11 @@
-"""Logs as a bag of ROS 1."""
+"""Logs as bags of ROS 1 and ROS 2, and a folder of logs as one bag in place."""
 
 import re
 import warnings
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,24 +23,29 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
-from hearthlog.analyzer.export.merge import held_count
+from hearthlog.analyzer.export.merge import bag_metadata, held_count, is_for_rosbag2, write_log
 from hearthlog.analyzer.logs.selection import LogSelection
-from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress
+from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, ignore_progress
+from hearthlog.schemas.files import is_local
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import decode, unreadable, without_unreadable
+from hearthlog.schemas.logs.files import find_logs, is_active, is_layer
+from hearthlog.schemas.logs.metadata import FileCounts, TopicCount, rosbag2_yaml
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.message_types import typestore
 from hearthlog.schemas.messages.type_definitions import defined_types, message_type
+from hearthlog.schemas.new_files import replaced_file
 
 _HEADER = "std_msgs/msg/Header"
-_NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
 _TIME_LIMIT = NANOSECONDS << 32  # the year 2106
 _NOT_READ = re.compile("[\udc80-\udcff]")
 _LITTLE_ENDIAN = b"\x00\x01"
 
 
-def _save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
+def _save_rosbag1(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
     """Write a bag; the sequence numbers of headers, which ROS 2 does not have, are 0."""
     selection = selection.decodable()
     with Writer(files.path) as writer:
@@ -243,7 +249,7 @@ def _types_of(name: str, encoding: str, text: bytes) -> tuple[str, Typestore]:
     if not own:
         return name, ours
     for each in (name, *own):
-        if not _NAME.fullmatch(each):  # code is made of these types
+        if not _TYPE_NAME.fullmatch(each):  # code is made of these types
             raise LogError(f"{each!r} is no name of a type")
     types = get_typestore(Stores.EMPTY)
     try:
@@ -254,4 +260,145 @@ def _types_of(name: str, encoding: str, text: bytes) -> tuple[str, Typestore]:
     return name, types
 
 
-EXPORTER = Exporter(_save)
+BAG = Exporter(_save_rosbag1)
+
+
+_NO_PLACE = (
+    "channels of different types or qualities of service, or without ROS 2 messages, for which "
+    "rosbag2 has no place"
+)
+
+
+def _save_rosbag2(selection: LogSelection, files: OutputFiles, progress: Progress) -> int:
+    """Write a log and `metadata.yaml`, without topics whose channels rosbag2 cannot tell apart."""
+    topics = [topic for topic, channels in selection.channels.items() if is_for_rosbag2(channels)]
+    if selection.channels and not topics:
+        raise LogError(_NO_PLACE)
+    for topic in selection.channels.keys() - topics:
+        warnings.warn(HearthlogWarning(f"{_NO_PLACE}: left out", topic, each=True), stacklevel=2)
+    if len(topics) < len(selection.channels):
+        selection = selection.only(topics)
+    _warn_of_definitions(selection)
+    log = files.path / f"{files.output.name}.mcap"
+    with log.open("xb") as stream:
+        record, repeated = write_log(selection, stream, log.name, progress)
+    assert record is not None  # each topic has one description
+    information = record["serialized_metadata"]  # JSON, which is YAML too
+    text = f"rosbag2_bagfile_information: {information}\n"
+    (files.path / "metadata.yaml").write_text(text, "utf-8")
+    return repeated
+
+
+def _warn_of_definitions(selection: LogSelection) -> None:
+    """Warn of types with several definitions: readers of rosbag2 decode all by one of them."""
+    known: dict[str, Any] = {}
+    for topic, channels in selection.channels.items():
+        for schema in [schema for _, schema in channels if schema is not None]:
+            try:
+                types = defined_types(schema.name, schema.encoding, schema.data)
+            except LogError:
+                continue  # its messages are copied all the same
+            for name, (_, fields) in types.items():
+                if known.setdefault(name, fields) != fields:
+                    text = f"{name} is defined in two ways, of which readers of rosbag2 take one"
+                    warnings.warn(HearthlogWarning(text, topic), stacklevel=2)
+
+
+ROSBAG2 = Exporter(_save_rosbag2)
+
+
+METADATA = "metadata.yaml"
+_DESCRIPTION = {"offered_qos_profiles", "topic_type_hash"}
+
+
+class BagInPlace(NamedTuple):
+    """What was made of a folder of logs."""
+
+    metadata: Path  # the file
+    unfinished: list[Path]  # logs that were not completed, or have no messages; not in the bag
+    overlapping: list[Path]  # logs that begin before an earlier one of the bag ends
+
+
+def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagInPlace:
+    """Write a `metadata.yaml` that makes one bag of all finished logs of a folder, or replace it.
+
+    Layers are left out: rosbag2 reads one file after the other.
+
+    Parameters
+    ----------
+    progress : callable
+        Is told the share that is done, 0 to 1.
+
+    Raises
+    ------
+    LogError
+        If there is no folder or no finished log in it, if a log is damaged, if a topic is of
+        different types or qualities of service, or if the file cannot be written.
+    """
+    if not (is_local(folder) and folder.is_dir()):
+        raise LogError(f"{folder}: is no folder of this machine; name that of the logs")
+    logs = [log for log in find_logs(folder) if not is_layer(log)]
+    counts, unfinished = [], []
+    for number, log in enumerate(logs):
+        progress(number / len(logs))
+        counted = None if is_active(log) else _count(log, folder)
+        if counted is None:
+            unfinished.append(log)
+        else:
+            counts.append(counted)
+    if not counts:
+        raise LogError(f"{folder}: no finished log is in this folder")
+    _check_topics(counts)
+    counts.sort(key=lambda file: file.span)
+    path = folder / METADATA
+    with replaced_file(path) as temporary:
+        temporary.write_text(rosbag2_yaml(counts), "utf-8")
+    return BagInPlace(path, unfinished, [folder / name for name in _overlapping(counts)])
+
+
+def _overlapping(files: Sequence[FileCounts]) -> Iterator[str]:
+    """Give the names of files that begin before an earlier one ends; rosbag2 merges nothing."""
+    latest = 0
+    for file in files:
+        start, end = file.span
+        if start < latest:
+            yield file.name
+        latest = max(latest, end)
+
+
+def _count(log: Path, folder: Path) -> FileCounts | None:
+    """Count the messages of a log by its index; None if it was not completed, or has none."""
+    with LogFile(log) as file:
+        statistics = file.statistics
+        if not file.complete or statistics is None or not statistics.message_count:
+            return None
+        topics: dict[str, TopicCount] = {}
+        for number, channel in file.channels.items():
+            schema = file.schemas.get(channel.schema_id)
+            if schema is None or not channel.metadata.keys() >= _DESCRIPTION:
+                raise LogError(f"{log}: topic {channel.topic} is not described as rosbag2 needs it")
+            described = TopicCount(schema.name, bag_metadata(channel))
+            topic = topics.setdefault(channel.topic, described)
+            topic.messages += statistics.channel_message_counts.get(number, 0)
+        span = statistics.message_start_time, statistics.message_end_time
+        return FileCounts(log.relative_to(folder).as_posix(), topics, span)
+
+
+def _check_topics(files: Sequence[FileCounts]) -> None:
+    """Check that every topic is the same in all files."""
+    known: dict[str, tuple[object, str]] = {}
+    for file in files:
+        for name, identity in _identities(file):
+            other, where = known.setdefault(name, (identity, file.name))
+            if other != identity:
+                raise LogError(
+                    f"{name} is of different types or qualities of service in {where} and "
+                    f"{file.name}, which rosbag2 has no way to say; export with --format rosbag2 "
+                    "and --output a part that is of one"
+                )
+
+
+def _identities(file: FileCounts) -> Iterator[tuple[str, object]]:
+    for name, topic in file.topics.items():
+        about = topic.channel_metadata
+        yield name, (topic.type, about["offered_qos_profiles"], about["topic_type_hash"])

@@ -1,0 +1,157 @@
+"""The promotion of a model in lines: changes in a home, the verdict on it, and its trial."""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hearthlog.analyzer.gate.comparison import Trial, gain_interval
+from hearthlog.analyzer.gate.paired_labels import time_words
+from hearthlog.schemas.errors import printable
+from hearthlog.tools.cli.terminal import print_table, tell
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.gate.comparison import HomeComparison, PairedAccuracy
+    from hearthlog.analyzer.gate.paired_labels import LabelChanges
+    from hearthlog.analyzer.gate.promotion_check import Verdict
+    from hearthlog.models.modelfile.registry import Judgement
+
+
+_SHOWN = 8  # changes
+
+
+def print_changes(changes: "LabelChanges", before: str, after: str) -> None:
+    """Print the longest changes, and the minutes of each class."""
+    from hearthlog.analyzer.gate.paired_labels import time_words
+
+    for change in changes.pairs()[:_SHOWN]:
+        print(f"  {change}")
+    rows = [
+        (name, time_words(first), time_words(second))
+        for name, first, second in zip(changes.classes, changes.before, changes.after, strict=True)
+        if first or second
+    ]
+    print()
+    print_table((changes.each.strip() or "in all", before, after), rows)
+
+
+_WHOLE_DAY = 0.95 * 24 * 60  # minutes
+
+
+def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
+    """Print what would change, how to hear that, and on what it is seen."""
+    evidence = verdict.evidence
+    if evidence is None:
+        return
+    for loss in evidence.losses[:1]:
+        more = f" (and {len(evidence.losses) - 1} more)" if len(evidence.losses) > 1 else ""
+        tell(f"not heard: {loss}{more}")
+    if not evidence.minutes:
+        return
+    _print_changes(evidence, verdict.model, verdict.champion)
+    if evidence.changes.pairs():
+        command = shlex.join(["hearthlog", "review", *map(str, home), "--queue", model])
+        print(printable(f"hear what changes: `{command}`"))
+    _print_right("sounds of the minutes that were drawn at random", evidence.random, verdict)
+    _print_right("silences of these minutes", evidence.quiet, verdict)
+    _print_right("other sounds that were marked and not learned from", evidence.marks, verdict)
+    if not evidence.random.sounds + evidence.quiet.sounds:
+        print(
+            "no minutes of this home that were drawn at random are reviewed: wrong marks cannot be "
+            "seen; `hearthlog review logs --queue` asks for some"
+        )
+
+
+def refusal(judgement: "Judgement", name: str) -> str:
+    """Say in a line why a model may not label, and how to insist."""
+    return (
+        f"{name} refused: {'; '.join(judgement.reasons)}; "
+        f"`hearthlog models promote {name} --anyway` lets it label all the same"
+    )
+
+
+def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> None:
+    from hearthlog.analyzer.gate.paired_labels import time_words
+
+    changes = evidence.changes
+    much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")
+    whole = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
+    day = changes.minutes.sum()
+    mean = f" (a day: the {time_words(day)} that a mean day with logs has)"
+    end = (mean if changes.each and day < _WHOLE_DAY else "") + end
+    print(
+        f"\n{model} in place of {champion} would change{much}{whole}, judged by "
+        f"{time_words(evidence.minutes)} of the last two weeks that it has not learned from{end}"
+    )
+    print_changes(changes, champion, model)
+
+
+def _print_right(what: str, right: "PairedAccuracy", verdict: "Verdict") -> None:
+    if right.sounds:
+        print(
+            f"of {right.sounds} {what} {verdict.model} is right about {right.after}, "
+            f"{verdict.champion} about {right.before}"
+        )
+
+
+def trial_as_json(trial: Trial) -> dict[str, Any]:
+    """Return a trial for a program."""
+    changes = trial.changes
+    return {
+        "champion": trial.champion,
+        "candidate": trial.candidate,
+        "candidate_sha256": trial.candidate_sha256,
+        "minutes": trial.minutes,
+        "minutes_a_day": {
+            name: [before, after]
+            for name, before, after in zip(
+                changes.classes, changes.before.tolist(), changes.after.tolist(), strict=True
+            )
+        },
+        "changes": [change._asdict() for change in changes.pairs()],
+        "random": trial.random._asdict(),
+        "marks": trial.marks._asdict(),
+        "quiet": trial.quiet._asdict(),
+        "verdict": _trial_verdict(trial),
+    }
+
+
+def print_trial(trial: Trial) -> None:
+    """Print how two models that label at the same time differ, and which is more often right."""
+    print(
+        printable(
+            f"{trial.candidate}, a candidate, beside {trial.champion}: "
+            f"{time_words(trial.minutes)} in which both labelled"
+        )
+    )
+    print_changes(trial.changes, trial.champion, trial.candidate)
+    print()
+    for what, right in (
+        ("sounds of minutes drawn at random", trial.random),
+        ("silences of minutes drawn at random", trial.quiet),
+        ("other marked sounds (marks are where the champion was wrong)", trial.marks),
+    ):
+        if right.sounds:
+            print(
+                printable(
+                    f"of {right.sounds} {what} {trial.candidate} is right about {right.after}, "
+                    f"{trial.champion} about {right.before}"
+                )
+            )
+    print(printable(_trial_verdict(trial)))
+
+
+def _trial_verdict(trial: Trial) -> str:
+    random, name = trial.random.plus(trial.quiet), trial.candidate
+    if not random.sounds:
+        return (
+            "no minutes drawn at random are reviewed since: which is better cannot be told; "
+            "`hearthlog review logs --queue` asks for some"
+        )
+    low, high = gain_interval(random)
+    where = f"right where {trial.champion} is not {random.gained} times, the reverse {random.lost}"
+    if low > 0.5:
+        return f"{name} is better: {where}; `hearthlog models promote {name}` makes it champion"
+    if high < 0.5:
+        return f"{name} is worse: {where}"
+    return f"no clear difference: {where}"

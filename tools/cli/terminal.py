@@ -1,0 +1,311 @@
+"""The terminal: lines, tables, progress, keys, and pages that open in a browser."""
+
+import io
+import json
+import os
+import shlex
+import shutil
+import stat
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import typer
+
+from hearthlog.schemas.errors import HearthlogError, Progress, printable, shortened
+from hearthlog.schemas.frames import millisecond_text
+
+if TYPE_CHECKING:
+    from queue import SimpleQueue
+
+
+JUDGED_BY = "leave it recording, for ten minutes that it has not learned from judge it"
+_SHOWN = 10  # of a list
+_MOST_TOLD = 100  # that are remembered
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines whose texts may come from any file."""
+    for line in lines:
+        print(printable(line))
+
+
+def print_json(result: dict[str, Any]) -> None:
+    """Print a result for a program."""
+    print(json.dumps(result, allow_nan=False))
+
+
+def tell(text: str) -> None:
+    """Write a line that is no result to standard error."""
+    print(f"hearthlog: {printable(text)}", file=sys.stderr)
+
+
+class TellOnce:
+    """Tells what may come again and again, each text once."""
+
+    def __init__(self) -> None:
+        self._told: deque[str] = deque(maxlen=_MOST_TOLD)
+
+    def __call__(self, what: object) -> None:
+        """Tell it, unless it was told of late."""
+        if str(what) not in self._told:
+            self._told.append(str(what))
+            tell(str(what))
+
+    def __bool__(self) -> bool:
+        return bool(self._told)
+
+
+def wrong_use(message: str) -> NoReturn:
+    """End with one line, and the exit status of wrong use."""
+    tell(message)
+    raise typer.Exit(2)
+
+
+def unfinished_lines(paths: Sequence[Path]) -> list[str]:
+    """Say in a line which logs were not completed, if any."""
+    names = ", ".join(map(str, paths))
+    return [f"unfinished, read up to the last whole chunk: {names}"] if names else []
+
+
+def end_with_warnings(lines: Sequence[str]) -> None:
+    """Tell each line; end with exit status 3 if there is one."""
+    for line in lines:
+        tell(line)
+    if lines:
+        raise typer.Exit(3)
+
+
+def number(count: int, what: str) -> str:
+    """Say how many there are of something."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
+def moment(stamp: int | None) -> str | None:
+    """Write a time (ns of UTC) down to the millisecond; None stays None."""
+    return None if stamp is None else millisecond_text(stamp)
+
+
+def first_of(what: str, lines: Sequence[str], hint: str = " (--json lists all)") -> Iterator[str]:
+    """Yield the first lines of a list, and how many more there are."""
+    for line in lines[:_SHOWN]:
+        yield f"{what}: {line}"
+    if len(lines) > _SHOWN:
+        yield f"{what}: and {len(lines) - _SHOWN} more{hint}"
+
+
+NAME_WIDTH = 18  # of a class in a table of figures
+_PLAIN_WIDTH = 160
+_GAP = 2
+_MANY = 1000  # rows, of which Rich would make a table for minutes
+
+
+def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
+    """Print rows of text below their heads.
+
+    Parameters
+    ----------
+    head : sequence of str
+        Empty for a table without heads.
+    words : int
+        Number of columns, from the left, that are words. The others are figures: aligned to the
+        right, and wrapped only after the words.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    cells = [[printable(cell) for cell in row] for row in rows]
+    if not cells:
+        return
+    if len(cells) > _MANY:
+        _print_plainly([list(head)] * bool(head) + cells, words)
+        return
+    table = Table(box=None, pad_edge=False, show_header=bool(head))
+    for place in range(len(cells[0])):
+        least = max(len(row[place]) for row in cells) if place >= words else None
+        table.add_column(
+            head[place] if head else "",
+            justify="left" if place < words else "right",
+            min_width=least,
+            overflow="fold",
+        )
+    for row in cells:
+        table.add_row(*row)
+    console = Console(highlight=False, markup=False, emoji=False, width=_width())
+    with console.capture() as text:
+        console.print(table)
+    print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
+
+
+def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
+    """Print rows of text in columns as wide as they need."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row[:words], widths, strict=False)]
+        figures = zip(row[words:], widths[words:], strict=True)
+        cells += [cell.rjust(width) for cell, width in figures]
+        print((" " * _GAP).join(cells).rstrip())
+
+
+def print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    """Print a confusion matrix, if it is not too wide."""
+    widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
+    if NAME_WIDTH + sum(widths) > _width():
+        print("confusion: too many classes for a table; --json has it")
+        return
+    print(title)
+    named = zip(classes, rows, strict=True)
+    print_table((), [(shortened(name, NAME_WIDTH), *row) for name, row in named])
+
+
+def _width() -> int:
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _PLAIN_WIDTH
+
+
+class OutputClosedError(Exception):
+    """Nobody reads standard output any more."""
+
+
+@contextmanager
+def checked_output() -> Iterator[None]:
+    """Let what is printed in the block raise one of our errors where it cannot be written.
+
+    Printing and flushing `sys.stdout` raise OutputClosedError if its reader is gone, and
+    HearthlogError if it cannot be written; what is printed afterwards is thrown away.
+    """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started us
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
+    plain = sys.stdout
+    binary = io.BufferedWriter(_Output(plain.fileno(), "wb", closefd=False))
+    sys.stdout = io.TextIOWrapper(
+        binary, plain.encoding, plain.errors, line_buffering=plain.isatty()
+    )
+    try:
+        yield
+    finally:
+        sys.stdout = plain
+
+
+class _Output(io.FileIO):
+    """A file whose errors are ours."""
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError as error:
+            self._throw_away()
+            raise OutputClosedError from error
+        except OSError as error:
+            self._throw_away()
+            raise HearthlogError(
+                f"standard output: cannot be written ({error.strerror})"
+            ) from error
+
+    def _throw_away(self) -> None:
+        """Let what is still to be written go nowhere, or Python would try again when it ends."""
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, self.fileno())
+        os.close(nothing)
+
+
+_SPEED_SECONDS = 1800.0  # over which speed is measured, for the time left: steps may be long
+_LINE_SECONDS = 60.0  # between two lines
+
+
+@contextmanager
+def share_done(what: str, *, announce: bool = False) -> Iterator[Progress]:
+    """Show the share, 0 to 1, that the block reports, and the time left.
+
+    Where standard error is no terminal, `announce` prints what begins, and what takes longer than
+    a minute prints a line a minute.
+    """
+    if not sys.stderr.isatty():
+        if announce:
+            tell(what)
+        yield _lines(what)
+        return
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+    with Bar(
+        console=Console(stderr=True), transient=True, speed_estimate_period=_SPEED_SECONDS
+    ) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _lines(what: str) -> Progress:
+    last = time.monotonic()
+
+    def report(share: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _LINE_SECONDS:
+            last = time.monotonic()
+            tell(f"{what}: {share:.1%}")
+
+    return report
+
+
+@contextmanager
+def read_keys(keys: "SimpleQueue[str]") -> Iterator[threading.Event]:
+    """Put keys into a queue as they are pressed; the end of the input is `q`, and sets the event.
+
+    Not that of /dev/null: what is started from a desktop has no other input, and has a window.
+    """
+    ended = threading.Event()
+    if not sys.stdin.isatty():
+        threading.Thread(target=_read_lines, args=[keys, ended], daemon=True).start()
+        yield ended
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        threading.Thread(target=_read_terminal, args=[keys], daemon=True).start()
+        yield ended
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _read_terminal(keys: "SimpleQueue[str]") -> None:
+    while key := sys.stdin.read(1):
+        keys.put("q" if key == "\x04" else key)
+
+
+def _read_lines(keys: "SimpleQueue[str]", ended: threading.Event) -> None:
+    for line in sys.stdin:
+        for key in line.strip():
+            keys.put(key)
+    if not stat.S_ISCHR(os.fstat(sys.stdin.fileno()).st_mode):
+        keys.put("q")
+        ended.set()
+
+
+def print_recording(path: Path) -> None:
+    """Print the name of a Rerun recording, and how to look at it."""
+    from hearthlog.analyzer.review.viewer.process import hidden_options
+
+    print(path)
+    print(f"open it with: rerun {hidden_options()} {shlex.quote(str(path))}")
+    tell("by --bind and --port no web page finds what Rerun shows")
+
+
+def show_page(address: str) -> None:
+    """Say where a page is, and open it where there is a display; without an address nothing."""
+    if not address:
+        return
+    from hearthlog.analyzer.review.viewer.process import has_display
+
+    tell(f"open {address}")
+    if has_display():  # else a browser of the terminal would take it from us
+        import webbrowser
+
+        webbrowser.open(address)
