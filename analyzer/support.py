@@ -12,8 +12,8 @@ from typing import Any
 
 from hearthlog._version import __version__
 from hearthlog.analyzer.doctor.examination import examine_file
-from hearthlog.analyzer.live import examine_live
 from hearthlog.analyzer.logs.recorder_info import CONFIGURATION, attachments_of
+from hearthlog.analyzer.recorder_status import examine_live
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, log_name

@@ -8,7 +8,7 @@ from threading import Event, Thread
 import numpy as np
 from homelife import GENERAL
 
-from hearthlog.analyzer.bridge.run import Bridge
+from hearthlog.analyzer.bridge.bridge import Bridge
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path

@@ -11,11 +11,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from livehome import LiveHome, midday_zone
 from viewers import free_port, patiently
 
-from hearthlog.analyzer.bridge.day import today
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.bridge import Bridge
+from hearthlog.analyzer.bridge.home import RecorderAddress, today
 from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.home_page import HomePage
-from hearthlog.analyzer.bridge.run import Bridge
 from hearthlog.analyzer.bridge.settings import PageSettings
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.logs.files import find_logs
@@ -61,7 +60,7 @@ class Served:
     def __init__(self, folder, settings=None, **options):
         self.settings = settings or {}
         self.log = LiveHome(folder / "logs", **options)
-        self.home = Home(folder / "logs", "home", midday_zone())
+        self.home = RecorderAddress(folder / "logs", "home", midday_zone())
         self.state, self.said, self.port = folder / "state", [], free_port()
         self._start()
 

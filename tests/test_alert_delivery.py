@@ -18,16 +18,19 @@ import pytest
 from waiting import wait_for
 
 from hearthlog.analyzer.bridge.alerts import output
-from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
-from hearthlog.analyzer.bridge.alerts.outbox import UNREAD, Outbox
+from hearthlog.analyzer.bridge.alerts.delivery import (
+    UNREAD,
+    Delivery,
+    Outbox,
+    message,
+    read_targets,
+)
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
-from hearthlog.analyzer.bridge.alerts.ring import Ring
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
-from hearthlog.analyzer.bridge.alerts.targets import read_targets
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.alerts.rules import Notification
+from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.page.page_token import page_token
+from hearthlog.analyzer.bridge.settings import DeliverySettings
+from hearthlog.analyzer.bridge.state import BridgeError, page_token
 
 # Apprise asks for it where there is one.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
@@ -36,7 +39,7 @@ WAIT = 30  # seconds, for what comes at once
 
 
 def ring(number, due=0):
-    return Ring("coughs", number * SECOND, f"alert {number}", is_known=True, due=due)
+    return Notification("coughs", number * SECOND, f"alert {number}", is_known=True, due=due)
 
 
 @contextmanager
@@ -197,7 +200,9 @@ def test_the_pauses_after_a_failure_grow_to_a_quarter_of_an_hour_and_begin_anew(
 
 
 def test_a_ring_is_told_with_its_time_and_late_as_late():
-    late = Ring("it", 1_772_348_400 * SECOND, "None", is_known=True, due=1_772_348_400 * SECOND)
+    late = Notification(
+        "it", 1_772_348_400 * SECOND, "None", is_known=True, due=1_772_348_400 * SECOND
+    )
     assert message(late, UTC, late.due + SECOND) == "2026-03-01 07:00: None"
     assert message(late, UTC, late.due + 3600 * SECOND) == "2026-03-01 07:00: None (told late)"
     waited = late._replace(due=late.due + 3600 * SECOND)
@@ -228,9 +233,9 @@ def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
-    home, said, broker = Home(tmp_path / "logs", "home", UTC), [], []
+    home, said, broker = RecorderAddress(tmp_path / "logs", "home", UTC), [], []
     now = time.time_ns()
-    rung = [Ring("it", now + n, f"ring {n}", is_known=True, due=now) for n in (1, 2)]
+    rung = [Notification("it", now + n, f"ring {n}", is_known=True, due=now) for n in (1, 2)]
 
     def tell(_name, text, _time):
         broker.append(text)
@@ -273,12 +278,12 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
-    home, said, now = Home(tmp_path / "logs", "home", UTC), [], time.time_ns()
+    home, said, now = RecorderAddress(tmp_path / "logs", "home", UTC), [], time.time_ns()
     with server() as (port, good), server() as (other, mended):
         right, typo = f"json://127.0.0.1:{port}", f"jsno://127.0.0.1:{other}"
         settings = DeliverySettings(urls_file=addresses(tmp_path, right, typo))
         own = AlertsOutput([], settings, home, tmp_path, said.append)
-        own._outbox.put([Ring("it", now, "first", is_known=True, due=now)])
+        own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
         wait_for(lambda: len(good) == 1)
         before = own._lines.names
         addresses(tmp_path, "# anna", f"{right}/?verify=no", typo)  # while it runs
@@ -286,11 +291,11 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
         own.close()
         addresses(tmp_path, f"{right}/?verify=yes", typo, "# and while it does not")
         own = AlertsOutput([], settings, home, tmp_path, said.append)
-        own._outbox.put([Ring("it", now + 1, "second", is_known=True, due=now)])
+        own._outbox.put([Notification("it", now + 1, "second", is_known=True, due=now)])
         wait_for(lambda: len(good) == 2)
         addresses(tmp_path, f"{right}/?rto=9", typo.replace("jsno", "json"))  # both at once
         wait_for(lambda: len(mended) == 2)
-        own._outbox.put([Ring("it", now + 2, "third", is_known=True, due=now)])
+        own._outbox.put([Notification("it", now + 2, "third", is_known=True, due=now)])
         wait_for(lambda: len(own._outbox) == 0)
         own.close()
     for texts in (good, mended):
@@ -299,13 +304,13 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
 
 def test_addresses_are_read_again_when_the_package_that_was_missing_is_there(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
-    home, said, now = Home(tmp_path / "logs", "home", UTC), [], time.time_ns()
+    home, said, now = RecorderAddress(tmp_path / "logs", "home", UTC), [], time.time_ns()
     with server() as (port, texts):
         settings = DeliverySettings(urls_file=addresses(tmp_path, f"json://127.0.0.1:{port}"))
         with monkeypatch.context() as missing:
             missing.setitem(sys.modules, "apprise", None)
             own = AlertsOutput([], settings, home, tmp_path, said.append)
-            own._outbox.put([Ring("it", now, "first", is_known=True, due=now)])
+            own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
             assert said[0].startswith("alerts: apprise is not installed; try: ")
         wait_for(lambda: len(texts) == 1)
         own.close()
@@ -320,7 +325,8 @@ def _is_told(own, broker):
 def test_what_waits_for_a_wrong_line_alone_is_dropped_after_a_day(tmp_path):
     now = time.time_ns()
     old, recent = (
-        Ring("it", now - hours * 3600 * SECOND, "", is_known=True, due=0) for hours in (25, 23)
+        Notification("it", now - hours * 3600 * SECOND, "", is_known=True, due=0)
+        for hours in (25, 23)
     )
     outbox = Outbox(tmp_path, ["a", UNREAD], pytest.fail)
     outbox.put([old, recent])
@@ -337,7 +343,10 @@ def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
     if content is not None:
         file.write_text(content)
         file.chmod(0o600)
-    settings, home = DeliverySettings(urls_file=file), Home(tmp_path / "logs", "home", UTC)
+    settings, home = (
+        DeliverySettings(urls_file=file),
+        RecorderAddress(tmp_path / "logs", "home", UTC),
+    )
     own = AlertsOutput(
         [], settings, home, tmp_path, said.append, lambda *given: told.append(given) or True
     )
@@ -438,13 +447,13 @@ from datetime import UTC
 from functools import partial
 from pathlib import Path
 from hearthlog.analyzer.bridge.alerts.delivery import Delivery
-from hearthlog.analyzer.bridge.alerts.outbox import Outbox
-from hearthlog.analyzer.bridge.alerts.ring import Ring
-from hearthlog.analyzer.bridge.alerts.targets import read_targets
+from hearthlog.analyzer.bridge.alerts.delivery import Outbox
+from hearthlog.analyzer.bridge.alerts.rules import Notification
+from hearthlog.analyzer.bridge.alerts.delivery import read_targets
 folder = Path(sys.argv[1])
 targets = read_targets(folder / "urls", print)
 outbox = Outbox(folder / "box", [each.name for each in targets], print)
-outbox.put(Ring("coughs", n, f"alert {n}", True, 0) for n in map(int, sys.argv[2:]))
+outbox.put(Notification("coughs", n, f"alert {n}", True, 0) for n in map(int, sys.argv[2:]))
 print("kept", flush=True)
 delivery = Delivery(outbox, targets, "home", UTC, print, first_pause=0.01)
 while len(outbox):

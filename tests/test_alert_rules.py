@@ -11,20 +11,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from hearthlog.analyzer.bridge.alerts.clock import end_of_quiet, wall_times
-from hearthlog.analyzer.bridge.alerts.duration import duration_words, read_duration
-from hearthlog.analyzer.bridge.alerts.evaluate import rings
-from hearthlog.analyzer.bridge.alerts.gathering import Gathered
-from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-from hearthlog.analyzer.bridge.alerts.ring import RuleState
+from hearthlog.analyzer.bridge.alerts.activity import SegmentCollector, read_activity
+from hearthlog.analyzer.bridge.alerts.evaluation import (
+    end_of_quiet,
+    home_sound,
+    notifications,
+    wall_times,
+)
+from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class
 from hearthlog.analyzer.bridge.alerts.rules import (
     LONGEST_PAUSE,
     AlertRule,
     AlertRules,
+    RuleState,
+    duration_words,
     history,
-    unknown_class,
+    read_duration,
 )
-from hearthlog.analyzer.bridge.alerts.unusual_days import home_sound
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.recorder.errors import ConfigurationError
@@ -42,7 +45,7 @@ def rule(kind, **keys):
 
 def home(*segments, covered=(), classes=None, written=()):
     """What was heard: segments (second, seconds, class[, confidence, microphone]) after noon."""
-    gathered = Gathered()
+    gathered = SegmentCollector()
     for microphone, names in (classes or {}).items():
         gathered.add_classes(microphone, names)
     for start, seconds, label, *more in sorted(segments):
@@ -60,7 +63,7 @@ def home(*segments, covered=(), classes=None, written=()):
 
 def rung(one, heard, hours=24):
     """Seconds after noon at which a rule rings."""
-    found, _ = rings(one, heard, NOON, NOON + hours * HOUR * SECOND, UTC)
+    found, _ = notifications(one, heard, NOON, NOON + hours * HOUR * SECOND, UTC)
     return [(ring.time - NOON) / SECOND for ring in found]
 
 
@@ -154,7 +157,7 @@ def test_none_by_a_time_is_not_known_where_too_little_was_heard(share, known):
     begin = NOON + 18 * HOUR * SECOND  # 06:00
     heard = home(covered=[(begin, begin + round(4 * share * HOUR) * SECOND)])
     one = rule("none_by", since="06:00", by="10:00", **{"class": "flushing_water"})
-    found, _ = rings(one, heard, NOON, NOON + DAY, UTC)
+    found, _ = notifications(one, heard, NOON, NOON + DAY, UTC)
     assert [ring.is_known for ring in found] == [known]
     assert found[0].time == NOON + 22 * HOUR * SECOND
     assert found[0].text == (
@@ -169,8 +172,8 @@ def test_a_microphone_whose_model_does_not_know_a_class_does_not_listen_for_it()
     one = rule("none_by", since="06:00", by="10:00", **{"class": "flushing_water"})
     know = {"hall": ["silence", "speech"], "bath": ["silence", "flushing_water"]}
     both, hall = home(*segments, classes=know), home(segments[0], classes=know)
-    assert [ring.is_known for ring in rings(one, both, NOON, NOON + DAY, UTC)[0]] == [True]
-    assert [ring.is_known for ring in rings(one, hall, NOON, NOON + DAY, UTC)[0]] == [False]
+    assert [ring.is_known for ring in notifications(one, both, NOON, NOON + DAY, UTC)[0]] == [True]
+    assert [ring.is_known for ring in notifications(one, hall, NOON, NOON + DAY, UTC)[0]] == [False]
 
 
 def test_a_class_of_a_scenario_is_heard_by_its_microphone_and_is_no_further_sound():
@@ -191,7 +194,9 @@ def test_a_class_of_a_scenario_is_heard_by_its_microphone_and_is_no_further_soun
         of_name = rule("more_than", **count, **{"class": name})
         assert name in unknown_class(of_name, heard.classes)
     absent = rule("none_by", since="06:00", by="10:00", microphone="hall", **{"class": "anna"})
-    assert [ring.is_known for ring in rings(absent, heard, NOON, NOON + DAY, UTC)[0]] == [True]
+    assert [ring.is_known for ring in notifications(absent, heard, NOON, NOON + DAY, UTC)[0]] == [
+        True
+    ]
     assert set(home_sound(heard).listened) == {"silence", "speech"}
     assert set(home_sound(heard).labels.labels) == {"silence", "speech"}
 
@@ -230,9 +235,9 @@ def test_quiet_hours_end_by_the_clock_of_the_home(day):
 def test_a_ring_in_quiet_hours_waits_for_their_end_unless_it_is_urgent():
     heard = home((12 * HOUR, 5, "crying"))
     keys = {"count": 0, "window": "1h", "class": "crying", "quiet_hours": ["22:00-06:30"]}
-    (ring,), _ = rings(rule("more_than", **keys), heard, NOON, NOON + DAY, UTC)
+    (ring,), _ = notifications(rule("more_than", **keys), heard, NOON, NOON + DAY, UTC)
     assert ring.due - ring.time == 6.5 * HOUR * SECOND
-    (ring,), _ = rings(rule("more_than", urgent=True, **keys), heard, NOON, NOON + DAY, UTC)
+    (ring,), _ = notifications(rule("more_than", urgent=True, **keys), heard, NOON, NOON + DAY, UTC)
     assert ring.due == ring.time
 
 
@@ -242,7 +247,7 @@ def days_of(count, first=date(2026, 2, 1)):
 
 def test_a_night_unlike_those_of_the_four_weeks_before_rings_in_the_morning():
     """Four to six coughs a night; 40 in the night to day 20, which day 21 is compared with."""
-    gathered = Gathered()
+    gathered = SegmentCollector()
     days = days_of(30)
     for number, day in enumerate(days):
         evening = midnight(day) - 2 * HOUR * SECOND
@@ -252,7 +257,7 @@ def test_a_night_unlike_those_of_the_four_weeks_before_rings_in_the_morning():
             gathered.add_segment("mic", start, start + SECOND, "coughing", 1.0)
     one = rule("unlike_usual", part="night", **{"class": "cough"})
     first, last = midnight(days[0]), midnight(days[-1]) + DAY
-    found, _ = rings(one, gathered.heard(), first, last, UTC)
+    found, _ = notifications(one, gathered.heard(), first, last, UTC)
     assert [(ring.time, ring.text) for ring in found] == [
         (
             midnight(days[20]) + 8 * HOUR * SECOND,
@@ -263,7 +268,7 @@ def test_a_night_unlike_those_of_the_four_weeks_before_rings_in_the_morning():
 
 def test_a_day_rings_only_with_a_week_to_compare_it_with_of_which_enough_was_heard():
     def with_days(before, share=1.0):
-        gathered = Gathered()
+        gathered = SegmentCollector()
         for number, day in enumerate(days_of(before + 1)):
             begin = midnight(day)
             own = share if number == 0 else 1.0
@@ -272,7 +277,10 @@ def test_a_day_rings_only_with_a_week_to_compare_it_with_of_which_enough_was_hea
             gathered.add_segment("mic", begin + DAY // 3, begin + DAY // 3 + length, "music", 1.0)
         one = rule("unlike_usual", of="minutes", **{"class": "music"})
         start = midnight(days_of(1)[0])
-        return [ring.text for ring in rings(one, gathered.heard(), start, start + 99 * DAY, UTC)[0]]
+        return [
+            ring.text
+            for ring in notifications(one, gathered.heard(), start, start + 99 * DAY, UTC)[0]
+        ]
 
     expected = ["Music on 2026-02-08: 1 h 00 min, usually 10 min"]
     assert with_days(7) == expected
@@ -340,8 +348,8 @@ def test_rules_over_thirty_days_ring_exactly_when_the_truth_says(first, tmp_path
     begin = wall_times(first, 0, VIENNA)[0]
     end = wall_times(first + timedelta(days=30), 0, VIENNA)[0]
     lost = []
-    heard = read_heard(find_home_logs([tmp_path]), "home", begin - 3 * DAY, end, lost.append)
-    found = {name: rings(one, heard, begin, end, VIENNA)[0] for name, one in RULES.items()}
+    heard = read_activity(find_home_logs([tmp_path]), "home", begin - 3 * DAY, end, lost.append)
+    found = {name: notifications(one, heard, begin, end, VIENNA)[0] for name, one in RULES.items()}
 
     def shown(own, *, known=True):
         times = [each.time for each in own if each.is_known == known]
@@ -362,7 +370,7 @@ def test_a_time_of_day_in_the_hour_of_the_change_rings_once_on_that_day(first):
     day = wall_times(first, 0, VIENNA)[0]
     one = rule("none_by", since="23:00", by="02:30", **{"class": "crying"})
     heard = home(covered=[(day - DAY, day + 2 * DAY)])
-    found, _ = rings(one, heard, day, day + DAY, VIENNA)
+    found, _ = notifications(one, heard, day, day + DAY, VIENNA)
     assert [ring.time for ring in found] == [wall_times(first, 150, VIENNA)[1]]
 
 
@@ -409,11 +417,11 @@ def test_any_division_of_the_time_gives_the_same_rings(life):
     whole = home(*heard, written=writes)
     edges = [NOON + second * SECOND for second in (0, *cuts, 7 * HOUR)]
     for one in DIVIDED:
-        at_once = rings(one, whole, edges[0], edges[-1], UTC)
+        at_once = notifications(one, whole, edges[0], edges[-1], UTC)
         found, state = [], RuleState()
         for start, end in itertools.pairwise(edges):
             known = whole.between(start - history(one), end, LONGEST_PAUSE)
-            more, state = rings(one, known, start, end, UTC, state)
+            more, state = notifications(one, known, start, end, UTC, state)
             found += more
         assert (found, state) == at_once
 
@@ -422,9 +430,9 @@ def test_a_sound_that_pauses_where_one_evaluation_ends_rings_once():
     heard = home((0, 100, "music"), (105, 100, "music"))
     one = rule("longer_than", longer_than="1m", cooldown="1m")
     edges = [NOON + second * SECOND for second in (0, 102, 300)]
-    first, state = rings(one, heard.between(0, edges[1], 0), edges[0], edges[1], UTC)
+    first, state = notifications(one, heard.between(0, edges[1], 0), edges[0], edges[1], UTC)
     assert len(first) == 1
-    assert rings(one, heard, edges[1], edges[2], UTC, state)[0] == []
+    assert notifications(one, heard, edges[1], edges[2], UTC, state)[0] == []
 
 
 @pytest.mark.parametrize(

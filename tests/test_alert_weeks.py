@@ -8,12 +8,10 @@ import pytest
 from livehome import MINUTE, LiveHome, following
 from pydantic import TypeAdapter
 
-from hearthlog.analyzer.bridge.alerts.memory import Memory, Progress
-from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
-from hearthlog.analyzer.bridge.alerts.ring import RuleState
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgress, RuleProgressStore
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule, RuleState
+from hearthlog.analyzer.bridge.home import RecorderAddress
+from hearthlog.analyzer.bridge.settings import DeliverySettings
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
@@ -57,8 +55,8 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
     state, told, said = tmp_path / "state", [], []
     (state / "alerts").mkdir(parents=True)
     until = now - 20 * MINUTE
-    progress = {"quiet": Progress(until, RuleState(since=until))}
-    Memory(state / "alerts" / "rules.json", pytest.fail).save([rule], progress)
+    progress = {"quiet": RuleProgress(until, RuleState(since=until))}
+    RuleProgressStore(state / "alerts" / "rules.json", pytest.fail).save([rule], progress)
     home = LiveHome(tmp_path / "logs")
     write_nights(home.folder, home.classes, silent_since)
 
@@ -67,7 +65,7 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
         return True
 
     try:
-        place = Home(home.folder, "home", zone)
+        place = RecorderAddress(home.folder, "home", zone)
         own = AlertsOutput([rule], DeliverySettings(), place, state, said.append, tell)
         end = time.monotonic() + 120
         with following(place, {"alerts": own}, said):

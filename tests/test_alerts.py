@@ -20,22 +20,16 @@ from pydantic import TypeAdapter
 from spliced import run
 from waiting import wait_for
 
-from hearthlog.analyzer.bridge.alerts.evaluate import rings
-from hearthlog.analyzer.bridge.alerts.gathering import Gathered
-from hearthlog.analyzer.bridge.alerts.live_home import LiveHome
-from hearthlog.analyzer.bridge.alerts.memory import Memory
-from hearthlog.analyzer.bridge.alerts.open_run import Label
-from hearthlog.analyzer.bridge.alerts.outbox import Outbox
-from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
-from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-from hearthlog.analyzer.bridge.alerts.ring import Ring, RuleState
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
-from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.alerts.activity import SegmentCollector, read_activity
+from hearthlog.analyzer.bridge.alerts.delivery import Outbox
+from hearthlog.analyzer.bridge.alerts.evaluation import notifications
+from hearthlog.analyzer.bridge.alerts.live_activity import LiveActivity, LiveLabel
+from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore, RuleWatch
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule, Notification, RuleState
+from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.state_folder import state_folder
+from hearthlog.analyzer.bridge.settings import DeliverySettings
+from hearthlog.analyzer.bridge.state import BridgeError, state_folder
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.logs.columns import read_columns
@@ -92,23 +86,23 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     labels = labels_of(columns)
     rules = [COUGHS, WATER, QUIET, DEAF, SPEECH, EACH]
     outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
-    memory = Memory(tmp_path / "rules.json", pytest.fail)
+    memory = RuleProgressStore(tmp_path / "rules.json", pytest.fail)
     watch = RuleWatch(rules, UTC, outbox, memory, pytest.fail, begin + MINUTE)
-    live, now, found, until = LiveHome(begin, 30 * SECOND), begin + MINUTE, [], 0
+    live, now, found, until = LiveActivity(begin, 30 * SECOND), begin + MINUTE, [], 0
     edge = begin
     while now < begin + 5.5 * HOUR * SECOND:
         live.push([columns.between(edge, now), gaps.between(edge, now)])
         for second in range(edge // SECOND, now // SECOND):
             if second in labels:
-                live.add_label("mic", Label(second * SECOND, labels[second], 0.9), CLASSES)
+                live.add_label("mic", LiveLabel(second * SECOND, labels[second], 0.9), CLASSES)
         until = live.known_until(now)
         new = watch.evaluate(live.heard, pytest.fail, until, now)
         assert all(now - each.time < 90 * SECOND for each in new)
         found += new
         live.forget_before(watch.needed_from(now))
         edge, now = now, now + int(rng.integers(1, 40)) * SECOND
-    heard = read_heard(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
-    expected = [rings(one, heard, begin + MINUTE, until, UTC)[0] for one in rules]
+    heard = read_activity(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
+    expected = [notifications(one, heard, begin + MINUTE, until, UTC)[0] for one in rules]
     assert sorted(found) == sorted(ring for own in expected for ring in own)
     assert [len(own) > 0 for own in expected] == [True] * 6
     assert [ring.is_known for own in expected[2:4] for ring in own] == [True, False]
@@ -116,22 +110,22 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
 
 
 def test_no_more_is_known_than_labels_have_decided():
-    live, begin = LiveHome(0, 30 * SECOND), 1000
+    live, begin = LiveActivity(0, 30 * SECOND), 1000
     assert live.known_until(2000 * SECOND) == 1970 * SECOND  # nobody is heard
     for second in range(begin, begin + 100):
-        live.add_label("mic", Label(second * SECOND, "silence", 0.9), CLASSES)
+        live.add_label("mic", LiveLabel(second * SECOND, "silence", 0.9), CLASSES)
     now = (begin + 100) * SECOND
     assert live.known_until(now) == (begin + 94) * SECOND
     assert live.known_until(now + 100 * SECOND) == now + 70 * SECOND  # it is away
 
 
 def test_a_scenario_that_is_taken_away_keeps_nobody_waiting():
-    live, begin = LiveHome(0, 30 * SECOND), 1_000_000 * SECOND
+    live, begin = LiveActivity(0, 30 * SECOND), 1_000_000 * SECOND
     for second in range(3 * 3600):
         time = begin + second * SECOND
-        live.add_label("mic", Label(time, "silence", 0.9), ["silence", "speech"])
+        live.add_label("mic", LiveLabel(time, "silence", 0.9), ["silence", "speech"])
         if second < 3600:
-            live.add_label("mic-water", Label(time, "tap_water", 0.9), ["silence", "tap_water"])
+            live.add_label("mic-water", LiveLabel(time, "tap_water", 0.9), ["silence", "tap_water"])
     assert time - live.known_until(time) < 10 * SECOND
     assert [name for name, *_ in live.open_segments()] == ["mic"]
     taps = live.heard().of("tap_water")
@@ -143,9 +137,9 @@ def test_what_was_heard_before_a_recorder_was_killed_stays_heard(tmp_path):
     write_day(tmp_path, DAY, hours=range(3), gaps=[(2 * HOUR, 600, "the recorder was not running")])
     gaps = read_columns(find_logs(tmp_path), ["/mic/gap"])["/mic/gap"]
     begin = midnight(DAY)
-    live = LiveHome(begin, 30 * SECOND)
+    live = LiveActivity(begin, 30 * SECOND)
     for second in range(100, 2 * HOUR, 10):
-        live.add_label("mic", Label(begin + second * SECOND, "silence", 0.9), CLASSES)
+        live.add_label("mic", LiveLabel(begin + second * SECOND, "silence", 0.9), CLASSES)
     before = live.heard().coverage["mic"].length
     assert before > 1.9 * HOUR * SECOND
     live.push([gaps])
@@ -158,11 +152,11 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
     events = [(HOUR + 60.0 * n, 2.0, "coughing", 0.9) for n in range(3)]
     write_day(tmp_path / "logs", DAY, events, classes=CLASSES)
     begin = midnight(DAY)
-    heard = read_heard(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
+    heard = read_activity(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
     for down_hours, expected in ((20, 1), (30, 0)):
         folder = tmp_path / str(down_hours)
         outbox = Outbox(folder / "box", ["x"], pytest.fail)
-        memory = Memory(folder / "rules.json", pytest.fail)
+        memory = RuleProgressStore(folder / "rules.json", pytest.fail)
 
         def start(now, memory=memory, outbox=outbox):
             return RuleWatch([COUGHS], UTC, outbox, memory, pytest.fail, now)
@@ -181,11 +175,11 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
 
 def test_a_new_rule_does_not_ring_for_the_silence_before_it(tmp_path):
     silent = rule("recorder_silent", "silent", silent_for="10m")
-    memory = Memory(tmp_path / "rules.json", pytest.fail)
+    memory = RuleProgressStore(tmp_path / "rules.json", pytest.fail)
     outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
     begin = midnight(DAY)
     watch = RuleWatch([silent], UTC, outbox, memory, pytest.fail, begin)
-    nothing = Gathered().heard()
+    nothing = SegmentCollector().heard()
 
     def ring_times(minutes):
         until = begin + minutes * 60 * SECOND
@@ -203,14 +197,14 @@ def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
         write_day(tmp_path / "logs", DAY.replace(day=number), events, classes=CLASSES, file_hours=6)
     one = rule("unlike_usual", of="minutes", **{"class": "speech"})
     outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
-    memory = Memory(tmp_path / "rules.json", pytest.fail)
+    memory = RuleProgressStore(tmp_path / "rules.json", pytest.fail)
     now = midnight(DAY.replace(day=10)) + 12 * HOUR * SECOND
     watch = RuleWatch([one], UTC, outbox, memory, pytest.fail, now)
     asked = []
 
     def weeks(start, end):
         asked.append(end)
-        return read_heard(find_home_logs([tmp_path / "logs"]), "home", start, end, pytest.fail)
+        return read_activity(find_home_logs([tmp_path / "logs"]), "home", start, end, pytest.fail)
 
     found = []
     for _ in range(30):
@@ -223,7 +217,7 @@ def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
 def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
     said = []
     path = tmp_path / "rules.json"
-    memory = Memory(path, said.append)
+    memory = RuleProgressStore(path, said.append)
     progress = memory.load([COUGHS])
     progress["coughs"].until, progress["coughs"].state = 7, RuleState(5, has_rung=True)
     memory.save([COUGHS], progress)
@@ -238,7 +232,7 @@ def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
 
 def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
     said = []
-    memory = Memory(tmp_path / "rules.json", said.append)
+    memory = RuleProgressStore(tmp_path / "rules.json", said.append)
     progress = memory.load([COUGHS])
     progress["coughs"].until = 9 * HOUR * SECOND
     memory.save([COUGHS], progress)
@@ -252,9 +246,9 @@ def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_t
     said, now = [], midnight(DAY) + 4 * HOUR * SECOND
     outbox = Outbox(tmp_path / "box", ["x"], said.append)
     silent = rule("recorder_silent", "silent", silent_for="10m", cooldown="1m")
-    memory = Memory(tmp_path / "rules.json", said.append)
+    memory = RuleProgressStore(tmp_path / "rules.json", said.append)
     watch = RuleWatch([silent, QUIET, COUGHS], UTC, outbox, memory, said.append, now)
-    nothing = Gathered().heard()
+    nothing = SegmentCollector().heard()
 
     def evaluate(until):
         return watch.evaluate(lambda: nothing, pytest.fail, until, until)
@@ -333,7 +327,7 @@ class Recorder(Thread):
 @contextmanager
 def bridge(root, rules, told, said):
     """A bridge that tells of rings of some rules."""
-    home = Home(root / "logs", "home", ZoneInfo("Europe/Vienna"))
+    home = RecorderAddress(root / "logs", "home", ZoneInfo("Europe/Vienna"))
 
     def tell(*ring):
         is_taken = next(connected)
@@ -388,7 +382,7 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
     right = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: right() + ahead[0])
     recorder = Recorder(tmp_path / "logs")
-    home = Home(tmp_path / "logs", "home", UTC)
+    home = RecorderAddress(tmp_path / "logs", "home", UTC)
     newest = recorder.water
 
     def tell(name, _text, rung):
@@ -435,18 +429,19 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
         calls.append(ring)
         return calls.count(ring) == 3
 
-    home = Home(tmp_path / "logs", "home", UTC)
+    home = RecorderAddress(tmp_path / "logs", "home", UTC)
     own = AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail, tell)
     now, right = time.time_ns(), time.time_ns
     own._outbox.put(
-        Ring("coughs", now + number, f"ring {number}", is_known=True, due=now) for number in (1, 2)
+        Notification("coughs", now + number, f"ring {number}", is_known=True, due=now)
+        for number in (1, 2)
     )
     try:
         for minutes in range(0, 60, 4):
             monkeypatch.setattr(time, "time_ns", lambda m=minutes: right() + m * MINUTE)
             own.update(SimpleNamespace(state=HomeState()))
             if minutes == 4:  # one that rang before those, and is found later
-                own._outbox.put([Ring("coughs", now, "ring 0", is_known=True, due=now)])
+                own._outbox.put([Notification("coughs", now, "ring 0", is_known=True, due=now)])
     finally:
         own.close()
     numbers = [text.partition("ring ")[2][0] for _, text, _ in calls]
@@ -455,7 +450,7 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
 
 
 def test_rules_of_which_nobody_would_be_told_are_refused(tmp_path):
-    home = Home(tmp_path, "home", UTC)
+    home = RecorderAddress(tmp_path, "home", UTC)
     with pytest.raises(BridgeError, match="nobody would be told; name urls_file in"):
         AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail)
 

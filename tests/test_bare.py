@@ -14,7 +14,7 @@ import soundfile
 import typer
 
 import hearthlog.tools.home
-from hearthlog.analyzer.ports import free_port
+from hearthlog.analyzer.network import free_port
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.tools.cli.main import make_app
 

@@ -20,24 +20,23 @@ from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
 from viewers import address_of, browsing, free_port, patiently
 
 from hearthlog.analyzer.bridge import http_server
-from hearthlog.analyzer.bridge.day import today
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.event_record import Event
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.bridge import open_outputs
+from hearthlog.analyzer.bridge.commands import REVIEWER, EventCorrections, class_of
+from hearthlog.analyzer.bridge.events import SoundEvent
+from hearthlog.analyzer.bridge.home import RecorderAddress, length, today, when
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.http_server import HttpServer
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.outputs import open_outputs
 from hearthlog.analyzer.bridge.page import server
-from hearthlog.analyzer.bridge.page.admission import PageAdmission
-from hearthlog.analyzer.bridge.page.board import Board
-from hearthlog.analyzer.bridge.page.day_picture import day_picture
-from hearthlog.analyzer.bridge.page.health_list import health_list
-from hearthlog.analyzer.bridge.page.home_page import HomePage
-from hearthlog.analyzer.bridge.page.now_heard import NowHeard
-from hearthlog.analyzer.bridge.page.said import REVIEWER, Said, class_of
-from hearthlog.analyzer.bridge.page.words import length, when
+from hearthlog.analyzer.bridge.page.home_page import (
+    CurrentSounds,
+    HomePage,
+    day_picture,
+    health_list,
+)
+from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
+from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -363,13 +362,13 @@ def test_a_browser_that_reads_nothing_does_not_hold_up_the_others(served):
 
 
 def test_nothing_listens_unless_the_page_is_configured(tmp_path):
-    home = Home(tmp_path, "home", UTC)
+    home = RecorderAddress(tmp_path, "home", UTC)
     outputs, _ = open_outputs(BridgeSettings(), home, tmp_path, print)
     assert outputs == {}
 
 
 def test_the_page_listens_on_loopback_by_default(tmp_path):
-    home, said, port = Home(tmp_path, "home", UTC), [], free_port()
+    home, said, port = RecorderAddress(tmp_path, "home", UTC), [], free_port()
     settings = BridgeSettings(page=PageSettings(port=port))
     outputs, _ = open_outputs(settings, home, tmp_path, said.append)
     assert address_of(port) == "127.0.0.1"
@@ -381,7 +380,7 @@ def test_the_page_listens_on_loopback_by_default(tmp_path):
 def test_an_address_of_the_network_comes_with_a_warning(tmp_path):
     said = []
     settings = PageSettings(port=free_port(), bind="0.0.0.0")
-    HomePage(settings, Home(tmp_path, "home", UTC), tmp_path, said.append).close()
+    HomePage(settings, RecorderAddress(tmp_path, "home", UTC), tmp_path, said.append).close()
     assert "in the clear" in said[1]
 
 
@@ -401,7 +400,7 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path, monkeypatch)
     monkeypatch.setenv("JOURNAL_STREAM", f"{journal.st_dev}:{journal.st_ino}")
     said = []
     for _ in range(2):
-        home = Home(tmp_path, "home", UTC)
+        home = RecorderAddress(tmp_path, "home", UTC)
         HomePage(PageSettings(port=free_port()), home, tmp_path / "state", said.append).close()
     secrets = {path.name: path for path in (tmp_path / "state").iterdir()}
     assert {*secrets} == {"page-token", "page-cookies", "page-address"}
@@ -415,7 +414,10 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path, monkeypatch)
 def test_who_starts_the_bridge_is_shown_the_whole_address(tmp_path):
     said = []
     HomePage(
-        PageSettings(port=free_port()), Home(tmp_path, "home", UTC), tmp_path, said.append
+        PageSettings(port=free_port()),
+        RecorderAddress(tmp_path, "home", UTC),
+        tmp_path,
+        said.append,
     ).close()
     assert said[0].endswith(f"/?token={(tmp_path / 'page-token').read_text().strip()}")
 
@@ -427,14 +429,16 @@ def test_a_file_that_has_no_token_is_refused(tmp_path, text):
     file = tmp_path / "token"
     file.write_text(text)
     with pytest.raises(BridgeError, match="has no token"):
-        HomePage(PageSettings(token_file=file), Home(tmp_path, "home", UTC), tmp_path, print)
+        HomePage(
+            PageSettings(token_file=file), RecorderAddress(tmp_path, "home", UTC), tmp_path, print
+        )
 
 
 def test_a_token_of_ones_own_opens_the_page(tmp_path):
     file, said, port = tmp_path / "token", [], free_port()
     file.write_text("Correct.Horse_Battery~1\n")
     settings = PageSettings(port=port, token_file=file)
-    page = HomePage(settings, Home(tmp_path, "home", UTC), tmp_path, said.append)
+    page = HomePage(settings, RecorderAddress(tmp_path, "home", UTC), tmp_path, said.append)
     connection = HTTPConnection("127.0.0.1", port, timeout=30)
     connection.request("GET", "/?token=Correct.Horse_Battery~1")
     assert connection.getresponse().status == 200
@@ -546,7 +550,7 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(said, why):
     state.push([segments("mic", (now - 60 * NANOSECONDS, now - 30 * NANOSECONDS, "silence"))])
     state.health["mic"] = Health(0, said)
     news = News(state, [], [], today(now, UTC), UTC)
-    (heard,) = NowHeard().describe(news)["rooms"]
+    (heard,) = CurrentSounds().describe(news)["rooms"]
     assert (heard["words"], heard["why"]) == ("Not listening", why)
     health = health_list(news, "home", now)[0]
     assert health["text"] == (f"not listening: {why}" if why else "not listening")
@@ -626,7 +630,7 @@ def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
     def refuse(log, _):
         raise LogError(f"{log}: cannot be written") from PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("hearthlog.analyzer.bridge.corrections.write_marks", refuse)
+    monkeypatch.setattr("hearthlog.analyzer.bridge.commands.write_marks", refuse)
     start = served.log.heard("music", 30)
     with served.stream() as part:
         part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})
@@ -640,9 +644,9 @@ def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
     start = home.heard("music", 40)
     home.close()
     (log,) = find_logs(tmp_path)
-    event = Event("mic", "music", start, start + 4 * NANOSECONDS, 1.0, 4.0)
+    event = SoundEvent("mic", "music", start, start + 4 * NANOSECONDS, 1.0, 4.0)
     write_marks(log, [Mark("mic", start, event.end, "phone_ring", "Ann")])
-    said = Said(tmp_path, "home")
+    said = EventCorrections(tmp_path, "home")
     said.read_back()
     assert said.of(event) == "Marked: Telephone ringing"
     later = event._replace(start=event.end, end=event.end + NANOSECONDS)

@@ -17,12 +17,15 @@ from recurring import record_recurring
 from servedhome import PALE_TEXTS, Phone, serving
 from viewers import browsing, patiently
 
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.page import group_naming
-from hearthlog.analyzer.bridge.page.group_naming import GroupNaming
-from hearthlog.analyzer.bridge.page.recurring import Recurring
-from hearthlog.analyzer.bridge.page.recurring_list import Moment, recurring_list
-from hearthlog.analyzer.bridge.page.said import REVIEWER
+from hearthlog.analyzer.bridge.commands import REVIEWER
+from hearthlog.analyzer.bridge.page import recurring as group_naming
+from hearthlog.analyzer.bridge.page.recurring import (
+    GroupNaming,
+    Moment,
+    RecurringSounds,
+    recurring_list,
+)
+from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.discover.groups import GROUPS
 from hearthlog.analyzer.discover.summary import (
     SUMMARY,
@@ -122,7 +125,7 @@ def test_a_summary_from_the_future_is_of_now():
 
 
 def test_without_a_summary_there_is_nothing_and_a_new_one_is_seen(tmp_path):
-    recurring = Recurring(tmp_path)
+    recurring = RecurringSounds(tmp_path)
     assert recurring.describe(MOMENT)["groups"] == []
     keep(tmp_path, group(1))
     assert [each["words"] for each in recurring.describe(MOMENT)["groups"]] == ["Sound 1"]
@@ -157,7 +160,7 @@ def test_the_summary_lies_beside_the_groups():
 )
 def test_a_file_that_is_no_summary_is_one_line_among_what_needs_a_look(tmp_path, content):
     (tmp_path / SUMMARY).write_bytes(content)
-    recurring = Recurring(tmp_path)
+    recurring = RecurringSounds(tmp_path)
     assert recurring.describe(MOMENT)["groups"] == []
     assert recurring.problem.startswith(f"{tmp_path / SUMMARY}: ")
     assert "\n" not in recurring.problem
@@ -175,14 +178,14 @@ def test_a_damaged_summary_is_shown_or_refused_and_nothing_else(tmp_path_factory
         content[place] = data.draw(st.integers(0, 255))
     folder = tmp_path_factory.mktemp("damaged")
     (folder / SUMMARY).write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
-    recurring = Recurring(folder)
+    recurring = RecurringSounds(folder)
     shown = json.dumps(recurring.describe(MOMENT), allow_nan=False)
     assert bool(recurring.problem) == ("Sound 1" not in shown and "Kettle" not in shown)
 
 
 def test_a_pipe_in_place_of_the_summary_holds_nobody_up(tmp_path):
     os.mkfifo(tmp_path / SUMMARY)
-    recurring = Recurring(tmp_path)
+    recurring = RecurringSounds(tmp_path)
     recurring.describe(MOMENT)
     assert "Not a regular file" in recurring.problem
 
@@ -239,7 +242,7 @@ def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(
 def test_what_came_of_a_name_is_not_said_of_a_group_of_another_file(tmp_path, monkeypatch):
     acting(monkeypatch, "import sys; sys.exit(4)")
     keep(tmp_path, group(3))
-    recurring = Recurring(tmp_path)
+    recurring = RecurringSounds(tmp_path)
     recurring.describe(MOMENT)
     recurring.name(KEY, "kettle")
 
@@ -273,7 +276,7 @@ def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
 def test_what_cannot_be_a_name_starts_nothing(tmp_path, monkeypatch, key, text, says):
     monkeypatch.setattr(group_naming, "module_command", pytest.fail)
     keep(tmp_path, group(1))
-    recurring = Recurring(tmp_path)
+    recurring = RecurringSounds(tmp_path)
     recurring.describe(MOMENT)
     with pytest.raises(BridgeError, match=says):
         recurring.name(key, text)

@@ -10,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.accuracy.event_counts import events_of
-from hearthlog.analyzer.bridge.day import iso_time, today
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.event_record import EventRecord
-from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HeardNow
-from hearthlog.analyzer.bridge.home_state import Health, HomeState, MicrophoneState
+from hearthlog.analyzer.bridge.bridge import ProblemReporter
+from hearthlog.analyzer.bridge.events import ANY_SOUND, ActiveClasses, EventRecord
+from hearthlog.analyzer.bridge.home import iso_time, today
+from hearthlog.analyzer.bridge.home_state import Health, HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier
-from hearthlog.analyzer.bridge.saying import Saying
+from hearthlog.analyzer.bridge.output import Total, Totals
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
-from hearthlog.analyzer.bridge.totals import Total, Totals
+from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -34,7 +33,7 @@ VIENNA = ZoneInfo("Europe/Vienna")
 
 def heard(labels, cuts=()):
     """Tell what is heard after labels that came in pieces."""
-    now, times = HeardNow(CLASSES), FRAME * np.arange(1, len(labels) + 1)
+    now, times = ActiveClasses(CLASSES), FRAME * np.arange(1, len(labels) + 1)
     for first, last in zip([0, *cuts], [*cuts, len(labels)], strict=True):
         now.push(labels[first:last], times[first:last])
     return [now.is_heard(name) for name in (*CLASSES, ANY_SOUND)]
@@ -47,8 +46,8 @@ def test_what_is_heard_does_not_depend_on_how_the_labels_came(labels, cuts):
 
 def ends_of(spans, seconds):
     """When a microphone that heard coughs in some spans was told of which event's end, in s."""
-    microphone, ends = MicrophoneState("mic"), []
-    microphone.classes, microphone.heard = CLASSES, HeardNow(CLASSES)
+    microphone, ends = LiveMicrophone("mic"), []
+    microphone.classes, microphone.heard = CLASSES, ActiveClasses(CLASSES)
     microphone.seen = math.inf
     for now in range(seconds):
         times = now * NANOSECONDS + FRAME * np.arange(20)
@@ -94,7 +93,7 @@ def test_a_sound_is_held_for_ten_seconds(frames, is_heard):
 
 
 def test_a_clock_that_is_set_back_ends_what_was_heard():
-    now = HeardNow(CLASSES)
+    now = ActiveClasses(CLASSES)
     now.push(40 * ["coughing"], 3600 * NANOSECONDS + FRAME * np.arange(40))
     assert now.is_heard("coughing")
     now.push(["silence"], np.array([FRAME]))
@@ -166,7 +165,7 @@ def test_an_identifier_has_letters_that_home_assistant_takes(text):
 
 def state_with(*events):
     """The state of a home with events of coughing, each of a second."""
-    state, microphone = HomeState(), MicrophoneState("mic")
+    state, microphone = HomeState(), LiveMicrophone("mic")
     state.microphones["mic"] = microphone
     record = microphone._records.setdefault("coughing", EventRecord("mic", "coughing"))
     for start in events:
@@ -194,8 +193,8 @@ def test_damaged_totals_are_named(tmp_path):
 
 def test_a_trouble_is_said_again_after_an_hour(monkeypatch):
     said, now = [], [1e6]
-    monkeypatch.setattr("hearthlog.analyzer.bridge.saying.time.monotonic", lambda: now[0])
-    say = Saying(said.append)
+    monkeypatch.setattr("hearthlog.analyzer.bridge.bridge.time.monotonic", lambda: now[0])
+    say = ProblemReporter(said.append)
     for _ in range(3):
         say("no broker")
         say("a full disk")
@@ -208,7 +207,7 @@ def test_who_cannot_be_told_of_a_trouble_ends_nothing():
     def refuse(_line):
         raise OSError(28, "No space left on device")
 
-    Saying(refuse)("no broker")
+    ProblemReporter(refuse)("no broker")
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ import pytest
 from brokers import Broker, Listener, settled_values
 from certificates import Authority
 
-from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.mqtt import connection
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.analyzer.bridge.state import BridgeError
 
 ALIVE = "hearthlog/home/bridge"
 

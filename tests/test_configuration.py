@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from spliced import run
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.analyzer.bridge.settings import (
+    DeliverySettings,
     MqttSettings,
     PageSettings,
     PingSettings,
@@ -482,7 +482,7 @@ def test_a_package_that_an_output_lacks_is_named_with_all_else(
     def find(module):
         return None if module == absent else find_spec(module)
 
-    monkeypatch.setattr("hearthlog.analyzer.bridge.outputs.find_spec", find)
+    monkeypatch.setattr("hearthlog.analyzer.bridge.bridge.find_spec", find)
     for module in [each for each in sys.modules if each.partition(".")[0] == absent]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, absent, None)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hearthlog.analyzer.bridge.mqtt.discovery import (
+from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
     device_id,
     discovery,

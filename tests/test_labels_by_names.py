@@ -14,7 +14,8 @@ from logreader import LogReader
 from spliced import run
 from test_scenarios_at_once import keep, renamed, replace_file
 
-from hearthlog.analyzer.bridge.alerts.rules import MoreThan, unknown_class
+from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class
+from hearthlog.analyzer.bridge.alerts.rules import MoreThan
 from hearthlog.analyzer.training.adaptation import base_classes
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier

@@ -18,8 +18,8 @@ from test_disk import small_disk
 from test_rest import recording
 from test_swap import wait_for
 
-from hearthlog.analyzer import ping
-from hearthlog.analyzer.live import examine_live
+from hearthlog.analyzer import network
+from hearthlog.analyzer.recorder_status import examine_live
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.schemas.logs.files import active_path, find_logs, log_path
 
@@ -72,7 +72,7 @@ def test_a_recorder_that_does_not_run_is_an_error(labmic, tmp_path):
 
 
 def test_a_recorder_that_hangs_is_an_error(labmic, tmp_path, monkeypatch):
-    monkeypatch.setattr("hearthlog.analyzer.live._SPEAKS_SECONDS", 2.0)
+    monkeypatch.setattr("hearthlog.analyzer.recorder_status._SPEAKS_SECONDS", 2.0)
     logs = tmp_path / "logs"
     with recording(labmic, logs) as process:
         wait_for_frames(logs, 30)
@@ -197,11 +197,11 @@ def test_a_watchdog_is_told_whether_all_is_well(labmic, tmp_path, watchdog):
 
 
 def test_a_watchdog_that_hangs_is_waited_for_a_while(monkeypatch):
-    monkeypatch.setattr(ping, "_SECONDS", 0.5)
+    monkeypatch.setattr(network, "_SECONDS", 0.5)
     with closing(create_server(("127.0.0.1", 0))) as server:
         url = f"http://127.0.0.1:{server.getsockname()[1]}/"
-        assert ping.ping(url, is_well=True) in {"no answer within 0 s", "timed out"}
-    assert ping.ping(url, is_well=True) == "Connection refused"
+        assert network.ping(url, is_well=True) in {"no answer within 0 s", "timed out"}
+    assert network.ping(url, is_well=True) == "Connection refused"
 
 
 @pytest.mark.parametrize("url", ["file:///etc/passwd", "watchdog", "https://", "ftp://a/b"])

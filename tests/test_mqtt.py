@@ -15,12 +15,11 @@ from killed_bridge import ZONE, kill_at_random, start_recorder
 from livehome import LiveHome, following, midday_zone
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.mqtt import publisher
-from hearthlog.analyzer.bridge.mqtt.announced import Announced
-from hearthlog.analyzer.bridge.mqtt.discovery import described, device_id, discovery
+from hearthlog.analyzer.bridge.mqtt.home_assistant import described, device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
-from hearthlog.analyzer.bridge.mqtt.topics import Topics
+from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
@@ -42,7 +41,7 @@ class Bridged:
         self, folder: Path, broker: Broker, outputs=(), node="home", state=None, **settings
     ):
         self.said = []
-        place = Home(folder, node, midday_zone())
+        place = RecorderAddress(folder, node, midday_zone())
         mqtt = MqttSettings(**({"host": "127.0.0.1", "port": broker.port} | settings))
         state = state or folder.parent / "bridge"
         self.publisher = MqttPublisher(mqtt, place, state, self.said.append)
@@ -196,7 +195,7 @@ def test_a_recorder_that_records_beside_another_one_is_no_other_name_of_it(
             log = tmp_path / f"{node}_{start:%Y%m%dT%H%M%SZ}.mcap"
             log.touch()
             os.utime(log, (end := start.timestamp() + 3600, end))
-    home = Home(tmp_path, "new", midday_zone())
+    home = RecorderAddress(tmp_path, "new", midday_zone())
     assert publisher._is_renamed(home, "old", is_first=True) == is_renamed
     assert publisher._is_renamed(home, "old", is_first=False) == (is_renamed and "new" in hours)
     assert not publisher._is_renamed(home, "new", is_first=True)
@@ -224,13 +223,13 @@ def test_what_was_switched_off_under_any_name_of_a_recorder_stays_off(tmp_path):
     said, muted = [], {"mqtt-attic.json": "speech", "mqtt-home.json": "coughing"}
     for name, label in muted.items():
         (tmp_path / name).write_text(json.dumps({"muted": [label]}))
-    first = Announced(tmp_path, "home", "x", lambda _, **__: True, said.append)
+    first = RetainedTopics(tmp_path, "home", "x", lambda _, **__: True, said.append)
     assert first.muted() == ["coughing", "speech"]
-    other = Announced(tmp_path, "attic", "x", lambda _, **__: False, said.append)
+    other = RetainedTopics(tmp_path, "attic", "x", lambda _, **__: False, said.append)
     assert "is used by another bridge" in said.pop()  # until the name is free
     other.close()
     first.save()
-    later = Announced(tmp_path, "attic", "x", lambda _, **__: False, said.append)
+    later = RetainedTopics(tmp_path, "attic", "x", lambda _, **__: False, said.append)
     later.save()
     first.switch("speech", is_told=True)
     first.close()

@@ -10,14 +10,13 @@ from threading import Thread
 import pytest
 from pydantic import ValidationError
 
-from hearthlog.analyzer import ping
-from hearthlog.analyzer.bridge import pinging
-from hearthlog.analyzer.bridge.day import today
+from hearthlog.analyzer import network
+from hearthlog.analyzer.bridge.bridge import PingOutput
+from hearthlog.analyzer.bridge.home import today
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.pinging import Pinging
 from hearthlog.analyzer.bridge.settings import PingSettings
-from hearthlog.analyzer.ports import free_port
+from hearthlog.analyzer.network import free_port
 from hearthlog.schemas.errors import HearthlogError
 
 pytestmark = pytest.mark.fast
@@ -48,8 +47,8 @@ def watchdog():
 @pytest.fixture
 def often(monkeypatch):
     """A ping every twentieth of a second, and no judgement that lasts longer than half of one."""
-    monkeypatch.setattr(pinging, "_SOON", 0.05)
-    monkeypatch.setattr(pinging, "_JUDGED_SECONDS", 0.5)
+    monkeypatch.setattr("hearthlog.analyzer.bridge.bridge._SOON", 0.05)
+    monkeypatch.setattr("hearthlog.analyzer.bridge.bridge._JUDGED_SECONDS", 0.5)
     return lambda url: PingSettings(url=url).model_copy(update={"every_seconds": 0.05})
 
 
@@ -71,7 +70,7 @@ def last_asked(pings, asked, what):
 
 def test_a_watchdog_is_asked_while_all_is_well_and_told_of_a_failure(often):
     with watchdog() as (url, asked):
-        pings = Pinging(often(url), pytest.fail)
+        pings = PingOutput(often(url), pytest.fail)
         assert last_asked(pings, asked, news(mic=0, clock=1)) == "/box"
         assert last_asked(pings, asked, news(mic=2)) == "/box/fail"
         assert last_asked(pings, asked, news(is_recording=False)) == "/box/fail"
@@ -81,7 +80,7 @@ def test_a_watchdog_is_asked_while_all_is_well_and_told_of_a_failure(often):
 
 def test_a_bridge_that_hangs_asks_no_more(often):
     with watchdog() as (url, asked):
-        pings = Pinging(often(url), pytest.fail)
+        pings = PingOutput(often(url), pytest.fail)
         last_asked(pings, asked, news(mic=0))
         until, count = time.monotonic() + 60, -1
         while len(asked) > count:
@@ -93,7 +92,7 @@ def test_a_bridge_that_hangs_asks_no_more(often):
 
 def test_a_watchdog_that_is_away_is_said_to_be(often):
     said = []
-    pings = Pinging(often(f"http://127.0.0.1:{free_port()}"), said.append)
+    pings = PingOutput(often(f"http://127.0.0.1:{free_port()}"), said.append)
     until = time.monotonic() + 60
     while not said and time.monotonic() < until:
         pings.update(news())
@@ -108,13 +107,13 @@ def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
     with watchdog() as (url, asked):
         file.write_text(f"\ufeff{url}/a-secret\r\n")
         settings = PingSettings(url_file=file).model_copy(update={"every_seconds": 0.05})
-        pings = Pinging(settings, said.append)
+        pings = PingOutput(settings, said.append)
         assert last_asked(pings, asked, news(mic=0)) == "/box/a-secret"
         pings.close()
     for wrong in ("", "a-secret", "https://", "http://x/a secret", "http://x:y/", "http://[x/"):
         file.write_text(wrong)
         with pytest.raises(HearthlogError, match="has no address that can be asked for") as error:
-            Pinging(settings, said.append)
+            PingOutput(settings, said.append)
         assert "secret" not in str(error.value)
     assert said == []
 
@@ -122,7 +121,7 @@ def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
 def test_of_a_failure_nothing_is_said_that_has_the_address(monkeypatch):
     for error in (InvalidURL("/a-secret"), ValueError("/a-secret"), BadStatusLine("/a-secret")):
         monkeypatch.setattr("urllib.request.urlopen", lambda *_, e=error, **__: raise_it(e))
-        assert ping.ping("http://127.0.0.1/a-secret", is_well=True) == type(error).__name__
+        assert network.ping("http://127.0.0.1/a-secret", is_well=True) == type(error).__name__
 
 
 def raise_it(error):

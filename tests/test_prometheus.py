@@ -13,11 +13,11 @@ from livehome import LiveHome, following
 from prometheus_client.parser import text_string_to_metric_families
 
 from hearthlog.analyzer.bridge import home_state, http_server, prometheus
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
-from hearthlog.analyzer.ports import free_port, listen
+from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.network import free_port, listen
 from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast
@@ -42,7 +42,7 @@ def bridged(home, folder, **settings):
     token = folder / "token"
     token.write_text(f"{TOKEN}\n")
     settings = {"token_file": token, "readable_by": "all", **settings}
-    place = Home(home.folder, "home", UTC)
+    place = RecorderAddress(home.folder, "home", UTC)
     output = PrometheusOutput(PrometheusSettings(**settings), place, folder, since, said.append)
     with following(place, {"prometheus": output}, said):
         yield
@@ -182,7 +182,7 @@ def test_a_port_that_is_taken_is_named(home, tmp_path):
 def test_a_port_without_a_token_stays_closed(home, tmp_path):
     port = free_port()
     settings = PrometheusSettings(port=port)
-    place = Home(home.folder, "home", UTC)
+    place = RecorderAddress(home.folder, "home", UTC)
     with pytest.raises(BridgeError, match=f"port {port} stays closed.*name a `token_file`"):
         PrometheusOutput(settings, place, tmp_path, 0, pytest.fail)
     with pytest.raises(ConnectionRefusedError):
@@ -194,7 +194,7 @@ def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, mon
     monkeypatch.setattr(prometheus, "_EVERY_SECONDS", 0.0)
     home.hears("silence")
     token, text, said = tmp_path / "token", tmp_path / "home.prom", []
-    place, port = Home(home.folder, "home", UTC), free_port()
+    place, port = RecorderAddress(home.folder, "home", UTC), free_port()
     if lacking == "no token":
         token.touch()
     settings = PrometheusSettings(
@@ -222,7 +222,9 @@ def test_a_text_file_that_node_exporter_does_not_read_is_said_to_be_none(home, t
     said = []
     path = tmp_path / "hearthlog.txt"
     settings = PrometheusSettings(text_file=path, readable_by="owner")
-    PrometheusOutput(settings, Home(home.folder, "home", UTC), tmp_path, 0, said.append).close()
+    PrometheusOutput(
+        settings, RecorderAddress(home.folder, "home", UTC), tmp_path, 0, said.append
+    ).close()
     (line,) = said
     assert line.startswith(f"bridge.prometheus: text_file: {path} does not end in .prom")
     assert line.endswith(f'write "{tmp_path}/hearthlog.prom"')
@@ -232,7 +234,11 @@ def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):
     said = []
     path = tmp_path / "hearthlog.prom"
     PrometheusOutput(
-        PrometheusSettings(text_file=path), Home(home.folder, "home", UTC), tmp_path, 0, said.append
+        PrometheusSettings(text_file=path),
+        RecorderAddress(home.folder, "home", UTC),
+        tmp_path,
+        0,
+        said.append,
     ).close()
     (line,) = said
     assert line.startswith(

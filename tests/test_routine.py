@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from pydantic import TypeAdapter, ValidationError
 
-from hearthlog.analyzer.bridge.alerts.evaluate import rings
-from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
+from hearthlog.analyzer.bridge.alerts.activity import read_activity
+from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule, history
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -327,9 +327,9 @@ def logs(tmp_path_factory):
 
 def test_an_alert_tells_of_an_unusual_day_in_the_morning_after_it(logs):
     shelf, start = find_home_logs([logs]), midnight(MONDAY)
-    heard = read_heard(shelf, "home", start, 1 << 62, pytest.fail)
+    heard = read_activity(shelf, "home", start, 1 << 62, pytest.fail)
     end = start + 20 * 24 * HOUR * NANOSECONDS
-    (ring,), _ = rings(rule(once_in=100), heard, start, end, UTC)
+    (ring,), _ = notifications(rule(once_in=100), heard, start, end, UTC)
     assert ring.time == start + (19 * 24 + 8) * HOUR * NANOSECONDS
     assert ring.text.startswith("Fri 20 Feb and the night after it, ")
     assert "bouts of coughing in the night 3" in ring.text

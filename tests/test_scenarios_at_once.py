@@ -23,17 +23,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from spliced import run
 from test_swap import MICROPHONE, block, wait_for
 
-from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
-from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-from hearthlog.analyzer.bridge.day import today
-from hearthlog.analyzer.bridge.follow_home import is_of_bridge
-from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.mqtt.discovery import discovery
+from hearthlog.analyzer.bridge.alerts.activity import read_activity
+from hearthlog.analyzer.bridge.alerts.live_activity import FIELDS, LiveActivity, is_of_alerts
+from hearthlog.analyzer.bridge.home import RecorderAddress, times, today
+from hearthlog.analyzer.bridge.home_state import HomeState, is_of_bridge
+from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.scenario_lines import scenario_lines
-from hearthlog.analyzer.bridge.page.words import times
+from hearthlog.analyzer.bridge.page.home_page import scenario_lines
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -549,7 +546,7 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     state = HomeState()
     columns = read_columns([log], [*OF_WATER, "/mic/gap", "/mic/label", "/mic/segment"])
     news = News(state, [], [], today(START + 60 * NANOSECONDS, UTC), UTC)
-    figures, home = tmp_path / "figures.prom", Home(tmp_path, "home", UTC)
+    figures, home = tmp_path / "figures.prom", RecorderAddress(tmp_path, "home", UTC)
     output = PrometheusOutput(
         PrometheusSettings(text_file=figures, readable_by="all"), home, tmp_path, 0, pytest.fail
     )
@@ -594,9 +591,9 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
 
 def test_alerts_hear_what_a_scenario_labels_from_the_log_and_as_it_is_written(log):
     start, end = START, START + 60 * 1_000_000_000
-    replayed = read_heard(find_home_logs([log]), "home", start, end, pytest.fail)
+    replayed = read_activity(find_home_logs([log]), "home", start, end, pytest.fail)
     columns = read_columns([log], None, fields={f for own in FIELDS.values() for f in own})
-    live = LiveHome(start, 0)
+    live = LiveActivity(start, 0)
     live.push([part for topic, part in columns.items() if is_of_alerts(topic)])
     labels = read_columns([log], OF_WATER)[OF_WATER[1]]["label"].tolist()
     for heard in (replayed, live.heard()):

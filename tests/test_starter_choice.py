@@ -14,7 +14,7 @@ from networks import model
 from onnx import helper
 from spliced import run
 
-from hearthlog.analyzer.live import _networks
+from hearthlog.analyzer.recorder_status import _networks
 from hearthlog.models.embedding.networks import NETWORKS, YAMNET, NetworkFile
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings

@@ -1,1 +1,1 @@
-"""What a home is told of its sounds: by MQTT, alerts, Prometheus and a page, all from the log."""
+"""The bridge: sounds of a home by MQTT, alerts, Prometheus and a page, from its log."""

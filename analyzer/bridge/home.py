@@ -1,13 +1,180 @@
-"""Whose sounds a bridge tells of."""
+"""The home that a bridge follows: recorder, labelling sources, days, and names in words."""
 
-from datetime import tzinfo
+from datetime import timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, local_time, midnight
+from hearthlog.models.classes import in_words
+from hearthlog.schemas.errors import printable, shortened
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import LIVE, SCENARIO, TopicName, is_scenario
 
-class Home(NamedTuple):
-    """The recorder of a home, and the home's own time."""
+
+class RecorderAddress(NamedTuple):
+    """The recorder that a bridge follows: log folder, node name and time zone."""
 
     folder: Path
     node: str
     zone: tzinfo
+
+
+class Today(NamedTuple):
+    """When the day began that a home is in, and its last night; in nanoseconds of UTC.
+
+    Attributes
+    ----------
+    midnight : int
+        When the day began.
+    night, morning : int
+        When the last night began, at 22:00 of this day or of the one before, and when it ends, at
+        7:00.
+    """
+
+    now: int
+    midnight: int
+    night: int
+    morning: int
+
+
+def today(now: int, zone: tzinfo) -> Today:
+    """Return the day and the night at a time."""
+    day = local_time(now, zone).date()
+    last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
+    night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
+    return Today(now, midnight(day, zone), *night)
+
+
+def iso_time(nanoseconds: int, zone: tzinfo) -> str:
+    """Write a time as ISO 8601, with the offset of the home and milliseconds.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Of UTC.
+    """
+    moment = local_time(nanoseconds, zone)
+    milliseconds = nanoseconds % NANOSECONDS // 1_000_000
+    return moment.replace(microsecond=1000 * milliseconds).isoformat(timespec="milliseconds")
+
+
+_BETWEEN = "-"
+
+
+def labelling_source(topic: TopicName) -> str | None:
+    """Return the labelling source of a topic; None for what no recorder labels live."""
+    if topic.labelling == LIVE:
+        return topic.microphone
+    if is_scenario(topic.labelling):
+        return source_name(topic.microphone, topic.labelling.removeprefix(f"{SCENARIO}/"))
+    return None
+
+
+def source_name(microphone: str, scenario: str) -> str:
+    """Return the labelling source of a scenario: `<microphone>-<scenario>`."""
+    return f"{microphone}{_BETWEEN}{scenario}"
+
+
+def source_microphone(source: str) -> str:
+    """Return the name of the microphone."""
+    return source.partition(_BETWEEN)[0]
+
+
+def source_scenario(source: str) -> str:
+    """Return the name of the scenario; empty for the model of the home."""
+    return source.partition(_BETWEEN)[2]
+
+
+def is_of_scenario(source: str) -> bool:
+    """Whether a source is the model of a scenario."""
+    return _BETWEEN in source
+
+
+_LONGEST = 200  # characters of a text from a log
+_LONGEST_NAME = 60
+_SURE, _FAIRLY_SURE = 0.9, 0.7
+_HEARD = {"listening", "reading"}  # what a recorder says of a microphone that it hears
+
+
+def clock(time: int, zone: tzinfo) -> str:
+    """Write what the clock on the wall shows: `14:05`."""
+    return f"{local_time(time, zone):%H:%M}"
+
+
+def when(time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
+    """Say when something was: `14:05`, `yesterday 23:10`, `3 May 14:05`.
+
+    Parameters
+    ----------
+    seconds : bool
+        Whether the seconds are said, too.
+    """
+    moment, today = local_time(time, zone), local_time(now, zone).date()
+    shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
+    if moment.date() == today:
+        return shown
+    if moment.date() == today - timedelta(days=1):
+        return f"yesterday {shown}"
+    return f"{moment.day} {moment:%B} {shown}"
+
+
+def long_date(time: int, zone: tzinfo) -> str:
+    """Write a date: `Tuesday, 3 May`."""
+    moment = local_time(time, zone)
+    return f"{moment:%A}, {moment.day} {moment:%B}"
+
+
+def length(seconds: float) -> str:
+    """Say how long something was: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
+    if seconds < 1:
+        return "less than a second"
+    if seconds < 90:
+        return _counted(round(seconds), "second")
+    minutes = round(seconds / 60)
+    if minutes < 90:
+        return _counted(minutes, "minute")
+    hours, rest = divmod(minutes, 60)
+    return _counted(hours, "hour") + (f" {_counted(rest, 'minute')}" if rest else "")
+
+
+def sureness(confidence: float) -> str:
+    """Say how sure the model was: `sure (95 %)`."""
+    words = "not sure"
+    if confidence >= _FAIRLY_SURE:
+        words = "sure" if confidence >= _SURE else "fairly sure"
+    return f"{words} ({100 * confidence:.0f} %)"
+
+
+def times(count: int) -> str:
+    """Say how often something was: `never`, `once`, `4 times`."""
+    return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def class_words(label: str) -> str:
+    """Name a class of any log as people would, on one line and not too long."""
+    return shortened(in_words(label), _LONGEST_NAME)
+
+
+def room(microphone: str) -> str:
+    """Name the place of a microphone as people would."""
+    return shortened(microphone.replace("_", " ").capitalize(), _LONGEST_NAME)
+
+
+def told(text: str) -> str:
+    """Return a text of a log on one line, and not too long."""
+    return shortened(" ".join(printable(text).split()), _LONGEST)
+
+
+def reason(text: str) -> str:
+    """Return why a microphone is not heard; empty if what was said of it last is no reason.
+
+    Parameters
+    ----------
+    text : str
+        What the recorder said; before it ended, or was killed, that it listens.
+    """
+    return "" if text in _HEARD else text
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"

@@ -1,24 +1,31 @@
-"""What the microphones of a home hear now, and what they heard of late, from the log alone."""
+"""State of the microphones of a home, followed in the log of its recorder."""
 
 import json
 import math
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
+from pathlib import Path
+from threading import Event as Flag
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.bridge.day import Today
-from hearthlog.analyzer.bridge.event_record import PAUSE_SECONDS, Event, EventRecord
-from hearthlog.analyzer.bridge.heard_now import HeardNow
-from hearthlog.analyzer.bridge.listeners import is_of_scenario, listener_of
+from hearthlog.analyzer.bridge.events import PAUSE_SECONDS, ActiveClasses, EventRecord, SoundEvent
+from hearthlog.analyzer.bridge.home import RecorderAddress, Today, is_of_scenario, labelling_source
 from hearthlog.analyzer.logs.spans import joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.files import is_layer, log_name
+from hearthlog.schemas.logs.follow import follow_messages
+from hearthlog.schemas.logs.metadata import provenance_records, unknown_version
+from hearthlog.schemas.mcap.chunks import read_definitions
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import TopicName, parse_topic
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, TopicName, is_scenario, parse_topic
 
 FIELDS = {
     message_types.LABEL: ("label", "confidence"),
@@ -39,14 +46,14 @@ class Health(NamedTuple):
     text: str
 
 
-class Known(NamedTuple):
+class EnoughHeard(NamedTuple):
     """Whether enough was heard to say that there was nothing: today, and in the last night."""
 
     day: bool
     night: bool
 
 
-class MicrophoneState:
+class LiveMicrophone:
     """What one microphone hears and heard, by one of its models.
 
     Parameters
@@ -71,7 +78,7 @@ class MicrophoneState:
         self._unnamed = unnamed
         self._names: list[str] = []
         self.classes: list[str] = []
-        self.heard = HeardNow([])
+        self.heard = ActiveClasses([])
         self.label, self.confidence = "", 0.0
         self.level_dbfs = math.nan
         self.gaps: list[tuple[int, int]] = []
@@ -80,13 +87,13 @@ class MicrophoneState:
         self._records: dict[str, EventRecord] = {}
         self._unended: set[str] = set()  # classes with an event that may go on
         self._latest = 0  # when the last segment ended, in nanoseconds of UTC
-        self._replaced: list[Event] = []  # that are over, for another one of the class began
+        self._replaced: list[SoundEvent] = []  # that are over, for another one of the class began
 
     def is_listening(self) -> bool:
         """Tell whether labels have come in the last fifteen seconds."""
         return time.monotonic() - self.seen <= _AWAY_SECONDS
 
-    def events(self, label: str, since: int) -> list[Event]:
+    def events(self, label: str, since: int) -> list[SoundEvent]:
         """Return the events of a class that began at a time or later, in nanoseconds of UTC."""
         record = self._records.get(label)
         return [] if record is None else record.since(since)
@@ -95,7 +102,7 @@ class MicrophoneState:
         """Return the classes of which events are known."""
         return list(self._records)
 
-    def last_event(self, label: str) -> Event | None:
+    def last_event(self, label: str) -> SoundEvent | None:
         """Return the last event of a class; None if none is known."""
         record = self._records.get(label)
         return record.events[-1] if record is not None and record.events else None
@@ -106,13 +113,13 @@ class MicrophoneState:
         if classes and classes != self._names:
             self._names = classes
             self.classes = [c for c in classes if c == SILENCE or c not in self._unnamed]
-            self.heard = HeardNow(classes)
+            self.heard = ActiveClasses(classes)
         self.heard.push(columns["label"].tolist(), columns.log_times)
         self.since = self.since or int(columns.log_times[0])
         self.label = str(columns["label"][-1])
         self.confidence = float(columns["confidence"][-1])
 
-    def push_segments(self, columns: Columns) -> list[Event]:
+    def push_segments(self, columns: Columns) -> list[SoundEvent]:
         """Add segments, with the fields of `FIELDS`; return the events that begin with them."""
         begun = []
         first = int(columns["header.stamp"][0])
@@ -142,7 +149,7 @@ class MicrophoneState:
         spans = zip(starts, durations, strict=True)
         self.gaps += [(start, start + length) for start, length in spans if length > 0]
 
-    def counts(self, label: str, today: Today, known: Known) -> tuple[int | None, int | None]:
+    def counts(self, label: str, today: Today, known: EnoughHeard) -> tuple[int | None, int | None]:
         """Count the events of a class that began since midnight, and those of the last night.
 
         Returns
@@ -154,10 +161,10 @@ class MicrophoneState:
         night = sum(event.start < today.morning for event in self.events(label, today.night))
         return day if day or known.day else None, night if night or known.night else None
 
-    def known_of(self, today: Today) -> Known:
+    def known_of(self, today: Today) -> EnoughHeard:
         """Tell of which times up to now it is known that nothing was heard in them."""
         night = self._share_heard(today.night, min(today.morning, today.now))
-        return Known(self._share_heard(today.midnight, today.now) > 0, night >= MOST)
+        return EnoughHeard(self._share_heard(today.midnight, today.now) > 0, night >= MOST)
 
     def _share_heard(self, start: int, end: int) -> float:
         """Return the share of a time, up to now, in which the microphone was heard."""
@@ -168,7 +175,7 @@ class MicrophoneState:
         starts, ends = np.array([(a, b) for a, b in inside if a < b], np.int64).reshape(-1, 2).T
         return 1 - joined(starts, ends).length / max(end - start, 1)
 
-    def ended_events(self) -> list[Event]:
+    def ended_events(self) -> list[SoundEvent]:
         """Return the events that are over, each once."""
         ended, self._replaced = self._replaced, []
         for label in sorted(self._unended):
@@ -196,21 +203,21 @@ class HomeState:
 
     Attributes
     ----------
-    scenarios : dict of str to MicrophoneState
+    scenarios : dict of str to LiveMicrophone
         The same by the models of scenarios: by `<microphone>-<scenario>`, which is no name of a
         microphone.
     caught_up : bool
         Whether all that was written before has been read, so that what comes is new.
-    listeners : collection of str or None
+    sources : collection of str or None
         Names of the states that the newest log can add to; None while that is not known.
     """
 
     def __init__(self) -> None:
-        self.microphones: dict[str, MicrophoneState] = {}
-        self.scenarios: dict[str, MicrophoneState] = {}
+        self.microphones: dict[str, LiveMicrophone] = {}
+        self.scenarios: dict[str, LiveMicrophone] = {}
         self.health: dict[str, Health] = {}
         self.caught_up = False
-        self.listeners: Collection[str] | None = None
+        self.sources: Collection[str] | None = None
         self._seen = -math.inf  # when anything came, by CLOCK_MONOTONIC
         self._said: set[str] = set()  # subjects of the health in the log that is read
 
@@ -218,24 +225,24 @@ class HomeState:
         """Tell whether anything was written in the last fifteen seconds."""
         return time.monotonic() - self._seen <= _AWAY_SECONDS
 
-    def every(self) -> list[MicrophoneState]:
+    def every(self) -> list[LiveMicrophone]:
         """Return the states of the microphones, and those of their scenarios."""
         return [*self.microphones.values(), *self.scenarios.values()]
 
-    def present(self) -> list[MicrophoneState]:
+    def present(self) -> list[LiveMicrophone]:
         """Return the states of the microphones that the recorder has now."""
         return [each for each in self.microphones.values() if not self.is_left_out(each.name)]
 
     def is_left_out(self, name: str) -> bool:
         """Return whether the recorder no longer has a microphone, or a scenario of it."""
-        return self.listeners is not None and name not in self.listeners
+        return self.sources is not None and name not in self.sources
 
     def begin_log(self) -> None:
         """Forget the health of what was spoken of in the log before the last one, and no more."""
         self.health = {name: each for name, each in self.health.items() if name in self._said}
         self._said.clear()
 
-    def find_event(self, identifier: str) -> Event | None:
+    def find_event(self, identifier: str) -> SoundEvent | None:
         """Return the event of an id; None if it is not known, or no more."""
         for microphone in list(self.microphones.values()):  # it may be asked in another thread
             for label in microphone.labels():
@@ -244,7 +251,7 @@ class HomeState:
                         return event
         return None
 
-    def push(self, columns: Sequence[Columns]) -> list[Event]:
+    def push(self, columns: Sequence[Columns]) -> list[SoundEvent]:
         """Add messages with the fields of `FIELDS`; return the events that begin with them."""
         begun = []
         for part in (each for each in columns if len(each)):
@@ -265,12 +272,12 @@ class HomeState:
                 begun += microphone.push_segments(part)
         return begun
 
-    def _state_of(self, topic: TopicName) -> MicrophoneState:
-        name = listener_of(topic)
+    def _state_of(self, topic: TopicName) -> LiveMicrophone:
+        name = labelling_source(topic)
         assert name is not None
         if is_of_scenario(name):
-            return self.scenarios.setdefault(name, MicrophoneState(name, OF_EVERY_SCENARIO))
-        return self.microphones.setdefault(name, MicrophoneState(name))
+            return self.scenarios.setdefault(name, LiveMicrophone(name, OF_EVERY_SCENARIO))
+        return self.microphones.setdefault(name, LiveMicrophone(name))
 
     def _time_seen(self, columns: Columns) -> float:
         """Tell when messages were written, by CLOCK_MONOTONIC.
@@ -308,3 +315,106 @@ def _class_names(columns: Columns) -> list[str]:
         if isinstance(names, list) and all(isinstance(name, str) for name in names):
             return names[:_MOST_CLASSES]
     return []
+
+
+_LATEST = 60 * NANOSECONDS  # of labels and diagnostics: of the older ones nothing is left
+_WAIT_SECONDS = 1.0
+_TICK_SECONDS = 0.5
+
+
+def is_of_bridge(topic: str) -> bool:
+    """Whether the bridge subscribes to a topic."""
+    if topic == DIAGNOSTICS:
+        return True
+    name = parse_topic(topic)
+    if name is None:
+        return False
+    kinds = {"label", "segment", "gap"} if name.labelling == LIVE else {"label", "segment"}
+    return (name.labelling == LIVE or is_scenario(name.labelling)) and name.kind in kinds
+
+
+def follow_home(
+    home: RecorderAddress, start: int, stop: Flag, damaged: Callable[[LogError], None]
+) -> Iterator[tuple[HomeState, list[SoundEvent]]]:
+    """Follow the logs of a recorder, and keep the state of its home.
+
+    Parameters
+    ----------
+    start : int
+        Log time from which on the events are to be known, in nanoseconds of UTC.
+    damaged : callable
+        Told the error of a log of which no more can be read, and that there is no folder yet.
+
+    Yields
+    ------
+    state : HomeState
+        The same one each time: after whatever was written, and twice a second while nothing is.
+    """
+    state, folder = HomeState(), home.folder
+    while not folder.is_dir():
+        damaged(LogError(f"{folder}: no such folder yet; waiting for a recorder"))
+        state.caught_up = True
+        yield state, []
+        if stop.wait(_WAIT_SECONDS):
+            return
+    state.caught_up = False
+    messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
+    yielded, current, described = -math.inf, folder, folder
+    for path, batch in messages:
+        if path == folder:  # all that was written has been read
+            if current != described and (names := _labelling_sources(current)) is not None:
+                state.sources, described = names, current
+            if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
+                state.caught_up = True
+                yielded = time.monotonic()
+                yield state, []
+        elif log_name(path).node == home.node:
+            if path != current and not is_layer(path):
+                current = path
+                state.begin_log()
+                _check_version(path, damaged)
+            yielded = time.monotonic()
+            yield state, _push(state, path, batch, damaged)
+        if stop.is_set():
+            return
+
+
+def _push(
+    state: HomeState, log: Path, batch: list[RawMessages], damaged: Callable[[LogError], None]
+) -> list[SoundEvent]:
+    """Add what was read of a log; return the events that begin with it."""
+    try:
+        return state.push(_decode(batch))
+    except LogError as error:
+        damaged(LogError(f"{log}: {error}"))
+        return []
+
+
+def _check_version(log: Path, damaged: Callable[[LogError], None]) -> None:
+    """Tell of a log of a later version, of which only what is known here is read."""
+    with suppress(LogError), LogFile(log) as file:  # it gets another name at this moment
+        for record in provenance_records(file):
+            if text := unknown_version(record):
+                damaged(LogError(f"{log}: {text}"))
+
+
+def _labelling_sources(log: Path) -> set[str] | None:
+    """Return the labelling sources of a log; None if it cannot be read at this moment."""
+    with suppress(LogError), LogFile(log) as file:
+        read_definitions(file)
+        topics = [channel.topic for channel in file.channels.values()]
+        parsed = [parse_topic(topic) for topic in topics if topic != DIAGNOSTICS]
+        names = (labelling_source(name) for name in parsed if name is not None)
+        return {name for name in names if name is not None}
+    return None
+
+
+def _decode(batch: list[RawMessages]) -> list[Columns]:
+    columns: list[Columns] = []
+    for raw in batch:
+        if raw.schema is not None and raw.schema.name in FIELDS and len(raw):
+            kind = raw.schema.name
+            if kind not in {message_types.SEGMENT, message_types.GAP}:
+                raw = raw.between(int(np.max(raw.log_times)) - _LATEST, None)  # noqa: PLW2901
+            columns += decode([raw], FIELDS[kind])
+    return columns

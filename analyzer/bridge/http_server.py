@@ -1,4 +1,4 @@
-"""A server of HTTP that clients cannot hold up: a few connections, each with a time to end."""
+"""HTTP server with limits: few connections, each with a deadline."""
 
 import select
 import socket

@@ -15,20 +15,18 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.home_state import MicrophoneState
-from hearthlog.analyzer.bridge.http_server import TEXT, HttpHandler, HttpServer
-from hearthlog.analyzer.bridge.listeners import (
+from hearthlog.analyzer.bridge.home import (
+    RecorderAddress,
     is_of_scenario,
-    microphone_of_listener,
-    scenario_of_listener,
+    source_microphone,
+    source_scenario,
 )
-from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.page_token import figures_token
+from hearthlog.analyzer.bridge.home_state import LiveMicrophone
+from hearthlog.analyzer.bridge.http_server import TEXT, HttpHandler, HttpServer
+from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
-from hearthlog.analyzer.bridge.totals import TOTALS, Total, Totals
-from hearthlog.analyzer.ports import HOST, is_asked_in_digits
+from hearthlog.analyzer.bridge.state import BridgeError, figures_token
+from hearthlog.analyzer.network import HOST, is_asked_in_digits
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import create_file, replaced_file
@@ -59,7 +57,7 @@ class PrometheusOutput:
     def __init__(
         self,
         settings: PrometheusSettings,
-        home: Home,
+        home: RecorderAddress,
         state_folder: Path,
         since: int,
         say: Callable[[str], None],
@@ -188,7 +186,7 @@ class _Handler(HttpHandler):
 class _Figures(Collector):
     """The figures of one moment."""
 
-    def __init__(self, news: News, home: Home, totals: Sequence[Total]) -> None:
+    def __init__(self, news: News, home: RecorderAddress, totals: Sequence[Total]) -> None:
         self._news = news
         self._home = home
         self._totals = totals
@@ -199,7 +197,7 @@ class _Figures(Collector):
         of_home = [total for total in self._totals if not is_of_scenario(total.microphone)]
         yield from _counters("", _LABELS, [((node, *one[:2]), one) for one in of_home])
         of_scenarios = [
-            ((node, microphone_of_listener(name), scenario_of_listener(name), one.label), one)
+            ((node, source_microphone(name), source_scenario(name), one.label), one)
             for one in self._totals
             if is_of_scenario(name := one.microphone)
         ]
@@ -224,7 +222,7 @@ class _Figures(Collector):
         def each(value: Callable[[Any], float]) -> list[tuple[tuple[str, ...], float]]:
             return [((node, microphone.name), value(microphone)) for microphone in microphones]
 
-        def level(microphone: MicrophoneState) -> float:
+        def level(microphone: LiveMicrophone) -> float:
             return microphone.level_dbfs if microphone.is_listening() else math.nan
 
         yield _gauge(

@@ -1,4 +1,4 @@
-"""The table `bridge` of the configuration: what a home is told, and where."""
+"""The table `bridge` of the configuration: outputs, alerts and their delivery."""
 
 import json
 import os
@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -16,10 +17,8 @@ from pydantic import (
 )
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
-from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings, SecretFile
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.ping import is_ping_address
-from hearthlog.analyzer.ports import ip_of
+from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.network import ip_of, is_ping_address
 from hearthlog.recorder.config import (
     BRIDGE,
     MicrophoneSettings,
@@ -30,6 +29,33 @@ from hearthlog.recorder.config import (
 from hearthlog.recorder.config_problems import Origins, configuration_error, key_lines
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.files import read_toml
+
+NO_RECIPIENT = (
+    "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a broker in "
+    "[bridge.mqtt]"
+)
+
+
+def _check_secret_file(value: Any) -> Any:
+    if "://" in str(value):  # a secret, which no message may repeat
+        raise ValueError("names a file; write the address into that file, on a line of its own")
+    return value
+
+
+SecretFile = Annotated[PlainPath, BeforeValidator(_check_secret_file)]
+
+
+class DeliverySettings(BaseModel):
+    """Where alerts go, besides the broker of MQTT."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    urls_file: SecretFile | None = Field(
+        default=None,
+        examples=["/etc/hearthlog/alert-urls"],
+        description="Addresses as Apprise reads them, one a line; they are secrets.",
+    )
+
 
 _MOST_OF_TOPIC = 200  # characters
 _COLLECTED = ".prom"  # ends the names that the textfile collector of node_exporter reads

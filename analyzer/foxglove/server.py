@@ -25,7 +25,7 @@ from foxglove.websocket import (
 )
 
 from hearthlog.analyzer.foxglove.publisher import Playback, Publisher
-from hearthlog.analyzer.ports import hidden_address, host_name, ip_of, is_asked_in_digits
+from hearthlog.analyzer.network import hidden_address, host_name, ip_of, is_asked_in_digits
 from hearthlog.schemas.errors import HearthlogError
 
 # Foxglove in a browser, and the desktop applications, whose pages are files.

@@ -22,8 +22,7 @@ from hearthlog.tools.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.bridge.alerts.ring import Ring
-    from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+    from hearthlog.analyzer.bridge.alerts.rules import AlertRule, Notification
     from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 
@@ -46,13 +45,17 @@ def bridge(
 
     The recorder takes no notice: only its logs are read. What cannot be told is tried again.
     """
-    from hearthlog.analyzer.bridge.alerts.rule_doubts import rule_doubts
-    from hearthlog.analyzer.bridge.home import Home
-    from hearthlog.analyzer.bridge.outputs import exposed_files, needed_modules, open_outputs
-    from hearthlog.analyzer.bridge.run import Bridge
-    from hearthlog.analyzer.bridge.saying import Saying
+    from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts
+    from hearthlog.analyzer.bridge.bridge import (
+        Bridge,
+        ProblemReporter,
+        exposed_files,
+        needed_modules,
+        open_outputs,
+    )
+    from hearthlog.analyzer.bridge.home import RecorderAddress
     from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
-    from hearthlog.analyzer.bridge.state_folder import state_folder
+    from hearthlog.analyzer.bridge.state import state_folder
     from hearthlog.analyzer.extras import require
     from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.pause_schedule import time_zone
@@ -71,8 +74,8 @@ def bridge(
     stop = Event()
     for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(each, lambda *_: stop.set())
-    home = Home(logs or settings.output, settings.node, time_zone(settings.timezone))
-    say = Saying(tell)
+    home = RecorderAddress(logs or settings.output, settings.node, time_zone(settings.timezone))
+    say = ProblemReporter(tell)
     state = state_folder(own.state, home.folder)
     for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
         say(line)
@@ -116,10 +119,11 @@ def replay(
 
     Exit status 3: a log is damaged or unfinished; what could be read was used.
     """
-    from hearthlog.analyzer.bridge.alerts.evaluate import rings
-    from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-    from hearthlog.analyzer.bridge.alerts.rules import history, unknown_class, unknown_microphone
-    from hearthlog.analyzer.bridge.listeners import microphone_of_listener
+    from hearthlog.analyzer.bridge.alerts.activity import read_activity
+    from hearthlog.analyzer.bridge.alerts.evaluation import notifications
+    from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class, unknown_microphone
+    from hearthlog.analyzer.bridge.alerts.rules import history
+    from hearthlog.analyzer.bridge.home import source_microphone
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
@@ -137,9 +141,9 @@ def replay(
     losses = list(home.losses)
     longest = max(history(rule) for rule in own.alert)
     with share_done("reading what was heard") as progress:
-        heard = read_heard(home, settings.node, first - longest, last, losses.append, progress)
-    found = {rule.name: rings(rule, heard, first, last, zone)[0] for rule in own.alert}
-    microphones = {microphone_of_listener(name) for name in heard.coverage}
+        heard = read_activity(home, settings.node, first - longest, last, losses.append, progress)
+    found = {rule.name: notifications(rule, heard, first, last, zone)[0] for rule in own.alert}
+    microphones = {source_microphone(name) for name in heard.coverage}
     for rule in own.alert:
         unheard = unknown_microphone(rule, microphones, recorded=True)
         if text := unheard or unknown_class(rule, heard.classes):
@@ -152,7 +156,7 @@ def replay(
 
 
 def _check_node(home: "HomeLogs", node: str) -> None:
-    from hearthlog.analyzer.bridge.alerts.read_logs import nodes_of
+    from hearthlog.analyzer.bridge.alerts.activity import nodes_of
     from hearthlog.analyzer.errors import DataError
     from hearthlog.schemas.errors import listed
 
@@ -164,7 +168,7 @@ def _check_node(home: "HomeLogs", node: str) -> None:
 
 def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> tuple[int, int]:
     """Return the span that is asked for, within what the logs have."""
-    from hearthlog.analyzer.bridge.alerts.read_logs import span_of
+    from hearthlog.analyzer.bridge.alerts.activity import span_of
 
     begin, until = span_of(home, node)
     first = begin if first is None else first
@@ -183,7 +187,7 @@ def _utc(time: int) -> str:
 
 def _print(
     rules: "Sequence[AlertRule]",
-    found: "dict[str, list[Ring]]",
+    found: "dict[str, list[Notification]]",
     span: tuple[int, int],
     zone: tzinfo,
 ) -> None:
@@ -212,7 +216,7 @@ def _days(weeks: float) -> str:
     return number(round(hours / 24), "day") if hours >= 24 else f"{hours:.1f} hours"
 
 
-def _line(ring: "Ring", zone: tzinfo) -> str:
+def _line(ring: "Notification", zone: tzinfo) -> str:
     told = f" (told at {_local(ring.due, zone)})" if ring.due > ring.time else ""
     return f"{_local(ring.time, zone)}  {ring.rule}: {ring.text}{told}"
 
@@ -223,12 +227,14 @@ def _local(time: int, zone: tzinfo) -> str:
     return f"{local_time(time, zone):%Y-%m-%d %H:%M}"
 
 
-def _unknown(rings: "Sequence[Ring]") -> int:
-    return sum(not ring.is_known for ring in rings)
+def _unknown(notifications: "Sequence[Notification]") -> int:
+    return sum(not ring.is_known for ring in notifications)
 
 
-def _as_json(found: "dict[str, list[Ring]]", span: tuple[int, int], zone: tzinfo) -> dict[str, Any]:
-    from hearthlog.analyzer.bridge.day import iso_time
+def _as_json(
+    found: "dict[str, list[Notification]]", span: tuple[int, int], zone: tzinfo
+) -> dict[str, Any]:
+    from hearthlog.analyzer.bridge.home import iso_time
 
     return {
         "start": iso_time(span[0], zone),

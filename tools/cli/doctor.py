@@ -106,8 +106,8 @@ def _write_bundle(bundle: Path, folder: Path) -> None:
 def _examine_live(
     folder: Path, ping_url: str | None, ping_file: Path | None, *, as_json: bool
 ) -> None:
-    from hearthlog.analyzer.live import examine_live
-    from hearthlog.analyzer.ping import is_ping_address, ping, read_ping_address
+    from hearthlog.analyzer.network import is_ping_address, ping, read_ping_address
+    from hearthlog.analyzer.recorder_status import examine_live
 
     if ping_url is not None and not is_ping_address(ping_url):
         wrong_use("--ping wants an address such as https://hc-ping.com/your-uuid")

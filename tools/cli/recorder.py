@@ -88,9 +88,8 @@ def check(
     others may read its secrets, a file may be a credential of the service, nobody would read a
     text file, or an alert cannot ring.
     """
-    from hearthlog.analyzer.bridge.alerts.rule_doubts import rule_doubts
-    from hearthlog.analyzer.bridge.alerts.unheard_classes import unheard_classes
-    from hearthlog.analyzer.bridge.outputs import exposed_files, output_problems
+    from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts, unheard_classes
+    from hearthlog.analyzer.bridge.bridge import exposed_files, output_problems
     from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
     from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.recording import recording_problems

@@ -1,1 +1,1 @@
-"""Alerts: rules that are evaluated from the log, and the ways on which they are told."""
+"""Alerts: rules that are evaluated from the log, and delivery of their notifications."""

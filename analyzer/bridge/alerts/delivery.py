@@ -1,16 +1,368 @@
-"""Tell targets of rings, each in a thread of its own, again and again with growing pauses."""
+"""Delivery of notifications: the outbox on disk, targets, and repeated attempts."""
 
+import codecs
+import hashlib
+import importlib
+import json
+import logging
+import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import tzinfo
+from difflib import SequenceMatcher
+from pathlib import Path
 from threading import Event as Flag
-from threading import Thread
+from threading import Lock, Thread, get_ident
+from typing import Any, NamedTuple, Protocol
 
-from hearthlog.analyzer.bridge.alerts.outbox import Outbox
-from hearthlog.analyzer.bridge.alerts.ring import Ring
-from hearthlog.analyzer.bridge.alerts.targets import Target
+from hearthlog.analyzer.bridge.alerts.rules import Notification
+from hearthlog.analyzer.bridge.state import BridgeError, secret_path
+from hearthlog.analyzer.extras import remedy
 from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.files import exposed_secret, read_whole
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.new_files import private_folder, replaced_file
+
+MOST = 1000
+UNREAD = "?"  # who is meant by a line that cannot be read, in the place of the name of a target
+_UNREAD_LONGEST = 24 * 3600 * NANOSECONDS  # that a notification waits for such a line to be mended
+_SUFFIX = ".json"
+_LONGEST = 1 << 16  # bytes of a notification
+_DAMAGED = (ValueError, TypeError, KeyError, RecursionError, HearthlogError)
+
+
+@dataclass
+class Waiting:
+    """A notification, and who was told of it."""
+
+    notification: Notification
+    told: set[str] = field(default_factory=set)
+
+
+class Outbox:
+    """Keeps notifications until each target was told; other threads may look into it.
+
+    Parameters
+    ----------
+    most : int, optional
+        Rings, at most: beyond them the oldest are dropped.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made or read.
+    """
+
+    def __init__(
+        self, folder: Path, targets: Sequence[str], say: Callable[[str], None], most: int = MOST
+    ) -> None:
+        self._folder = folder
+        self._targets = frozenset(targets)
+        self._say = say
+        self._most = most
+        self._lock = Lock()
+        self._waiting: dict[str, Waiting] = {}
+        private_folder(folder)
+        for path in sorted(folder.glob(f"*{_SUFFIX}")):
+            self._load(path)
+        self._early = frozenset(self._waiting)  # what was there may be evaluated once more
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def set_targets(self, targets: Iterable[str], now: int) -> None:
+        """Name those who are to be told from now on; what waits for nobody else is removed.
+
+        Parameters
+        ----------
+        targets : iterable of str
+            With `UNREAD` notifications wait for a day, and are there for a target that comes.
+        """
+        with self._lock:
+            self._targets = frozenset(targets)
+            self._remove_done(now)
+
+    def replace_targets(self, former: Mapping[str, str]) -> None:
+        """Take targets for those whose place they have now: they know what those were told."""
+        with self._lock:
+            for waiting in self._waiting.values():
+                told = {now for now, before in former.items() if before in waiting.told}
+                if told - waiting.told:
+                    waiting.told |= told
+                    self._write(waiting)
+
+    def _remove_done(self, now: int) -> None:
+        for name in [n for n, each in self._waiting.items() if self._is_done(each, now)]:
+            self._remove(name)
+
+    def _is_done(self, waiting: Waiting, now: int) -> bool:
+        missing = self._targets - waiting.told
+        is_old = now - waiting.notification.time > _UNREAD_LONGEST
+        return not missing or (is_old and missing == {UNREAD})
+
+    def put(self, notifications: Iterable[Notification]) -> None:
+        """Keep notifications, unless they are known; they are on the disk on return."""
+        with self._lock:
+            self._remove_done(time.time_ns())
+            for notification in notifications:
+                if notification.id not in self._waiting and notification.id not in self._early:
+                    self._waiting[notification.id] = waiting = Waiting(notification)
+                    self._write(waiting)
+            self._drop_oldest()
+
+    def waiting_for(self, target: str, now: int) -> list[Notification]:
+        """Return the notifications of which a target is to be told now, the oldest first."""
+        with self._lock:
+            notifications = [
+                each.notification for each in self._waiting.values() if target not in each.told
+            ]
+        return sorted(
+            (notification for notification in notifications if notification.due <= now),
+            key=lambda notification: notification.time,
+        )
+
+    def note_told(self, target: str, notification: Notification) -> None:
+        """Note that a target was told of a notification, which is removed when all of them were."""
+        with self._lock:
+            waiting = self._waiting.get(notification.id)
+            if waiting is None:
+                return
+            waiting.told.add(target)
+            if waiting.told >= self._targets:
+                self._remove(notification.id)
+            else:
+                self._write(waiting)
+
+    def forget_after(self, time: int) -> None:
+        """Forget the notifications of a time to come, which rang while the clock was ahead."""
+        with self._lock:
+            for name in [n for n, each in self._waiting.items() if each.notification.time > time]:
+                self._remove(name)
+
+    def _drop_oldest(self) -> None:
+        number = len(self._waiting) - self._most
+        if number > 0:
+            for name in sorted(
+                self._waiting, key=lambda each: self._waiting[each].notification.time
+            )[:number]:
+                self._remove(name)
+            self._say(
+                f"{self._folder}: {self._most} alerts wait to be told, and the oldest are dropped; "
+                "see above which target cannot be reached, and mend it, or take it out of urls_file"
+            )
+
+    def _remove(self, name: str) -> None:
+        del self._waiting[name]
+        try:
+            self._path(name).unlink(missing_ok=True)
+        except OSError as error:
+            self._say(f"{self._path(name)}: cannot be removed ({error.strerror}); do so by hand")
+
+    def _write(self, waiting: Waiting) -> None:
+        content = {**waiting.notification._asdict(), "told": sorted(waiting.told)}
+        path = self._path(waiting.notification.id)
+        try:
+            with replaced_file(path) as temporary:
+                temporary.write_text(json.dumps(content), "utf-8")
+        except LogError as error:
+            self._say(f"{error}; until it can, alerts are only kept in memory")
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}{_SUFFIX}"
+
+    def _load(self, path: Path) -> None:
+        try:
+            waiting = _waiting(json.loads(read_whole(path, "alert", _LONGEST, LogError)))
+            if waiting.notification.id != path.name.removesuffix(_SUFFIX):
+                raise ValueError
+        except _DAMAGED:
+            self._say(f"{path}: no alert that was kept here; remove it")
+            return
+        if waiting.told >= self._targets:
+            path.unlink(missing_ok=True)
+        else:
+            self._waiting[waiting.notification.id] = waiting
+
+
+def _waiting(content: Any) -> Waiting:
+    notification = Notification(**{name: content[name] for name in Notification._fields})
+    whole = isinstance(notification.time, int) and isinstance(notification.due, int)
+    if (
+        not whole
+        or not isinstance(notification.rule, str)
+        or not isinstance(notification.text, str)
+    ):
+        raise ValueError
+    return Waiting(notification, {str(name) for name in content["told"]})
+
+
+_LIMIT = 1 << 16  # bytes of the file
+_HOST = re.compile(r"localhost|\[[0-9a-f:.]+\]|[\w-]+(\.[\w-]+)+", re.ASCII | re.IGNORECASE)
+_FORM = "%(thread)d %(message)s"  # other targets are told at the same time
+_CODE = re.compile(r"\berror=(\d{3})\b")
+
+
+class Target(Protocol):
+    """Somebody who is told."""
+
+    @property
+    def name(self) -> str:
+        """What names the target from one start to the next, and gives nothing away."""
+
+    @property
+    def place(self) -> str:
+        """What people call the target; it gives nothing away either."""
+
+    def deliver(self, title: str, text: str) -> str:
+        """Tell; return why it could not be told, or an empty text.
+
+        Parameters
+        ----------
+        title, text : str
+        """
+
+
+class AppriseTarget:
+    """An address of Apprise."""
+
+    def __init__(self, plugin: Any, address: str, line: int) -> None:
+        self._plugin = plugin
+        self.name = _name(address)
+        self.place = f"line {line}, {_scheme_and_host(plugin, address)}"
+
+    def deliver(self, title: str, text: str) -> str:
+        """Tell, within the seconds that the address allows; return why it could not be told."""
+        import apprise  # noqa: PLC0415  takes half a second, and few need it
+
+        with apprise.LogCapture(level=logging.WARNING, fmt=_FORM) as said:
+            done = self._plugin.notify(
+                title=title, body=text, notify_type=apprise.NotifyType.WARNING
+            )
+            if done:
+                return ""
+            lines = said.getvalue().splitlines()
+        return _reason("\n".join(line for line in lines if line.startswith(f"{get_ident()} ")))
+
+
+def _scheme_and_host(plugin: Any, address: str) -> str:
+    scheme, host = address.partition("://")[0], plugin.host or ""
+    # Many services have a token in the place of the host, or a topic, in which there is no dot.
+    is_host = "host" in (plugin.template_tokens or {}) and _HOST.fullmatch(host)
+    # In a password that is not escaped, what follows an @ or precedes a / is taken for a host.
+    is_sure = "@" not in address or (address.count("@") == 1 and f"@{host}" in address)
+    return f"{scheme}://{host}" if is_host and is_sure else scheme
+
+
+def _reason(said: str) -> str:
+    """Say what is known of a failure, without what Apprise says: it has topics and paths in it."""
+    code = _CODE.search(said)
+    if code:
+        return f"error {code[1]}"
+    is_away = "connection error" in said.lower()
+    return "no connection" if is_away else "`apprise -v -b test ADDRESS` says why"
+
+
+class Addresses(NamedTuple):
+    """Addresses of a file, and its problems.
+
+    Attributes
+    ----------
+    problems : list of str
+        Why somebody who was meant cannot be told, a line each, without any address.
+    names : list of str
+        What names the target of each line, whether it can be read or not.
+    """
+
+    targets: list[AppriseTarget]
+    problems: list[str]
+    names: list[str]
+    lacks_package: bool = False
+
+
+def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
+    """Read a file of addresses, one a line; `#` begins a line that is none.
+
+    Raise `BridgeError` if the file cannot be read, a line is no address that Apprise knows, or
+    none is there.
+    """
+    found = find_targets(file, say)
+    if found.problems:
+        raise BridgeError("; ".join(found.problems))
+    return found.targets
+
+
+def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
+    """Read a file of addresses as `read_targets` does, as far as it can be read."""
+    file = secret_path(file)
+    try:
+        importlib.invalidate_caches()  # it may have been installed since the last time
+        import apprise  # noqa: PLC0415
+
+        text = _text(read_whole(file, "file of addresses", _LIMIT, BridgeError))
+    except BridgeError as error:
+        return Addresses([], [str(error)], [])
+    except ModuleNotFoundError as error:
+        problem = f"{error.name} is not installed; {remedy(error.name or '')}"
+        return Addresses([], [problem], [], lacks_package=True)
+    if line := exposed_secret(file):
+        say(line)
+    # Nothing is loaded from the disk, and nothing written there.
+    asset = apprise.AppriseAsset(
+        plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False
+    )
+    asset.app_id = asset.app_desc = "hearthlog"
+    targets: dict[str, AppriseTarget] = {}
+    problems = []
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    for number, address in lines:
+        plugin = _plugin(address, asset)
+        if plugin is None:
+            problems.append(
+                f"{file}, line {number}: no address that Apprise knows; docs/alerts.md has examples"
+            )
+        else:
+            target = AppriseTarget(plugin, address, number)
+            targets.setdefault(target.name, target)
+    if not targets and not problems:
+        problems = [f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic"]
+    return Addresses([*targets.values()], problems, [_name(line) for _, line in lines])
+
+
+def replaced_names(before: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Return which lines of a file of addresses were edited: the name of each now, and before."""
+    matcher = SequenceMatcher(None, before, names, autojunk=False)
+    edited = [
+        pair
+        for kind, i, i_end, j, j_end in matcher.get_opcodes()
+        if kind == "replace"
+        for pair in zip(names[j:j_end], before[i:i_end], strict=False)
+    ]
+    return {now: former for now, former in edited if now not in before and former not in names}
+
+
+def _name(address: str) -> str:
+    return hashlib.sha256(address.encode()).hexdigest()[:16]
+
+
+def _plugin(address: str, asset: Any) -> Any:
+    """Return an address as Apprise reads it; None if it cannot."""
+    import apprise  # noqa: PLC0415
+
+    try:
+        return apprise.Apprise.instantiate(address, asset=asset, suppress_exceptions=True)
+    except Exception:  # noqa: BLE001  hundreds of services, each with its own
+        return None
+
+
+def _text(data: bytes) -> str:
+    """Decode a file as editors write it: UTF-8, or what begins with a mark."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
+    return data.decode("utf-8-sig", "replace")
+
 
 _LOOK_SECONDS = 0.5
 _CLOSE_SECONDS = 2.0
@@ -18,7 +370,7 @@ _LATE = 5 * 60 * NANOSECONDS
 
 
 class Delivery:
-    """Tells each target of the rings that wait for it; none of them waits for another.
+    """Tells each target of the notifications that wait for it; none of them waits for another.
 
     Parameters
     ----------
@@ -81,11 +433,13 @@ class Delivery:
     def _tell(self, target: Target, stop: Flag) -> tuple[int, bool]:
         """Tell a target of all that waits for it; return of how much, and whether it failed."""
         told = 0
-        for ring in self._outbox.waiting_for(target.name, time.time_ns()):
+        for notification in self._outbox.waiting_for(target.name, time.time_ns()):
             if stop.is_set():
                 break
             try:
-                reason = target.deliver(f"{self._node}: {ring.rule}", message(ring, self._zone))
+                reason = target.deliver(
+                    f"{self._node}: {notification.rule}", message(notification, self._zone)
+                )
             except Exception as error:  # noqa: BLE001  hundreds of services, each with its own
                 reason = type(error).__name__
             if reason:
@@ -94,19 +448,19 @@ class Delivery:
                     "again, a quarter of an hour apart at most"
                 )
                 return told, True
-            self._outbox.note_told(target.name, ring)
+            self._outbox.note_told(target.name, notification)
             told += 1
         return told, False
 
 
-def message(ring: Ring, zone: tzinfo, now: int | None = None) -> str:
-    """Write what is told of a ring: when it rang, what was the case, and whether that was long ago.
+def message(notification: Notification, zone: tzinfo, now: int | None = None) -> str:
+    """Write the text of a notification: its time, what was the case, and whether it comes late.
 
     Parameters
     ----------
     now : int, optional
         In nanoseconds of UTC; by default it is now.
     """
-    late = (time.time_ns() if now is None else now) - ring.due > _LATE
-    moment = f"{local_time(ring.time, zone):%Y-%m-%d %H:%M}"
-    return f"{moment}: {ring.text}{' (told late)' if late else ''}"
+    late = (time.time_ns() if now is None else now) - notification.due > _LATE
+    moment = f"{local_time(notification.time, zone):%Y-%m-%d %H:%M}"
+    return f"{moment}: {notification.text}{' (told late)' if late else ''}"

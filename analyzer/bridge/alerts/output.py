@@ -1,41 +1,244 @@
-"""The output of the bridge that evaluates rules, and tells of what rings."""
+"""The output of alerts: evaluates rules live, and keeps their progress between starts."""
 
+import json
 import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import tzinfo
+from functools import cache
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
-from hearthlog.analyzer.bridge.alerts.gathering import Gathered
-from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
-from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
-from hearthlog.analyzer.bridge.alerts.memory import KnownLines, Memory
-from hearthlog.analyzer.bridge.alerts.open_run import Label
-from hearthlog.analyzer.bridge.alerts.outbox import UNREAD, Outbox
-from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
-from hearthlog.analyzer.bridge.alerts.ring import Ring
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule, unknown_class
-from hearthlog.analyzer.bridge.alerts.settings import NO_LISTENER, DeliverySettings
-from hearthlog.analyzer.bridge.alerts.targets import Addresses, find_targets, replaced_names
-from hearthlog.analyzer.bridge.alerts.watch import AHEAD, RuleWatch
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.alerts.activity import HomeActivity, SegmentCollector, read_activity
+from hearthlog.analyzer.bridge.alerts.delivery import (
+    UNREAD,
+    Addresses,
+    Delivery,
+    Outbox,
+    find_targets,
+    message,
+    replaced_names,
+)
+from hearthlog.analyzer.bridge.alerts.evaluation import judged_days, notifications
+from hearthlog.analyzer.bridge.alerts.live_activity import (
+    FIELDS,
+    LiveActivity,
+    LiveLabel,
+    is_of_alerts,
+)
+from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class
+from hearthlog.analyzer.bridge.alerts.rules import (
+    DAY,
+    MINUTE,
+    SECOND,
+    AlertRule,
+    DailyRule,
+    Notification,
+    RuleState,
+    history,
+    live_history,
+)
+from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.secret_files import secret_path
+from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings
+from hearthlog.analyzer.bridge.state import BridgeError, secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.new_files import replaced_file
 
-# Told the name of a rule, a text, and when it rang; returns whether somebody has taken it.
-OnRing = Callable[[str, str, int], bool]
+_LIMIT = 1 << 20  # bytes
+_DAMAGED = (ValueError, TypeError, KeyError, AttributeError, RecursionError, HearthlogError)
+
+
+@dataclass
+class RuleProgress:
+    """How far a rule is evaluated.
+
+    Attributes
+    ----------
+    until : int
+        Log time, in nanoseconds of UTC; 0 for one that is new.
+    """
+
+    until: int = 0
+    state: RuleState = field(default_factory=RuleState)
+
+
+class RuleProgressStore:
+    """Keeps how far each rule is evaluated; one that was changed begins anew."""
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self._path = path
+        self._say = say
+
+    def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleProgress]:
+        """Return how far rules are evaluated, by name."""
+        known = {}
+        try:
+            if self._path.exists():
+                content = json.loads(read_whole(self._path, "memory", _LIMIT, LogError))
+                known = {name: _progress(each) for name, each in content.items()}
+        except _DAMAGED:
+            self._say(f"{self._path}: cannot be read; all rules begin anew")
+        return {rule.name: known.get(rule.fingerprint, RuleProgress()) for rule in rules}
+
+    def save(self, rules: Sequence[AlertRule], progress: dict[str, RuleProgress]) -> None:
+        """Keep how far rules are evaluated; it is on the disk on return."""
+        content = {
+            rule.fingerprint: {"until": own.until, **own.state._asdict()}
+            for rule in rules
+            for own in [progress[rule.name]]
+        }
+        try:
+            with replaced_file(self._path) as temporary:
+                temporary.write_text(json.dumps(content), "utf-8")
+        except LogError as error:
+            self._say(f"{error}; alerts may come twice after the next start")
+
+
+class KnownLines:
+    """Remembers the lines of the file of addresses, by the names of their targets."""
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self._path = path
+        self._say = say
+        self.names: list[str] = []
+        try:
+            if path.exists():
+                content = json.loads(read_whole(path, "memory", _LIMIT, LogError))
+                self.names = [str(name) for name in content]
+        except _DAMAGED:
+            say(f"{path}: cannot be read; whoever is on an edited line may be told twice")
+
+    def keep(self, names: Sequence[str]) -> None:
+        """Remember the lines that there are now."""
+        if names == self.names:
+            return
+        self.names = list(names)
+        try:
+            with replaced_file(self._path) as temporary:
+                temporary.write_text(json.dumps(self.names), "utf-8")
+        except LogError as error:
+            self._say(f"{error}; whoever is on an edited line may be told twice")
+
+
+def _progress(content: dict[str, int]) -> RuleProgress:
+    state = RuleState(int(content["last"]), bool(content["has_rung"]), int(content["since"]))
+    return RuleProgress(int(content["until"]), state)
+
+
+_OLDEST = DAY  # what rang longer ago is not told any more
+_EVERY = SECOND  # of the log
+_SAVE_EVERY = 5 * MINUTE
+AHEAD = 5 * SECOND  # that make a clock one that was set back
+
+
+class RuleWatch:
+    """Evaluates rules, keeps what rings, and remembers how far it is.
+
+    Attributes
+    ----------
+    start : int
+        From when on what was heard has to be known, in nanoseconds of UTC.
+    """
+
+    def __init__(  # noqa: PLR0913, PLR0917
+        self,
+        rules: Sequence[AlertRule],
+        zone: tzinfo,
+        outbox: Outbox,
+        memory: RuleProgressStore,
+        say: Callable[[str], None],
+        now: int,
+    ) -> None:
+        self._rules = rules
+        self._zone = zone
+        self._outbox = outbox
+        self._memory = memory
+        self._say = say
+        self._progress = memory.load(rules)
+        self._saved = now
+        self.set_right(now)
+        self.start = self.needed_from(now)
+
+    def set_right(self, now: int) -> None:
+        """Let rules begin anew that are evaluated up to a time to come, or up to long ago."""
+        is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
+        self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
+        if is_ahead:
+            self._say("alerts: the clock was ahead, and was set back; the rules begin anew")
+            self._outbox.forget_after(now + AHEAD)
+            self.save(now)
+
+    def needed_from(self, now: int) -> int:
+        """Return from when on what was heard has to be known, in nanoseconds of UTC."""
+        return min(
+            (self._progress[rule.name].until - live_history(rule) for rule in self._rules),
+            default=now,
+        )
+
+    def evaluate(
+        self,
+        heard: Callable[[], HomeActivity],
+        weeks: Callable[[int, int], HomeActivity],
+        until: int,
+        now: int,
+    ) -> list[Notification]:
+        """Evaluate the rules up to a time; what rings is on the disk on return.
+
+        Parameters
+        ----------
+        until : int
+            In nanoseconds of UTC: up to then all is known.
+        """
+        self.set_right(now)
+        found: list[Notification] = []
+        heard_once = cache(heard)
+        for rule in self._rules:
+            own = self._progress[rule.name]
+            if until - own.until < _EVERY:
+                continue
+            if isinstance(rule, DailyRule):
+                if not judged_days(rule, own.until, until, self._zone):
+                    own.until = until
+                    continue
+                what = weeks(until - history(rule), until)
+            else:
+                what = heard_once()
+            rang, state = notifications(rule, what, own.until, until, self._zone, own.state)
+            self._progress[rule.name] = RuleProgress(until, state)
+            found += rang
+        self._outbox.put(found)
+        if found or now - self._saved >= _SAVE_EVERY:
+            self.save(now)
+        return found
+
+    def save(self, now: int) -> None:
+        """Remember how far the rules are evaluated."""
+        self._memory.save(self._rules, self._progress)
+        self._saved = now
+
+
+def _as_of(own: RuleProgress, now: int) -> RuleProgress:
+    if own.until > now + AHEAD or not own.until:
+        return RuleProgress(now, RuleState(since=now))
+    if own.until < now - _OLDEST:
+        return RuleProgress(now - _OLDEST, own.state._replace(has_rung=False))
+    return own
+
+
+# Takes the name of a rule, a text and a time; returns whether somebody has taken them.
+OnNotification = Callable[[str, str, int], bool]
 BROKER = "mqtt"  # in the place of the name of a target
 _PATIENCE = 30 * NANOSECONDS
 _TO_COME = 60 * NANOSECONDS  # from now: what is later was written while a clock was ahead
@@ -48,14 +251,13 @@ _WAIT_SECONDS = 60.0  # for news, where there is no recorder
 
 
 class AlertsOutput:
-    """Evaluates rules in a thread of its own, and has everybody told of what rings.
+    """Evaluates rules in a thread of its own, and delivers their notifications.
 
     Parameters
     ----------
-    on_ring : callable, optional
-        Told the name of the rule, the text and the time (nanoseconds of UTC) of each ring, in the
-        thread of `update`; told the same at each update, and nothing else, until it returns that
-        somebody has taken it.
+    on_notification : callable, optional
+        Called with rule, text and time (nanoseconds of UTC) of a notification, in the thread of
+        `update`; with the same one at each update until it returns that it was taken.
 
     Raises
     ------
@@ -67,18 +269,18 @@ class AlertsOutput:
         self,
         rules: Sequence[AlertRule],
         delivery: DeliverySettings,
-        home: Home,
+        home: RecorderAddress,
         state_folder: Path,
         say: Callable[[str], None],
-        on_ring: OnRing | None = None,
+        on_notification: OnNotification | None = None,
     ) -> None:
         self._file = delivery.urls_file
-        if self._file is None and on_ring is None:
-            raise BridgeError(NO_LISTENER)
+        if self._file is None and on_notification is None:
+            raise BridgeError(NO_RECIPIENT)
         self._rules = rules
         self._followed = home
         self._say = say
-        self._on_ring = on_ring
+        self._on_notification = on_notification
         folder = state_folder / "alerts"
         self._has_problems = False
         self._read_file, self._looked_at_file = object(), -math.inf  # and when, CLOCK_MONOTONIC
@@ -87,14 +289,14 @@ class AlertsOutput:
         except OSError as error:
             raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
         self._lines = KnownLines(folder / "lines.json", say)
-        memory = Memory(folder / "rules.json", say)
+        memory = RuleProgressStore(folder / "rules.json", say)
         now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
-        self._heard = LiveHome(self._watch.start, _PATIENCE)
+        self._heard = LiveActivity(self._watch.start, _PATIENCE)
         self._began = time.monotonic()
         self._has_news = Flag()  # what is heard now is known
-        self._labels: deque[tuple[str, Label, Sequence[str]]] = deque(maxlen=_LABELS)
-        self._told_now: tuple[Ring, str] | None = None  # of which the broker is told
+        self._labels: deque[tuple[str, LiveLabel, Sequence[str]]] = deque(maxlen=_LABELS)
+        self._told_now: tuple[Notification, str] | None = None  # of which the broker is told
         self._stop = Flag()
         self._delivery = Delivery(self._outbox, [], home.node, home.zone, say)
         self._find_targets()
@@ -105,11 +307,11 @@ class AlertsOutput:
         """Note what is heard now, and tell the broker of what rang."""
         for microphone in news.state.every():
             if microphone.label:
-                label = Label(microphone.heard.time, microphone.label, microphone.confidence)
+                label = LiveLabel(microphone.heard.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))
         self._has_news.set()
-        if self._on_ring is not None:
-            while self._tell_broker(self._on_ring):
+        if self._on_notification is not None:
+            while self._tell_broker(self._on_notification):
                 pass
 
     def close(self) -> None:
@@ -118,18 +320,18 @@ class AlertsOutput:
         self._thread.join(_CLOSE_SECONDS)
         self._delivery.close()
 
-    def _tell_broker(self, on_ring: OnRing) -> bool:
-        """Tell of one ring, the same one until it is taken; return whether it was."""
+    def _tell_broker(self, on_notification: OnNotification) -> bool:
+        """Tell of one notification, the same one until it is taken; return whether it was."""
         if self._told_now is None:
             waiting = self._outbox.waiting_for(BROKER, time.time_ns())
             if not waiting:
                 return False
             # Written once: minutes later it would say that it is late, and be another message.
             self._told_now = waiting[0], message(waiting[0], self._followed.zone)
-        ring, text = self._told_now
-        is_taken = on_ring(ring.rule, text, ring.time)
+        notification, text = self._told_now
+        is_taken = on_notification(notification.rule, text, notification.time)
         if is_taken:
-            self._outbox.note_told(BROKER, ring)
+            self._outbox.note_told(BROKER, notification)
             self._told_now = None
         return is_taken
 
@@ -167,7 +369,7 @@ class AlertsOutput:
             self._outbox.replace_targets(replaced_names(self._lines.names, names))
             self._lines.keep(names)
         told = [target.name for target in targets] + [UNREAD] * bool(problems)
-        told += [BROKER] * (self._on_ring is not None)
+        told += [BROKER] * (self._on_notification is not None)
         self._outbox.set_targets(told, time.time_ns())
         self._delivery.set_targets(targets)
 
@@ -180,7 +382,7 @@ class AlertsOutput:
         now = self._latest = time.time_ns()
         self._watch.set_right(now)
         start = self._watch.needed_from(now)
-        self._heard = LiveHome(start, _PATIENCE)
+        self._heard = LiveActivity(start, _PATIENCE)
         while not logs.is_dir():
             self._find_targets()
             self._look()
@@ -237,7 +439,7 @@ class AlertsOutput:
         self._latest = max(self._latest, now)
         return now
 
-    def _weeks(self, start: int, end: int) -> HomeHeard:
+    def _weeks(self, start: int, end: int) -> HomeActivity:
         """Read weeks from the logs, once a day; what cannot be read was not heard.
 
         A night that is still quiet in the morning has no segment yet.
@@ -246,9 +448,9 @@ class AlertsOutput:
         try:
             logs = find_home_logs([home.folder])
         except LogError:  # there is none yet
-            return Gathered().heard()
+            return SegmentCollector().heard()
         open_segments = self._heard.open_segments()
-        return read_heard(logs, home.node, start, end, lambda _: None, others=open_segments)
+        return read_activity(logs, home.node, start, end, lambda _: None, others=open_segments)
 
     def _damaged(self, error: LogError) -> None:
         self._say(f"alerts: {error}")

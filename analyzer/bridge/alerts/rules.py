@@ -1,22 +1,54 @@
-"""The rules of alerts: each a table `[[bridge.alert]]` of the configuration."""
+"""Rules of alerts and their durations, with the notifications that rules give."""
 
 import hashlib
 import re
-from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_duration
-from hearthlog.analyzer.bridge.listeners import microphone_of_listener
+from hearthlog.analyzer.bridge.events import ANY_SOUND
 from hearthlog.analyzer.routine.day_anomaly import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
-from hearthlog.models.classifiers.names import AUDIOSET
-from hearthlog.models.embedding.sound_names import audioset_names
 from hearthlog.recorder.pause_schedule import QuietHours, check_quiet_hours, quiet_hours
-from hearthlog.schemas.errors import HearthlogError, listed
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import NANOSECONDS
 
-ANY_SOUND = ""  # in place of a class: whatever is not silence
+SECOND = NANOSECONDS
+MINUTE, HOUR, DAY = 60 * SECOND, 3600 * SECOND, 86_400 * SECOND
+_UNITS = {"d": DAY, "h": HOUR, "m": MINUTE, "s": SECOND}
+_WORDS = {"d": "d", "h": "h", "m": "min", "s": "s"}
+_FORM = re.compile(r"(?:(\d{1,3})d)?(?:(\d{1,4})h)?(?:(\d{1,5})m)?(?:(\d{1,6})s)?")
+
+
+def read_duration(text: object) -> int:
+    """Read a duration, in nanoseconds.
+
+    Raise `ValueError` if it is written otherwise.
+    """
+    found = _FORM.fullmatch(text) if isinstance(text, str) else None
+    if found is None or not any(found.groups()):
+        raise ValueError(f"{str(text)[:64]!r} is no duration; write it as 90s, 20m, 1h30m or 7d")
+    counts = zip(_UNITS.values(), found.groups(), strict=True)
+    return sum(unit * int(count) for unit, count in counts if count)
+
+
+def duration_words(nanoseconds: int) -> str:
+    """Write a duration: `1 h 30 min`.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Whole seconds.
+    """
+    parts = []
+    rest = nanoseconds
+    for key, unit in _UNITS.items():
+        count, rest = divmod(rest, unit)
+        if count:
+            parts.append(f"{count} {_WORDS[key]}")
+    return " ".join(parts) or "0 s"
+
+
 _LONGEST_WINDOW = 7 * DAY
 LONGEST_PAUSE = 10 * MINUTE  # within an event
 _MARGIN = 5 * MINUTE
@@ -81,7 +113,7 @@ class _Rule(BaseModel):
     urgent: bool = Field(default=False, description="Whether it rings in quiet hours, too.")
 
     def hours(self) -> list[QuietHours]:
-        """Return the quiet hours in which a ring waits."""
+        """Return the quiet hours in which a notification waits."""
         return [] if self.urgent else [quiet_hours(text) for text in self.quiet_hours]
 
     @property
@@ -248,65 +280,6 @@ def history(rule: AlertRule) -> int:
     return _TWO_DAYS if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN
 
 
-def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> str:
-    """Say that no model knows the class of a rule; empty if one does, or if nothing is known."""
-    if not isinstance(rule, _SoundRule) or rule.label == ANY_SOUND:
-        return ""
-    own = [
-        names
-        for name, names in classes.items()
-        if rule.microphone in {"", microphone_of_listener(name)}
-    ]
-    if not own or any(rule.label in names for names in own):
-        return ""
-    there = listed(sorted(set().union(*own) - {SILENCE}), "and")
-    return (
-        f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard; "
-        f"there are {there}{_of_network(rule.label)}"
-    )
-
-
-def _of_network(label: str) -> str:
-    """Say what the names of the network of sounds have of a class; empty if they have it not."""
-    name = next((each for each in audioset_names() if each.name == label), None)
-    if name is None:
-        return ""
-    if name.is_event:
-        return f'; scenarios = {{{AUDIOSET} = "{AUDIOSET}"}} brings it, with a network of sounds'
-    return "; a network of sounds has a name for it, which is a hint alone: it is not counted"
-
-
-def unknown_microphone(
-    rule: AlertRule, microphones: Collection[str], *, recorded: bool = False
-) -> str:
-    """Say that there is no microphone of the name that a rule has; empty if there is.
-
-    Parameters
-    ----------
-    recorded : bool, optional
-        Whether these are the ones that logs have something of, not those that are configured.
-    """
-    name = rule.microphone if isinstance(rule, _SoundRule) else ""
-    if not microphones or name in {"", *microphones}:
-        return ""
-    lacks = (
-        f"nothing of the microphone {name!r} was recorded in this time"
-        if recorded
-        else f"there is no microphone {name!r}, so that it hears nothing"
-    )
-    return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
-
-
-def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
-    """Say that nothing labels what the microphone of a rule hears; empty if something does."""
-    if not isinstance(rule, _SoundRule) or rule.microphone not in microphones:
-        return ""
-    return (
-        f"{rule.name}: the microphone {rule.microphone!r} has no model, so that no sound of it has "
-        "a class"
-    )
-
-
 def live_history(rule: AlertRule) -> int:
     """Return how long before a time a rule needs what is followed, and not read from the logs.
 
@@ -316,3 +289,63 @@ def live_history(rule: AlertRule) -> int:
         Nanoseconds. Of weeks, the day that is judged: a silence may have gone on since it began.
     """
     return _TWO_DAYS if isinstance(rule, DailyRule) else history(rule)
+
+
+_NEVER = -(1 << 62)
+
+
+class Notification(NamedTuple):
+    """Notification by a rule.
+
+    Attributes
+    ----------
+    time : int
+        When it rang, by the time of the log, in nanoseconds of UTC.
+    due : int
+        From when on it is told: the time, or the end of quiet hours.
+    """
+
+    rule: str
+    time: int
+    text: str
+    is_known: bool
+    due: int
+
+    @property
+    def id(self) -> str:
+        """Identifier of the notification: the same in every evaluation."""
+        return f"{self.time}-{hashlib.sha256(self.rule.encode()).hexdigest()[:12]}"
+
+
+class RuleState(NamedTuple):
+    """What a rule remembers.
+
+    Attributes
+    ----------
+    last : int
+        When it rang last, in nanoseconds of UTC.
+    since : int
+        From when on it is in force, in nanoseconds of UTC: of the time before nobody knows whether
+        there was a recorder.
+    """
+
+    last: int = _NEVER
+    has_rung: bool = False
+    since: int = _NEVER
+
+
+class Condition(NamedTuple):
+    """A span of time in which what a rule looks for is the case.
+
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC; the end is not part of it.
+    text : str
+        In words; empty where they depend on when it rings.
+    """
+
+    start: int
+    end: int
+    text: str = ""
+    is_known: bool = True

@@ -1,1 +1,1 @@
-"""What is heard, for a broker of MQTT and for Home Assistant."""
+"""Output to a broker of MQTT, and to Home Assistant."""

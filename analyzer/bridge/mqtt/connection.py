@@ -1,4 +1,4 @@
-"""A connection to a broker that may come and go: what it has to say is said again, or in time."""
+"""Connection to a broker that may be away: values are repeated, events expire."""
 
 import math
 import ssl
@@ -15,9 +15,8 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.analyzer.bridge.state import BridgeError, secret_path
 from hearthlog.schemas.files import read_whole
 
 _KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead

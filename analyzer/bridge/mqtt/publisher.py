@@ -1,4 +1,4 @@
-"""What is heard, said to a broker."""
+"""Publisher of states and events to a broker."""
 
 import json
 import math
@@ -12,21 +12,18 @@ from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.bridge.day import iso_time
-from hearthlog.analyzer.bridge.event_record import Event
-from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
-from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.home_state import HomeState, Known, MicrophoneState
-from hearthlog.analyzer.bridge.mqtt.announced import Announced
+from hearthlog.analyzer.bridge.events import ANY_SOUND, SoundEvent
+from hearthlog.analyzer.bridge.home import RecorderAddress, iso_time
+from hearthlog.analyzer.bridge.home_state import EnoughHeard, HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
-from hearthlog.analyzer.bridge.mqtt.discovery import (
+from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
     described,
     device_id,
     discovery,
     home_id,
 )
-from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, Topics
+from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.models.classes import SILENCE, UNKNOWN
@@ -35,7 +32,7 @@ from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.logs.files import log_name, walk_logs
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.bridge.mqtt.commands import Answer, Commands
+    from hearthlog.analyzer.bridge.commands import Answer, Commands
 
 _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
@@ -56,7 +53,11 @@ class MqttPublisher:
     """
 
     def __init__(
-        self, settings: MqttSettings, home: Home, state_folder: Path, say: Callable[[str], None]
+        self,
+        settings: MqttSettings,
+        home: RecorderAddress,
+        state_folder: Path,
+        say: Callable[[str], None],
     ) -> None:
         self._settings = settings
         self._home = home
@@ -65,14 +66,14 @@ class MqttPublisher:
         # Those that there are switches of, and those of which no more.
         self._switches: tuple[list[str], list[str]] | None = None
         # Events that were not told of yet.
-        self._begun: deque[Event] = deque(maxlen=_MOST_BEGUN)
-        self._ended: deque[Event] = deque(maxlen=_MOST_BEGUN)
+        self._begun: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
+        self._ended: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
         self._is_born = False
         subscriptions = [self._birth_topic] if settings.home_assistant else []
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
         self._say = say
-        self._announced = Announced(
+        self._announced = RetainedTopics(
             state_folder, home.node, place_of(settings), partial(_is_renamed, home), say
         )
         self._forgotten: set[str] = set()  # topics that the broker is just told to forget
@@ -146,13 +147,13 @@ class MqttPublisher:
                 place = Place("last_event", event.microphone)
                 self._keep(place, json.dumps(event_fields(event, news)))
 
-    def _recent(self, waiting: deque[Event], news: News) -> list[Event]:
+    def _recent(self, waiting: deque[SoundEvent], news: News) -> list[SoundEvent]:
         """Take the events that waited for a broker, but for those that are no news any more."""
         recent = [event for event in waiting if news.today.now - event.end <= RECENT]
         waiting.clear()
         return recent
 
-    def _send_events(self, kind: str, events: Sequence[Event], news: News) -> None:
+    def _send_events(self, kind: str, events: Sequence[SoundEvent], news: News) -> None:
         for event in (each for each in events if self._announced.is_told(each.label)):
             topic = self._topics.of_microphone(event.microphone, kind)
             self._connection.send(topic, json.dumps(event_fields(event, news)))
@@ -178,7 +179,7 @@ class MqttPublisher:
 
     def _take_commands(self) -> "Commands":
         # Imported here: who commands nothing needs nothing that corrects logs.
-        from hearthlog.analyzer.bridge.mqtt.commands import Commands  # noqa: PLC0415
+        from hearthlog.analyzer.bridge.commands import Commands  # noqa: PLC0415
 
         home = self._home
         return Commands(home.folder, home.node, self._announced.switch, self._answers.append)
@@ -265,7 +266,7 @@ class MqttPublisher:
         self._forgotten.discard(topic)
         self._connection.keep(topic, value)
 
-    def _describe(self, microphone: MicrophoneState) -> None:
+    def _describe(self, microphone: LiveMicrophone) -> None:
         """Tell Home Assistant of the classes of a microphone, before the first value of one."""
         name, classes = microphone.name, microphone.classes
         self._classes[name] = list(classes)
@@ -311,7 +312,7 @@ class MqttPublisher:
         classes = self._classes.get(microphone)
         return bool(label) and classes is not None and label not in classes
 
-    def _say_state(self, microphone: MicrophoneState, news: News) -> None:
+    def _say_state(self, microphone: LiveMicrophone, news: News) -> None:
         def say(kind: str, value: str) -> None:
             self._keep(Place(kind, microphone.name), value)
 
@@ -333,7 +334,7 @@ class MqttPublisher:
                 shown = value if is_told or kind != "on" else _ON[False]
                 self._keep(Place(kind, microphone.name, label), shown)
 
-    def _say_problem(self, microphone: MicrophoneState, state: HomeState) -> None:
+    def _say_problem(self, microphone: LiveMicrophone, state: HomeState) -> None:
         others = state.microphones.keys() - {microphone.name}
         bad = [
             f"{subject}: {health.text}"
@@ -345,7 +346,7 @@ class MqttPublisher:
 
 
 def class_values(
-    microphone: MicrophoneState, label: str, news: News, known: Known
+    microphone: LiveMicrophone, label: str, news: News, known: EnoughHeard
 ) -> Iterator[tuple[str, str]]:
     """Yield what the broker keeps of a class: the kind of topic, and its value.
 
@@ -363,7 +364,7 @@ def class_values(
         yield "last_heard", iso_time(last.end, news.zone)
 
 
-def event_fields(event: Event, news: News) -> dict[str, str | float]:
+def event_fields(event: SoundEvent, news: News) -> dict[str, str | float]:
     """Describe an event for JSON."""
     return {
         "event_type": event.label,
@@ -375,7 +376,7 @@ def event_fields(event: Event, news: News) -> dict[str, str | float]:
     }
 
 
-def _is_renamed(home: Home, former: str, *, is_first: bool) -> bool:
+def _is_renamed(home: RecorderAddress, former: str, *, is_first: bool) -> bool:
     """Return whether another recorder of the folder has the name of this one now.
 
     It wrote logs here, does not record, and this recorder wrote none of its logs while the other

@@ -1,33 +1,395 @@
-"""The page of the home, made of what the bridge knows, once a second where something changed."""
+"""The page of the home: its parts as JSON, updated once a second."""
 
 import json
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import tzinfo
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.event_record import Event
-from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.commands import EventCorrections
+from hearthlog.analyzer.bridge.events import ANY_SOUND, HOLD_SECONDS, SoundEvent
+from hearthlog.analyzer.bridge.home import (
+    RecorderAddress,
+    Today,
+    class_words,
+    clock,
+    length,
+    long_date,
+    reason,
+    room,
+    source_microphone,
+    source_scenario,
+    sureness,
+    times,
+    told,
+    when,
+)
+from hearthlog.analyzer.bridge.home_state import EnoughHeard, HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.admission import PageAdmission
-from hearthlog.analyzer.bridge.page.board import Board
-from hearthlog.analyzer.bridge.page.day_picture import BIN, day_picture
-from hearthlog.analyzer.bridge.page.event_list import last_events
-from hearthlog.analyzer.bridge.page.health_list import health_list
-from hearthlog.analyzer.bridge.page.now_heard import NowHeard
-from hearthlog.analyzer.bridge.page.page_token import cookie_key, keep_address, page_token
-from hearthlog.analyzer.bridge.page.recurring import Recurring
-from hearthlog.analyzer.bridge.page.recurring_list import Moment
-from hearthlog.analyzer.bridge.page.said import Said
-from hearthlog.analyzer.bridge.page.scenario_lines import scenario_lines
-from hearthlog.analyzer.bridge.page.server import PageServer
-from hearthlog.analyzer.bridge.page.words import clock, room
+from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
+from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
 from hearthlog.analyzer.bridge.settings import PageSettings
-from hearthlog.analyzer.ports import ip_of
+from hearthlog.analyzer.bridge.state import BridgeError, cookie_key, keep_address, page_token
+from hearthlog.analyzer.colours import colour_on_paper
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+from hearthlog.analyzer.network import ip_of
+from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.recorder.host import writes_to_journal
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, listed
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import is_sound
+
+_QUIETEST = -80.0  # dBFS, the left end of the bar
+_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # behind the end of a segment
+_NOT_LISTENING = "Not listening"
+
+
+class _Heard(NamedTuple):
+    words: str
+    since: int  # in nanoseconds of UTC; 0: not known
+
+
+class CurrentSounds:
+    """Says what each microphone hears, and remembers since when."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, _Heard] = {}
+
+    def describe(self, news: News) -> Any:
+        """Describe what is heard for JSON."""
+        microphones = news.state.present()
+        return {
+            "is_recording": news.state.is_recording(),
+            "rooms": [
+                self._room(each, news, is_alone=len(microphones) == 1) for each in microphones
+            ],
+        }
+
+    def _room(self, microphone: LiveMicrophone, news: News, *, is_alone: bool) -> Any:
+        words = _sentence(microphone)
+        last = self._last.get(microphone.name)
+        if last is None or last.words != words:
+            since = _known_since(microphone) or (news.today.now if last is not None else 0)
+            last = self._last[microphone.name] = _Heard(words, since)
+        shown = f"since {when(last.since, news.today.now, news.zone)}" if last.since else ""
+        health = news.state.health.get(microphone.name)
+        is_listening = microphone.is_listening()
+        return {
+            "room": "" if is_alone else room(microphone.name),
+            "words": words,
+            "since": shown,
+            "why": reason(told(health.text)) if health is not None and not is_listening else "",
+            "level": _level(microphone) if is_listening else None,
+        }
+
+
+def _sentence(microphone: LiveMicrophone) -> str:
+    if not microphone.is_listening():
+        return _NOT_LISTENING
+    names = [class_words(label) for label in heard_classes(microphone)]
+    if names:
+        return listed([names[0], *map(str.lower, names[1:])], "and")
+    return "A sound" if microphone.heard.is_heard(ANY_SOUND) else in_words(SILENCE)
+
+
+def heard_classes(microphone: LiveMicrophone) -> list[str]:
+    """Return the classes of sound that are heard now, in the order of the model."""
+    return [
+        label
+        for label in microphone.classes
+        if is_sound(label) and microphone.heard.is_heard(label)
+    ]
+
+
+def _known_since(microphone: LiveMicrophone) -> int:
+    """Return since when it has been so, as far as the log says; 0 if it does not."""
+    if not microphone.is_listening():
+        return microphone.heard.time
+    heard = heard_classes(microphone)
+    if heard:
+        last = [microphone.last_event(label) for label in heard]
+        end = microphone.heard.time - _GOES_ON
+        going = [event.start for event in last if event is not None and event.end >= end]
+        return max(going) if len(going) == len(heard) else 0
+    return max((event.end for event in _last_events(microphone)), default=0)
+
+
+def _last_events(microphone: LiveMicrophone) -> Iterator[SoundEvent]:
+    for label in microphone.labels():
+        event = microphone.last_event(label)
+        if event is not None:
+            yield event
+
+
+def _level(microphone: LiveMicrophone) -> Any:
+    """Return the level as a share of the bar and in words; None where it is not known."""
+    level = microphone.level_dbfs
+    if not math.isfinite(level):
+        return None
+    return min(max(round(1 - level / _QUIETEST, 2), 0.0), 1.0), f"{level:.0f} dB".replace(
+        "-", "\N{MINUS SIGN}"
+    )
+
+
+_SHOWN = 20
+_DAY = 24 * 3600 * NANOSECONDS
+
+
+class LastEvents(NamedTuple):
+    """The last events: themselves, by their ids, and what is shown of them."""
+
+    events: dict[str, SoundEvent]
+    shown: Any
+
+
+def last_events(news: News, said_of: Callable[[SoundEvent], str]) -> LastEvents:
+    """Find the last events, and describe them for JSON.
+
+    Parameters
+    ----------
+    said_of : callable
+        Returns what people said that an event was, in words; empty for nothing.
+    """
+    microphones = news.state.microphones.values()
+    found: list[SoundEvent] = []
+    for microphone in microphones:
+        for label in microphone.labels():
+            found += microphone.events(label, news.today.midnight - _DAY)[-_SHOWN:]
+    found = sorted(found, key=lambda event: (event.start, event.id), reverse=True)[:_SHOWN]
+    names = dict.fromkeys(
+        label for each in microphones for label in [*each.classes, *each.labels()]
+    )
+    shown = {
+        "events": [
+            _described(event, news, said_of(event), is_alone=len(microphones) == 1)
+            for event in found
+        ],
+        "classes": [(label, class_words(label)) for label in names if is_sound(label)],
+    }
+    return LastEvents({event.id: event for event in found}, shown)
+
+
+def _described(event: SoundEvent, news: News, said: str, *, is_alone: bool) -> Any:
+    return {
+        "id": event.id,
+        "label": event.label,
+        "words": class_words(event.label),
+        "colour": colour_on_paper(event.label),
+        "time": when(event.start, news.today.now, news.zone, seconds=True),
+        "length": length(event.seconds),
+        "sure": sureness(event.confidence),
+        "room": "" if is_alone else room(event.microphone),
+        "said": said,
+    }
+
+
+_WELL, _WARNING, _WRONG = 0, 1, 2  # as in diagnostics
+_THINGS = {"disk": "Disk", "machine": "Clock and computer"}
+
+
+class HealthLine(NamedTuple):
+    """How one thing is: a level from 0, for well, to 2; and a text."""
+
+    what: str
+    level: int
+    text: str
+
+
+def health_list(news: News, node: str, started: int, recurring: str = "") -> list[Any]:
+    """Say how everything is, for JSON.
+
+    Parameters
+    ----------
+    started : int
+        When the bridge was started, in nanoseconds of UTC.
+    """
+    lines = [*_lines(news, node, started)]
+    if recurring:
+        lines.append(HealthLine("Sounds that recur", _WARNING, recurring))
+    return [line._asdict() for line in lines]
+
+
+def _lines(news: News, node: str, started: int) -> Iterator[HealthLine]:
+    state = news.state
+    for microphone in state.present():
+        yield _of_microphone(microphone, state)
+    is_recording = state.is_recording()
+    yield HealthLine(
+        "Recorder",
+        _WELL if is_recording else _WRONG,
+        "recording" if is_recording else "nothing has been written for more than 15 seconds",
+    )
+    for subject, health in sorted(state.health.items()):
+        if subject not in state.microphones:
+            yield HealthLine(_thing(subject, node), min(health.level, _WRONG), told(health.text))
+    yield HealthLine(
+        "Bridge", _WELL, f"follows the recorder since {when(started, news.today.now, news.zone)}"
+    )
+
+
+def _of_microphone(microphone: LiveMicrophone, state: HomeState) -> HealthLine:
+    health = state.health.get(microphone.name)
+    text, level = ("", _WELL) if health is None else (told(health.text), health.level)
+    is_alone = len(state.present()) == 1
+    what = "Microphone" if is_alone else f"Microphone, {room(microphone.name)}"
+    if not microphone.is_listening():
+        why = reason(text)
+        return HealthLine(what, _WRONG, f"not listening: {why}" if why else "not listening")
+    return HealthLine(what, min(level, _WRONG), f"listening: {text}" if level else "listening")
+
+
+def _thing(subject: str, node: str) -> str:
+    whose, _, part = subject.partition(" ")
+    if whose == node and part in _THINGS:
+        return _THINGS[part]
+    return told(subject.replace("_", " ")).capitalize()
+
+
+def scenario_lines(news: News) -> list[Any]:
+    """Describe each scenario of each microphone for JSON, in a line."""
+    state, midnight = news.state, news.today.midnight
+    lines = []
+    for name in sorted(state.scenarios):
+        own = state.scenarios[name]
+        today = _today(own, midnight)
+        if own.is_listening() or today:
+            where = [room(source_microphone(name))] if len(state.microphones) > 1 else []
+            what = " · ".join([room(source_scenario(name)), *where])
+            lines.append({"what": what, "about": f"Now {_now(own)}. Today {today or 'nothing'}."})
+    return lines
+
+
+def _now(own: LiveMicrophone) -> str:
+    if not own.is_listening():
+        return "not listening"
+    return listed([class_words(label).lower() for label in heard_classes(own)], "and") or "nothing"
+
+
+def _today(own: LiveMicrophone, midnight: int) -> str:
+    """Say how often, and for how long, each class was heard; of the longest first."""
+    events = {label: own.events(label, midnight) for label in own.labels()}
+    seconds = {label: sum(each.seconds for each in same) for label, same in events.items() if same}
+    return ", ".join(
+        f"{class_words(label).lower()} {times(len(events[label]))} ({length(seconds[label])})"
+        for label in sorted(seconds, key=lambda label: -seconds[label])
+    )
+
+
+BIN = 120 * NANOSECONDS  # as wide as in the picture of the report
+_HOUR = 3600 * NANOSECONDS
+_LEAST = 3  # of nine: what is short has to be seen
+_SILENT = 60 * NANOSECONDS  # without a label: shorter is not seen
+_DIGITS = 4  # of a place in the day, which is from 0 to 1
+
+
+class DaySpan(NamedTuple):
+    """A day of a home, from midnight to midnight, in nanoseconds of UTC."""
+
+    start: int
+    end: int
+    zone: tzinfo
+
+    def place(self, time: int) -> float:
+        """Return where in the day a time is, from 0 to 1."""
+        inside = min(max(time, self.start), self.end)
+        return round((inside - self.start) / (self.end - self.start), _DIGITS)
+
+
+def day_picture(microphones: Iterable[LiveMicrophone], today: Today, zone: tzinfo) -> Any:
+    """Describe the picture of a day for JSON."""
+    date = local_time(today.midnight, zone).date()
+    day = DaySpan(*day_span(date, zone), zone)
+    hours = range(day.start, day.end, _HOUR)
+    nights = [
+        (day.start, at_hour(date, MORNING, zone)),
+        (at_hour(date, EVENING, zone), day.end),
+    ]
+    return {
+        "title": long_date(today.now, zone),
+        "now": day.place(today.now - today.now % BIN),
+        "hours": [(day.place(hour), local_time(hour, zone).hour) for hour in hours],
+        "nights": [(day.place(start), day.place(end)) for start, end in nights],
+        "rooms": [_room(microphone, day, today) for microphone in microphones],
+    }
+
+
+def _room(microphone: LiveMicrophone, day: DaySpan, today: Today) -> Any:
+    known = microphone.known_of(today)
+    return {
+        "room": room(microphone.name),
+        "gaps": [(day.place(a), day.place(b)) for a, b in _unheard(microphone, day, today)],
+        "lanes": [
+            _lane(microphone, label, day, today, known)
+            for label in dict.fromkeys([*microphone.classes, *microphone.labels()])
+            if label != SILENCE
+        ],
+    }
+
+
+def _lane(
+    microphone: LiveMicrophone, label: str, day: DaySpan, today: Today, known: EnoughHeard
+) -> Any:
+    count, night = microphone.counts(label, today, known)
+    last = microphone.last_event(label)
+    last_heard = "" if last is None else when(last.end, today.now, day.zone)
+    words = class_words(label)
+    how_often = "not known" if count is None else times(count)
+    told = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
+    events = microphone.events(label, day.start - 24 * _HOUR)
+    return {
+        "words": words,
+        "colour": colour_on_paper(label),
+        "bars": bars((event for event in events if event.end > day.start), day),
+        "told": told,
+        "today": count,
+        "night": night,
+        "last": last_heard,
+    }
+
+
+def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
+    """Return how much of each two minutes of a day events fill: a digit each, 9 for all of it.
+
+    Returns
+    -------
+    str
+        Empty where there is none.
+    """
+    filled = [0] * -(-(day.end - day.start) // BIN)
+    for event in events:
+        start, end = max(event.start, day.start), min(max(event.end, event.start + 1), day.end)
+        for place in range((start - day.start) // BIN, -(-(end - day.start) // BIN)):
+            first = day.start + place * BIN
+            filled[place] += min(end, first + BIN) - max(start, first)
+    if not any(filled):
+        return ""
+    return "".join(
+        str(max(min(-(-9 * part // BIN), 9), _LEAST)) if part else "0" for part in filled
+    )
+
+
+def _unheard(microphone: LiveMicrophone, day: DaySpan, today: Today) -> list[tuple[int, int]]:
+    """Return when of a day, up to now, a microphone was not heard; what is short is left out."""
+    spans = [(day.start, microphone.since or today.now), *microphone.gaps]
+    if not microphone.is_listening():
+        spans.append((max(microphone.heard.time, day.start), today.now))
+    inside = [(max(a, day.start), min(b, today.now)) for a, b in spans]
+    return _joined([(a, b) for a, b in inside if b - a >= _SILENT])
+
+
+def _joined(spans: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Join spans with less than two minutes between them."""
+    joined: list[tuple[int, int]] = []
+    for start, end in sorted(spans):
+        if joined and start - joined[-1][1] < BIN:
+            joined[-1] = joined[-1][0], max(joined[-1][1], end)
+        else:
+            joined.append((start, end))
+    return joined
+
 
 _EVERY_SECONDS = 1.0
 
@@ -39,7 +401,7 @@ class HomePage:
     """
 
     def __init__(
-        self, settings: PageSettings, home: Home, state: Path, say: Callable[[str], None]
+        self, settings: PageSettings, home: RecorderAddress, state: Path, say: Callable[[str], None]
     ) -> None:
         bind = ip_of(settings.bind)
         if bind is None:
@@ -51,10 +413,10 @@ class HomePage:
         self._started = time.time_ns()
         self._made = -_EVERY_SECONDS
         self._day_key: Any = None
-        self._events: dict[str, Event] = {}
-        self._now = NowHeard()
-        self._said = Said(home.folder, home.node)
-        self._recurring = Recurring(home.folder)
+        self._events: dict[str, SoundEvent] = {}
+        self._now = CurrentSounds()
+        self._corrections = EventCorrections(home.folder, home.node)
+        self._recurring = RecurringSounds(home.folder)
         self._is_read_back = False
         token = page_token(settings.token_file, state)
         names = frozenset(settings.names)
@@ -89,7 +451,7 @@ class HomePage:
         if not self._is_read_back:
             self._is_read_back = True
             threading.Thread(target=self._read_back, daemon=True).start()
-        last = last_events(news, self._said.of)
+        last = last_events(news, self._corrections.of)
         self._events = last.events
         self._put("now", self._now.describe(news))
         self._put("scenarios", scenario_lines(news))
@@ -114,11 +476,11 @@ class HomePage:
         found = self._events.get(event)
         if found is None:
             raise BridgeError("This event is too long ago for the page: `hearthlog review` has it.")
-        return self._said.say(found, label)
+        return self._corrections.add(found, label)
 
     def _read_back(self) -> None:
         try:
-            self._said.read_back()
+            self._corrections.read_back()
         except HearthlogError as error:
             self._say(f"page: earlier marks are not shown: {error}")
 

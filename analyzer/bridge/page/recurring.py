@@ -1,22 +1,223 @@
-"""The sounds that recur in a home, for its page: read where they are others, and named."""
+"""Recurring sounds on the page: groups from `hearthlog discover`, and their naming."""
 
+import os
+import subprocess
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import tzinfo
 from pathlib import Path
-from typing import Any
+from threading import Lock, Thread, Timer
+from typing import IO, Any, NamedTuple, cast
 
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.page.group_naming import GroupNaming
-from hearthlog.analyzer.bridge.page.recurring_list import Moment, recurring_list, shown_groups
-from hearthlog.analyzer.bridge.page.said import class_of
-from hearthlog.analyzer.bridge.page.words import told
-from hearthlog.analyzer.discover.summary import SUMMARY, GroupsSummary, load_summary
+from hearthlog.analyzer.bridge.commands import READ_ONLY, REVIEWER, class_of
+from hearthlog.analyzer.bridge.home import class_words, length, room, times, told, when
+from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.discover.summary import (
+    SUMMARY,
+    GroupsSummary,
+    GroupSummary,
+    busiest_hours,
+    load_summary,
+)
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.recorder.host import module_command
+from hearthlog.schemas.errors import HearthlogError, listed
+from hearthlog.schemas.frames import read_time
+
+_MOST_UNNAMED, _MOST_NAMED = 10, 50
+_LABELS = 2
+_SPACE = "\N{NO-BREAK SPACE}"
+
+
+class Moment(NamedTuple):
+    """When something is told, in nanoseconds of UTC, and in which time zone."""
+
+    now: int
+    zone: tzinfo
+
+
+def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
+    """Choose the groups that are shown, by keys that no group of another file has."""
+    unnamed = [each for each in summary.groups if not each.name][:_MOST_UNNAMED]
+    named = [each for each in summary.groups if each.name][:_MOST_NAMED]
+    return {f"{each.number} of {summary.id}": each for each in [*unnamed, *named]}
+
+
+def recurring_list(
+    summary: GroupsSummary, looked: int, said: Mapping[str, str], moment: Moment
+) -> Any:
+    """Describe the sounds that recur for JSON.
+
+    Parameters
+    ----------
+    looked : int
+        When the summary was written, in nanoseconds of UTC.
+    """
+    shown = shown_groups(summary)
+    left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED
+    is_alone = len({name for each in summary.groups for name in each.microphones}) <= 1
+    return {
+        "looked": when(min(max(looked, 0), moment.now), *moment),
+        "more": f"{left} more without a name come later." if left > 0 else "",
+        "groups": [
+            _described(key, group, said.get(key, ""), moment, is_alone=is_alone)
+            for key, group in shown.items()
+        ],
+    }
+
+
+def group_words(group: GroupSummary) -> str:
+    """Name a group as people do: `Door bell`, or `Sound 3` where it has no name."""
+    return class_words(group.name) if group.name else f"Sound {group.number}"
+
+
+def _described(key: str, group: GroupSummary, said: str, moment: Moment, *, is_alone: bool) -> Any:
+    return {
+        "id": key,
+        "words": group_words(group),
+        "is_named": bool(group.name),
+        "about": _how_often(group),
+        "heard": _heard_as(group),
+        "listen": f"For instance {_examples(group, moment, is_alone=is_alone)}",
+        "said": said,
+    }
+
+
+def _how_often(group: GroupSummary) -> str:
+    days = "one day" if group.days == 1 else f"{group.days} days"
+    hours = busiest_hours(group.hours).replace(" to ", " and ")
+    usual = f", mostly between {hours} o'clock" if hours else ""
+    often = times(group.times)
+    return f"{often[0].upper()}{often[1:]} on {days}{usual}, {length(group.seconds)} each"
+
+
+def _heard_as(group: GroupSummary) -> str:
+    labels = [*group.labels.items()][:_LABELS]
+    told = [f"{class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
+    return f"Heard as {listed(told)}" if told else ""
+
+
+def _examples(group: GroupSummary, moment: Moment, *, is_alone: bool) -> str:
+    return listed(
+        [
+            when(read_time(each.start), *moment, seconds=True)
+            + ("" if is_alone else f" ({room(each.microphone)})")
+            for each in sorted(group.examples, key=lambda each: read_time(each.start))
+        ],
+        "and",
+    )
+
+
+_LONGEST_SECONDS = 6 * 3600.0
+_NICE = 10
+_LONGEST_LINE = 4096  # characters
+_PREFIX = "hearthlog: "
+_DONE_WITH_LOSSES = 3  # exit status
+
+
+class GroupNaming:
+    """Names groups of sounds, one at a time.
+
+    All logs are read for that: too much for the bridge, which lives on a small box.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.said: dict[str, str] = {}
+        self._folder = folder
+        self._process: subprocess.Popen[str] | None = None
+        self._thread: Thread | None = None
+        self._lock = Lock()
+
+    def start(self, key: str, number: int, label: str) -> str:
+        """Begin to mark the sounds of a group, and say so.
+
+        Parameters
+        ----------
+        label : str
+            The class that they are; empty to take the marks back.
+
+        Raises
+        ------
+        BridgeError
+            If another group is being named, or nothing can be written there.
+        """
+        asked = ["--undo", str(number)]
+        text = "The name is being taken back …"
+        if label:
+            asked = ["--name", f"{number}={label}", "--reviewer", REVIEWER]
+            text = (
+                f"Being marked: {class_words(label)}. The box reads all its logs for that, which "
+                "can take many minutes."
+            )
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                raise BridgeError("The box still marks another sound: try again when it is done.")
+            if not os.access(self._folder, os.W_OK):
+                raise BridgeError(READ_ONLY)
+            process = self._process = _started([*asked, "--json", "--", str(self._folder)])
+            self.said[key] = text
+            self._thread = Thread(target=self._follow, args=(process, key, number), daemon=True)
+            self._thread.start()
+        return text
+
+    def close(self) -> None:
+        """End what goes on; what has been marked stays, and is completed by naming again."""
+        with self._lock:
+            if self._process is not None:
+                self._process.terminate()
+
+    def _follow(self, process: subprocess.Popen[str], key: str, number: int) -> None:
+        """Wait for the end, and keep what it says."""
+        timer = Timer(_LONGEST_SECONDS, process.kill)
+        timer.daemon = True
+        timer.start()
+        with process:
+            result, last = _read(cast(IO[str], process.stderr), f"{_PREFIX}group {number}:")
+            self.said[key] = _outcome(process.wait(), result, last)
+        timer.cancel()
+
+
+def _started(asked: list[str]) -> subprocess.Popen[str]:
+    """Start `hearthlog discover`, which lets others go first."""
+    try:
+        process = subprocess.Popen(  # noqa: S603  a list of arguments, without a shell
+            [*module_command("hearthlog.tools.cli.main"), "discover", *asked],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+        )
+    except OSError as error:
+        raise BridgeError(f"It was not saved: {error.strerror}") from error
+    with suppress(OSError):  # a sandbox may forbid it
+        os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
+    return process
+
+
+def _read(stream: IO[str], wanted: str) -> tuple[str, str]:
+    """Return the line that begins as wanted, and the last one, without what begins each."""
+    result = last = ""
+    while line := stream.readline(_LONGEST_LINE):
+        last = line.removeprefix(_PREFIX)
+        if line.startswith(wanted):
+            result = line.removeprefix(wanted)
+    return told(result), told(last)
+
+
+def _outcome(status: int, result: str, last: str) -> str:
+    if status < 0:
+        return f"It was not done: the process was ended by signal {-status}."
+    if not result or status not in {0, _DONE_WITH_LOSSES}:
+        return f"It was not done: {last or f'exit status {status}'}"
+    return result if status == 0 else f"{result}; not all could be read: {last}"
+
 
 _NOTHING: dict[str, Any] = {"looked": "", "more": "", "groups": []}
 
 
-class Recurring:
+class RecurringSounds:
     """The groups that `hearthlog discover` has found, if it has.
 
     Attributes

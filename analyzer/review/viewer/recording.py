@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.ports import free_port
+from hearthlog.analyzer.network import free_port
 from hearthlog.analyzer.review.lanes import PLOTS, Checked, Plot, StateLane
 from hearthlog.analyzer.review.live_timeline import Update
 from hearthlog.analyzer.review.timeline import LogLines, Timeline, home_clock

@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, cast
 
-from hearthlog.analyzer.ports import HOST, free_port
+from hearthlog.analyzer.network import HOST, free_port
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 

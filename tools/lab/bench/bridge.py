@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HeardNow
+from hearthlog.analyzer.bridge.events import ANY_SOUND, ActiveClasses
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -133,7 +133,7 @@ def _since_decision(turned_on: Sequence[_TurnedOn], logs: Path) -> NDArray[np.fl
 def _decisions(labels: Columns) -> NDArray[np.float64]:
     """Return when the frames ended with which any sound was on, in seconds of UTC."""
     names = labels["label"].tolist()
-    heard = HeardNow(sorted({*names, SILENCE}))
+    heard = ActiveClasses(sorted({*names, SILENCE}))
     is_on = []
     for place, name in enumerate(names):
         heard.push([name], labels.log_times[place : place + 1])

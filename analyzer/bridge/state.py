@@ -1,14 +1,53 @@
-"""Secrets of a server: a token in a file, given or made once, and what is made of it."""
+"""Files of the bridge: the folder of its state, secrets, and tokens of its servers."""
 
+import os
 import re
 import secrets
 from pathlib import Path
 
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.new_files import create_file, private_folder, replaced_file
+
+
+class BridgeError(HearthlogError):
+    """The bridge cannot do what it is configured for."""
+
+
+_OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between them
+
+
+def state_folder(configured: Path | None, logs: Path) -> Path:
+    """Return the folder of the state, which is made where it is missing.
+
+    Returns
+    -------
+    Path
+        The configured one; else that of systemd; else `bridge` beside the logs.
+
+    Raises
+    ------
+    BridgeError
+        If it cannot be made.
+    """
+    given = os.environ.get(_OF_SYSTEMD, "").partition(":")[0]
+    folder = configured or (Path(given) if given else logs.absolute().parent / "bridge")
+    try:
+        private_folder(folder)
+    except OSError as error:
+        raise BridgeError(
+            f"{folder}: cannot be made ({error.strerror}); name another one: bridge.state"
+        ) from error
+    return folder
+
+
+_CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
+
+
+def secret_path(path: Path) -> Path:
+    """Return where a file of a secret is."""
+    return Path(os.environ.get(_CREDENTIALS, "")) / path
+
 
 _TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
 _FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # what an address can have as it is

@@ -1,26 +1,39 @@
-"""The outputs that are configured, opened, and opened again where that failed."""
+"""The bridge: follows the log of a recorder and updates the configured outputs."""
 
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Event as Flag
+from threading import Lock, Thread
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from hearthlog.analyzer.bridge.alerts.settings import NO_LISTENER
-from hearthlog.analyzer.bridge.day import today
-from hearthlog.analyzer.bridge.errors import BridgeError
-from hearthlog.analyzer.bridge.home import Home
-from hearthlog.analyzer.bridge.output import News, Output
-from hearthlog.analyzer.bridge.page.page_token import figures_token, page_secrets, read_token
-from hearthlog.analyzer.bridge.saying import Saying
-from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.analyzer.bridge.settings import BridgeSettings, MqttSettings, PageSettings
-from hearthlog.analyzer.bridge.totals import TOTALS, kept_until
+from hearthlog.analyzer.bridge.events import SoundEvent
+from hearthlog.analyzer.bridge.home import RecorderAddress, today
+from hearthlog.analyzer.bridge.home_state import HomeState, follow_home
+from hearthlog.analyzer.bridge.output import RECENT, TOTALS, News, Output, kept_until
+from hearthlog.analyzer.bridge.settings import (
+    NO_RECIPIENT,
+    BridgeSettings,
+    MqttSettings,
+    PageSettings,
+    PingSettings,
+)
+from hearthlog.analyzer.bridge.state import (
+    BridgeError,
+    figures_token,
+    page_secrets,
+    read_token,
+    secret_path,
+)
 from hearthlog.analyzer.extras import missing, remedy
-from hearthlog.analyzer.ping import has_password, read_ping_address
-from hearthlog.analyzer.ports import ip_of, listen
+from hearthlog.analyzer.network import has_password, ip_of, listen, ping, read_ping_address
+from hearthlog.recorder.host import give_back, keep_one_heap, notify
 from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import exposed_secret
@@ -29,6 +42,149 @@ from hearthlog.schemas.frames import NANOSECONDS
 if TYPE_CHECKING:
     from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 
+
+_ERROR = 2  # level of diagnostics
+_SOON = 10.0  # seconds after the start
+_JUDGED_SECONDS = 60.0  # after which what was known of the recorder counts no more
+
+
+class PingOutput:
+    """Asks for an address again and again, and for `/fail` below it while something is wrong.
+
+    All is well while the recorder writes and says of nothing that it fails. A bridge that hangs
+    pings no more.
+
+    Raise `HearthlogError` if the file of the address cannot be used.
+    """
+
+    def __init__(self, settings: PingSettings, say: Callable[[str], None]) -> None:
+        self._settings = settings
+        self._url = settings.url
+        if settings.url_file is not None:
+            self._url = read_ping_address(secret_path(settings.url_file))
+        self._say = say
+        self._is_well = False
+        self._judged = 0.0  # when, by CLOCK_MONOTONIC
+        self._stop = Flag()
+        Thread(target=self._ping, daemon=True).start()
+
+    def update(self, news: News) -> None:
+        """Note whether all is well."""
+        fails = any(health.level >= _ERROR for health in news.state.health.values())
+        self._is_well = news.state.is_recording() and not fails
+        self._judged = time.monotonic()
+
+    def close(self) -> None:
+        """Ping no more."""
+        self._stop.set()
+
+    def _ping(self) -> None:
+        pause = min(self._settings.every_seconds, _SOON)
+        while not self._stop.wait(pause):
+            pause = self._settings.every_seconds
+            if time.monotonic() - self._judged <= _JUDGED_SECONDS:
+                problem = ping(self._url, is_well=self._is_well)
+                if problem:
+                    self._say(f"ping: nobody there has taken it ({problem}); trying again")
+
+
+_WATCHDOG_SECONDS = 10.0
+_MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of
+_AHEAD = 3600 * NANOSECONDS  # of now: so much later no event can begin
+_FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
+
+
+@dataclass
+class Bridge:
+    """Follows one recorder.
+
+    Attributes
+    ----------
+    since : int
+        From when on events are to be known, in nanoseconds of UTC.
+    """
+
+    home: RecorderAddress
+    since: int
+    outputs: dict[str, Output]
+    say: Callable[[str], None]
+    _watchdog_due: float = 0.0
+
+    def run(self, stop: Flag) -> None:
+        """Tell what is heard until `stop` is set."""
+        keep_one_heap()
+        notify(["READY=1"])
+        early: deque[SoundEvent] = deque(maxlen=_MOST_EARLY)
+        had_caught_up = False
+        try:
+            for state, begun in follow_home(self.home, self.since, stop, self._damaged):
+                self._live()
+                early += begun
+                if state.caught_up:
+                    self._tell(state, list(early), is_first=not had_caught_up)
+                    early.clear()
+                had_caught_up = state.caught_up
+        finally:
+            notify(["STOPPING=1"])
+            for name, output in self.outputs.items():
+                self._try(name, output.close)
+
+    def _live(self) -> None:
+        """Tell systemd that the log is followed."""
+        if time.monotonic() >= self._watchdog_due:
+            self._watchdog_due = time.monotonic() + _WATCHDOG_SECONDS
+            notify(["WATCHDOG=1"])
+
+    def _tell(self, state: HomeState, begun: Sequence[SoundEvent], *, is_first: bool) -> None:
+        now = time.time_ns()
+        moment = today(now, self.home.zone)
+        ended = [event for each in state.every() for event in each.ended_events()]
+        if is_first:
+            give_back()  # what it took to read the log
+            ended = [event for event in ended if now - event.end <= RECENT]
+        recent = [event for event in begun if now - event.end <= RECENT]
+        news = News(state, recent, ended, moment, self.home.zone)
+        for name, output in self.outputs.items():
+            self._try(name, partial(output.update, news))
+        for microphone in state.every():
+            microphone.forget(min(moment.midnight, moment.night) - _FORGOTTEN, now + _AHEAD)
+
+    def _try(self, name: str, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except Exception as error:  # noqa: BLE001  one that fails must not stop the others
+            self.say(f"{name}: {type(error).__name__}: {error}")
+
+    def _damaged(self, error: Exception) -> None:
+        self.say(str(error))
+
+
+_REPEAT_SECONDS = 3600.0
+_MOST_TEXTS = 100  # texts that are remembered
+
+
+class ProblemReporter:
+    """Passes lines on, from any thread; the same one again an hour later at the earliest."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._said: OrderedDict[str, float] = OrderedDict()
+        self._lock = Lock()
+
+    def __call__(self, text: object) -> None:
+        """Say something, unless it was said of late."""
+        line, now = str(text), time.monotonic()
+        with self._lock:
+            if now - self._said.get(line, -_REPEAT_SECONDS) < _REPEAT_SECONDS:
+                return
+            self._said[line] = now
+            self._said.move_to_end(line)
+            if len(self._said) > _MOST_TEXTS:
+                self._said.popitem(last=False)
+        with suppress(OSError, ValueError):  # a full disk, or nobody who reads it
+            self._say(line)
+
+
 _OLDEST = 7 * 24 * 3600 * NANOSECONDS  # how far back the log is read at most, at a start
 _EARLIER = 6 * 3600 * NANOSECONDS  # so much longer no event takes, so that those are known whole
 _AGAIN_SECONDS = 60.0
@@ -36,7 +192,7 @@ _AGAIN_SECONDS = 60.0
 _Output = TypeVar("_Output", bound=Output)
 
 
-class Reopened(Generic[_Output]):
+class ReopenedOutput(Generic[_Output]):
     """An output that is tried again every minute while it cannot be opened.
 
     Attributes
@@ -77,7 +233,7 @@ class Reopened(Generic[_Output]):
 
 
 def open_outputs(
-    settings: BridgeSettings, home: Home, state_folder: Path, say: Saying
+    settings: BridgeSettings, home: RecorderAddress, state_folder: Path, say: ProblemReporter
 ) -> tuple[dict[str, Output], int]:
     """Open the outputs that are configured.
 
@@ -97,7 +253,7 @@ def open_outputs(
 
             return MqttPublisher(mqtt, home, state_folder, say)
 
-        publisher = Reopened(publish, say)
+        publisher = ReopenedOutput(publish, say)
         outputs["mqtt"] = publisher
     if (figures := settings.prometheus) is not None:
         first = since
@@ -107,27 +263,25 @@ def open_outputs(
 
             return PrometheusOutput(figures, home, state_folder, first, say)
 
-        outputs["prometheus"] = Reopened(count, say)
+        outputs["prometheus"] = ReopenedOutput(count, say)
         kept = kept_until(state_folder / TOTALS, since) - _EARLIER
         since = min(since, max(kept, moment.now - _OLDEST))
     if (page := settings.page) is not None:
         from hearthlog.analyzer.bridge.page.home_page import HomePage  # noqa: PLC0415
 
-        outputs["page"] = Reopened(lambda: HomePage(page, home, state_folder, say), say)
+        outputs["page"] = ReopenedOutput(lambda: HomePage(page, home, state_folder, say), say)
     if (watchdog := settings.ping) is not None:
-        from hearthlog.analyzer.bridge.pinging import Pinging  # noqa: PLC0415
-
-        outputs["ping"] = Reopened(lambda: Pinging(watchdog, say), say)
+        outputs["ping"] = ReopenedOutput(lambda: PingOutput(watchdog, say), say)
     if settings.alert:
         from hearthlog.analyzer.bridge.alerts.output import AlertsOutput  # noqa: PLC0415
 
-        def ring(rule: str, text: str, rung: int) -> bool:
+        def publish_alert(rule: str, text: str, rung: int) -> bool:
             return publisher.output is not None and publisher.output.alert(rule, text, rung)
 
         rules, delivery = settings.alert, settings.delivery
-        on_ring = None if mqtt is None else ring
-        outputs["alerts"] = Reopened(
-            lambda: AlertsOutput(rules, delivery, home, state_folder, say, on_ring), say
+        on_notification = None if mqtt is None else publish_alert
+        outputs["alerts"] = ReopenedOutput(
+            lambda: AlertsOutput(rules, delivery, home, state_folder, say, on_notification), say
         )
     return outputs, since
 
@@ -159,7 +313,7 @@ def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
     if (figures := settings.prometheus) is not None and (line := figures.unread_text_file()):
         warnings.append(line)
     if settings.alert and settings.mqtt is None and settings.delivery.urls_file is None:
-        problems.append(NO_LISTENER)
+        problems.append(NO_RECIPIENT)
     for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:
         if path is not None and not path.is_absolute() and not secret_path(path).exists():
             warnings.append(f"{path}: not here; it has to be a credential of the service")
@@ -188,7 +342,7 @@ def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_St
     if settings.ping is not None and (url := settings.ping.url_file) is not None:
         yield url, lambda: read_ping_address(secret_path(url))
     if (file := settings.delivery.urls_file) is not None:
-        from hearthlog.analyzer.bridge.alerts.targets import find_targets  # noqa: PLC0415
+        from hearthlog.analyzer.bridge.alerts.delivery import find_targets  # noqa: PLC0415
 
         yield file, lambda: problems.extend(find_targets(file, lambda _: None)[1])
 

@@ -1,4 +1,4 @@
-"""What Home Assistant is told of: a device for each microphone, and one for what it may command."""
+"""Discovery by Home Assistant: a device for each microphone, and one for commands."""
 
 import json
 from collections import Counter

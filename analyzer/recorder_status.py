@@ -1,4 +1,4 @@
-"""The state of the recorders of a folder now: whether they run, hear, write, and what to do."""
+"""Status of the recorders of a folder: process, microphones, disk, and remedies."""
 
 import json
 import os

@@ -1,0 +1,426 @@
+"""Activity of a home: segments, coverage and classes, collected from its logs."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.bridge.events import ANY_SOUND
+from hearthlog.analyzer.bridge.home import is_of_scenario, labelling_source, source_microphone
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.selection import Described, array_names, select
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
+from hearthlog.schemas.arrays import Bool, Float32, Int64
+from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.logs.files import time_span
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import labelling_topic, parse_topic
+
+
+@dataclass(frozen=True)
+class Sounds:
+    """Segments of one class, or of several.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, in the order of the starts.
+    confidences : np.ndarray [shape=(n,)], float32
+    microphones : np.ndarray [shape=(n,)] of str
+    """
+
+    starts: Int64
+    ends: Int64
+    confidences: Float32
+    microphones: NDArray[np.object_]
+
+    def rows(self, rows: Bool) -> "Sounds":
+        """Return some of the segments.
+
+        Parameters
+        ----------
+        rows : np.ndarray [shape=(n,)], bool
+        """
+        return Sounds(
+            self.starts[rows], self.ends[rows], self.confidences[rows], self.microphones[rows]
+        )
+
+    def between(self, start: int, end: int, pause: int) -> "Sounds":
+        """Return what was heard in a span of time, with all of the events that go on in it.
+
+        Parameters
+        ----------
+        pause : int
+            Within an event, at most.
+        """
+        own = self.rows(self.starts < end)
+        own = Sounds(own.starts, np.minimum(own.ends, end), own.confidences, own.microphones)
+        events = joined(own.starts, own.ends, pause)
+        first = np.searchsorted(events.ends, start)
+        begin = events.starts[first] if first < len(events.starts) else end
+        return own.rows(own.starts >= begin)
+
+
+NO_SOUNDS = Sounds(NONE.starts, NONE.ends, np.empty(0, np.float32), np.empty(0, object))
+
+
+def sounds_of(parts: Iterable[Sounds]) -> Sounds:
+    """Put segments together, in the order of time."""
+    parts = list(parts)
+    if not parts:
+        return NO_SOUNDS
+    columns = [
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("starts", "ends", "confidences", "microphones")
+    ]
+    order = np.argsort(columns[0], kind="stable")
+    return Sounds(*(column[order] for column in columns))
+
+
+@dataclass(frozen=True)
+class HomeActivity:
+    """Activity of a home in a span of time.
+
+    Attributes
+    ----------
+    sounds : mapping of str to Sounds
+        By class, of the models of the home; silence is none.
+    written : Spans
+        When the recorder wrote; no more than a minute apart is one span.
+    """
+
+    sounds: Mapping[str, Sounds]
+    scenario_sounds: Mapping[str, Sounds]
+    coverage: Mapping[str, Spans]
+    classes: Mapping[str, frozenset[str]]
+    written: Spans
+
+    def of(self, label: str) -> Sounds:
+        """Return the segments of a class, or of any sound."""
+        return sounds_of(self.sounds.values()) if label == ANY_SOUND else self._of(label)
+
+    def _of(self, label: str) -> Sounds:
+        own = self.sounds.get(label, NO_SOUNDS)
+        others = self.scenario_sounds.get(label)
+        return own if others is None else sounds_of([own, others])
+
+    def listened(self, label: str, microphone: str) -> Spans:
+        """Return when a class would have been heard.
+
+        Parameters
+        ----------
+        microphone : str
+            Empty: any of those whose models know the class.
+        """
+        knowing = [
+            spans
+            for name, spans in self.coverage.items()
+            if microphone in {"", source_microphone(name)} and self._knows(name, label)
+        ]
+        return reduce(_either, knowing, NONE)
+
+    def _knows(self, source: str, label: str) -> bool:
+        known = self.classes.get(source)
+        if is_of_scenario(source):
+            return known is not None and label in known
+        return known is None or label == ANY_SOUND or label in known
+
+    def between(self, start: int, end: int, pause: int) -> "HomeActivity":
+        """Return what was heard in a span of time, with all of the events that go on in it.
+
+        Parameters
+        ----------
+        pause : int
+            Within an event, at most.
+        """
+        return HomeActivity(
+            {label: sounds.between(start, end, pause) for label, sounds in self.sounds.items()},
+            {
+                label: sounds.between(start, end, pause)
+                for label, sounds in self.scenario_sounds.items()
+            },
+            {name: cut(spans, start, end) for name, spans in self.coverage.items()},
+            self.classes,
+            cut(self.written, start, end),
+        )
+
+
+def _either(a: Spans, b: Spans) -> Spans:
+    return joined(np.concatenate([a.starts, b.starts]), np.concatenate([a.ends, b.ends]))
+
+
+SEGMENT_FIELDS = "header.stamp", "duration", "label", "confidence"
+_PAUSE = 60 * NANOSECONDS  # between what the recorder writes, as one span
+
+
+@dataclass
+class _Rows:
+    """Segments of one class, of which more come."""
+
+    starts: list[int] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
+    confidences: list[float] = field(default_factory=list)
+    microphones: list[str] = field(default_factory=list)
+    known: Sounds | None = None
+
+    def sounds(self) -> Sounds:
+        if self.known is None:
+            rows = Sounds(
+                np.array(self.starts, np.int64),
+                np.array(self.ends, np.int64),
+                np.array(self.confidences, np.float32),
+                np.array(self.microphones, object),
+            )
+            self.known = sounds_of([rows])
+        return self.known
+
+    def keep(self, sounds: Sounds) -> None:
+        columns = sounds.starts, sounds.ends, sounds.confidences, sounds.microphones
+        self.starts, self.ends, self.confidences, self.microphones = (c.tolist() for c in columns)
+        self.known = None
+
+
+class _GrowingSpans:
+    """Spans of time that come one after the other, for the most part in order."""
+
+    def __init__(self) -> None:
+        self._spans: list[list[int]] = []
+
+    def add(self, start: int, end: int, pause: int) -> None:
+        """Add a span, which goes on with the last one after no more than a pause."""
+        last = self._spans[-1] if self._spans else None
+        if last is not None and last[0] <= start <= last[1] + pause:
+            last[1] = max(last[1], end)
+        else:
+            self._spans.append([start, end])
+
+    def spans(self, pause: int) -> Spans:
+        """Return the spans as arrays."""
+        if not self._spans:
+            return NONE
+        starts, ends = np.array(self._spans, np.int64).T
+        return joined(starts, ends, pause)
+
+    def forget_before(self, time: int) -> None:
+        """Forget the spans that end before a time."""
+        self._spans = [span for span in self._spans if span[1] >= time]
+
+    @property
+    def last_start(self) -> int | None:
+        """When the last span begins."""
+        return self._spans[-1][0] if self._spans else None
+
+
+class SegmentCollector:
+    """Collects the segments of a home, source by source."""
+
+    def __init__(self) -> None:
+        self.classes: dict[str, set[str]] = {}
+        self._rows: dict[str, _Rows] = {}
+        self._scenario_rows: dict[str, _Rows] = {}
+        self._coverage: dict[str, _GrowingSpans] = {}
+        self._written = _GrowingSpans()
+
+    def add_segments(self, source: str, columns: Columns) -> None:
+        """Add segments, with the fields `SEGMENT_FIELDS`."""
+        rows = zip(*(columns[name].tolist() for name in SEGMENT_FIELDS), strict=True)
+        for start, duration, label, confidence in rows:
+            if duration > 0:
+                self.add_segment(source, start, start + duration, label, confidence)
+
+    def add_segment(self, source: str, start: int, end: int, label: str, confidence: float) -> None:
+        """Add a segment."""
+        covered = self._coverage.setdefault(source, _GrowingSpans())
+        covered.add(start, end, FRAME_NANOSECONDS)
+        self._written.add(start, end, _PAUSE)  # a long one has a message at its end alone
+        name = class_name(label)
+        if not _is_told(source, name):
+            return
+        every = self._scenario_rows if is_of_scenario(source) else self._rows
+        rows = every.setdefault(name, _Rows())
+        rows.starts.append(start)
+        rows.ends.append(end)
+        rows.confidences.append(confidence)
+        rows.microphones.append(source_microphone(source))
+        rows.known = None
+        if source in self.classes:
+            self.classes[source].add(name)
+
+    def add_classes(self, source: str, names: Iterable[str]) -> None:
+        """Add the classes that the model of a source knows.
+
+        Parameters
+        ----------
+        names : iterable of str
+            None: nothing is known of them.
+        """
+        own = {class_name(name) for name in names}
+        if is_of_scenario(source):
+            own -= OF_EVERY_SCENARIO
+        if own:
+            self.classes.setdefault(source, set()).update(own)
+
+    def add_written(self, times: Int64) -> None:
+        """Add times at which the recorder wrote.
+
+        Parameters
+        ----------
+        times : np.ndarray [shape=(n,)], int64
+            Ascending, in nanoseconds of UTC.
+        """
+        spans = joined(times, times, _PAUSE)
+        for start, end in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True):
+            self.add_written_span(start, end)
+
+    def add_written_span(self, start: int, end: int) -> None:
+        """Add a span of time in which the recorder wrote at least once a minute."""
+        self._written.add(start, end, _PAUSE)
+
+    @property
+    def recorder_began(self) -> int | None:
+        """When the recorder last began to write; None if it never did."""
+        return self._written.last_start
+
+    def heard(self, others: Sequence[tuple[str, int, int, str, float]] = ()) -> HomeActivity:
+        """Return what was heard."""
+        sounds = {label: rows.sounds() for label, rows in self._rows.items()}
+        of_scenarios = {label: rows.sounds() for label, rows in self._scenario_rows.items()}
+        coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
+        written = self._written.spans(_PAUSE)
+        for source, start, end, label, confidence in others:
+            written = _with(written, start, end, _PAUSE)
+            spans = coverage.get(source, NONE)
+            coverage[source] = _with(spans, start, end, FRAME_NANOSECONDS)
+            name = class_name(label)
+            if _is_told(source, name):
+                more = Sounds(
+                    np.array([start]),
+                    np.array([end]),
+                    np.array([confidence], np.float32),
+                    np.array([source_microphone(source)], object),
+                )
+                every = of_scenarios if is_of_scenario(source) else sounds
+                every[name] = sounds_of([every.get(name, NO_SOUNDS), more])
+        classes = {name: frozenset(own) for name, own in self.classes.items()}
+        return HomeActivity(sounds, of_scenarios, coverage, classes, written)
+
+    def forget_before(self, time: int, pause: int) -> None:
+        """Forget the events that were over before a time.
+
+        Parameters
+        ----------
+        pause : int
+            Within an event, at most.
+        """
+        for rows in (*self._rows.values(), *self._scenario_rows.values()):
+            if rows.starts:
+                rows.keep(rows.sounds().between(time, 1 << 62, pause))
+        for own in (*self._coverage.values(), self._written):
+            own.forget_before(time)
+
+
+def _is_told(source: str, name: str) -> bool:
+    """Tell whether a class is one that a rule may be about."""
+    return name not in (OF_EVERY_SCENARIO if is_of_scenario(source) else {SILENCE})
+
+
+def _with(spans: Spans, start: int, end: int, pause: int) -> Spans:
+    return joined(np.append(spans.starts, start), np.append(spans.ends, end), pause)
+
+
+_LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
+
+
+def read_activity(  # noqa: PLR0913, PLR0917
+    logs: HomeLogs,
+    node: str,
+    start: int,
+    end: int,
+    lose: Callable[[str], None],
+    progress: Progress = ignore_progress,
+    others: Sequence[tuple[str, int, int, str, float]] = (),
+) -> HomeActivity:
+    """Read what was heard in a span of time.
+
+    Parameters
+    ----------
+    start, end : int
+        In nanoseconds of UTC; of what ends later, the beginning is there, too.
+    progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
+    others : sequence of (str, int, int, str, float), optional
+        Segments that go on and are in no log yet, as `SegmentCollector.heard` takes them.
+    """
+    collector = SegmentCollector()
+    entries = [entry.path for entry in logs.between(start, end + _LATE) if entry.node == node]
+    for number, path in enumerate(entries, 1):
+        try:
+            _add_log(collector, path, start, end + _LATE, lose)
+        except LogError as error:
+            lose(str(error))
+        progress(number / len(entries))
+    return collector.heard(others)
+
+
+def _add_log(
+    collector: SegmentCollector, path: Path, start: int, end: int, lose: Callable[[str], None]
+) -> None:
+    with LogFile(path) as file:
+        for first, last in zip(
+            file.chunks["start"].tolist(), file.chunks["end"].tolist(), strict=True
+        ):
+            collector.add_written_span(first, last)
+    selection = select([path])
+    if selection.unfinished:
+        lose(f"unfinished, read up to the last whole chunk: {path}")
+    sources = {}
+    for topic in selection.topics_of(message_types.SEGMENT, set(SEGMENT_FIELDS)):
+        name = parse_topic(topic)
+        source = None if name is None else labelling_source(name)
+        if name is not None and source is not None:
+            sources[topic] = source
+            labels = labelling_topic(name.microphone, name.labelling, "label")
+            _add_classes(collector, source, selection.channels.get(labels, ()))
+    segments = read_columns([path], list(sources), start, end, SEGMENT_FIELDS)
+    for topic, columns in segments.items():
+        collector.add_segments(sources[topic], columns)
+
+
+def _add_classes(collector: SegmentCollector, source: str, channels: Sequence[Described]) -> None:
+    for channel, _ in channels:
+        collector.add_classes(source, array_names(channel.metadata, "probabilities"))
+
+
+def nodes_of(logs: HomeLogs) -> list[str]:
+    """List the names of the recorders of some logs."""
+    entries: Sequence[str] = [entry.node for entry in logs.entries if not entry.layer]
+    return sorted(set(entries))
+
+
+def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
+    """Return when the logs of a recorder begin and end, in nanoseconds of UTC.
+
+    Raise `LogError` if none of them has a message that can be read.
+    """
+    own = [entry.path for entry in logs.entries if entry.node == node and not entry.layer]
+    first, last = _first_span(own), _first_span(reversed(own))
+    if first is None or last is None:
+        raise LogError(f"the logs of {node} have no message that can be read")
+    return first[0], last[1]
+
+
+def _first_span(paths: Iterable[Path]) -> tuple[int, int] | None:
+    for path in paths:
+        with suppress(LogError):
+            span = time_span(path)
+            if span is not None:
+                return span
+    return None

@@ -1,0 +1,561 @@
+"""Evaluation of rules on the activity of a home: conditions, and notifications of them."""
+
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta, tzinfo
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.bridge.alerts.activity import HomeActivity
+from hearthlog.analyzer.bridge.alerts.rules import (
+    MINUTE,
+    AlertRule,
+    Condition,
+    DailyRule,
+    LongerThan,
+    MoreThan,
+    NoneBy,
+    Notification,
+    RecorderSilent,
+    RuleState,
+    SoundRule,
+    UnlikeUsual,
+    UnusualDay,
+    duration_words,
+    pause_of,
+)
+from hearthlog.analyzer.bridge.events import ANY_SOUND
+from hearthlog.analyzer.bridge.home import is_of_scenario
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Spans,
+    cut,
+    first_of_groups,
+    joined,
+    lengths,
+    rows_at,
+)
+from hearthlog.analyzer.report.values import BASELINE_DAYS, Count, Duration, UsualRange, usual_range
+from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
+from hearthlog.analyzer.routine.day_anomaly import Routines
+from hearthlog.analyzer.routine.day_profile import HomeSegments, Profiles
+from hearthlog.models.classes import SILENCE
+from hearthlog.recorder.pause_schedule import QuietHours
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.frames import NANOSECONDS
+
+
+class SoundEvents(NamedTuple):
+    """Events of the segments that a rule counts: those with short pauses between them.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    counted : np.ndarray [shape=(n,)], int64
+        When each had lasted as long as it must: from then on it counts.
+    """
+
+    starts: Int64
+    ends: Int64
+    counted: Int64
+    heard: Spans
+
+    def heard_counted(self) -> Spans:
+        """Return what was heard of each event from when on it counts."""
+        if self.counted is self.starts:
+            return self.heard
+        parts = [
+            cut(self.heard, start, end)
+            for start, end in zip(self.counted.tolist(), self.ends.tolist(), strict=True)
+            if start < end
+        ]
+        if not parts:
+            return NONE
+        return Spans(*(np.concatenate(edges) for edges in zip(*parts, strict=True)))
+
+
+def events_of_rule(rule: SoundRule, heard: HomeActivity) -> SoundEvents:
+    """Find the events that a rule counts.
+
+    Returns
+    -------
+    SoundEvents
+        Without those that are too short. Segments of all microphones that are at most ten seconds
+        apart are one event, unless the rule says otherwise.
+    """
+    sounds = heard.of(rule.label)
+    rows = sounds.confidences >= np.float32(rule.confidence)
+    if rule.microphone:
+        rows &= sounds.microphones == rule.microphone
+    spans = joined(sounds.starts[rows], sounds.ends[rows])
+    firsts = first_of_groups(spans.starts, spans.ends, pause_of(rule))
+    ends = spans.ends[np.append(firsts[1:], len(spans.ends)) - 1] if len(firsts) else spans.ends
+    starts = spans.starts[firsts]
+    least = round(rule.least_seconds * NANOSECONDS)
+    if not least:
+        return SoundEvents(starts, ends, starts, spans)
+    counted, long_enough = _times_heard(spans, firsts, least)
+    return SoundEvents(starts[long_enough], ends[long_enough], counted[long_enough], spans)
+
+
+def _times_heard(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int64]:
+    """Return when each group of spans has so much in it, and which ones ever have."""
+    lengths = spans.ends - spans.starts
+    sums = np.cumsum(lengths)
+    before = sums[firsts] - lengths[firsts]
+    totals = np.append(before[1:], sums[-1:]) - before
+    rows = np.minimum(np.searchsorted(sums, before + least), max(len(sums) - 1, 0))
+    times = spans.ends[rows] - (sums[rows] - before - least)
+    return times, np.flatnonzero(totals >= least)
+
+
+def more_than_conditions(rule: MoreThan, heard: HomeActivity, until: int) -> list[Condition]:
+    """Find when there was more of a class in the window before than a rule allows.
+
+    Parameters
+    ----------
+    heard : HomeActivity
+        From the length of the window before the first time that matters.
+    until : int
+        Time up to which it is known, in nanoseconds of UTC.
+    """
+    events = events_of_rule(rule, heard)
+    spans = _too_many(rule, events) if rule.minutes is None else _too_long(rule, events, until)
+    return [
+        Condition(*span) for span in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
+    ]
+
+
+def more_than_text(rule: MoreThan, heard: HomeActivity, time: int) -> str:
+    """Say how much there was in the window that ends with a time."""
+    window = duration_words(rule.window)
+    if rule.minutes is not None:
+        return f"{rule.words}: more than {rule.minutes:g} min in the last {window}"
+    counted = events_of_rule(rule, heard).counted
+    number = int(((counted > time - rule.window) & (counted <= time)).sum())
+    times = "once" if number == 1 else f"{number} times"
+    return f"{rule.words}: {times} in the last {window}, more than {rule.count}"
+
+
+def _too_many(rule: MoreThan, events: SoundEvents) -> Spans:
+    """Each event counts for the length of the window."""
+    assert rule.count is not None
+    times = np.concatenate([events.counted, events.counted + rule.window])
+    steps = np.repeat([1, -1], len(events.counted))
+    edges, places = np.unique(times, return_inverse=True)
+    numbers = np.cumsum(np.bincount(places, steps, len(edges)))
+    over = np.flatnonzero(numbers[:-1] > rule.count)
+    return joined(edges[over], edges[over + 1])
+
+
+def _too_long(rule: MoreThan, events: SoundEvents, until: int) -> Spans:
+    """Measure the window at every time at which the measure may begin to grow or to shrink."""
+    assert rule.minutes is not None
+    most = round(rule.minutes * MINUTE)
+    spans, lump = events.heard_counted(), round(rule.least_seconds * NANOSECONDS)
+    inside = [events.counted, spans.starts, spans.ends]
+    edges = np.unique(np.concatenate([*inside, *(times + rule.window for times in inside)]))
+    edges = np.append(edges[edges < until], until)
+    if len(edges) < 2:
+        return joined(edges[:0], edges[:0])
+    amounts = _sum_to(spans, edges) - _sum_to(spans, edges - rule.window)
+    known = np.searchsorted(events.counted, edges, side="right")
+    gone = np.searchsorted(events.counted, edges - rule.window, side="right")
+    amounts, lengths_of = (amounts + lump * (known - gone))[:-1], np.diff(edges)
+    now, earlier = (rows_at(spans, times[:-1]) >= 0 for times in (edges, edges - rule.window))
+    slopes = now.astype(np.int64) - earlier
+    missing = np.where(slopes > 0, np.maximum(most - amounts, 0), 0)
+    missing[(slopes <= 0) & (amounts <= most)] = until
+    left = np.where(slopes < 0, np.minimum(amounts - most, lengths_of), lengths_of)
+    over = missing < left
+    return joined((edges[:-1] + missing)[over], (edges[:-1] + left)[over])
+
+
+def _sum_to(spans: Spans, times: Int64) -> Int64:
+    """Measure spans up to each of some ascending times."""
+    first = min(int(times[0]), int(spans.starts[0]) if len(spans.starts) else 0)
+    return np.cumsum(lengths(spans, np.concatenate([[first], times])))
+
+
+def longer_than_conditions(rule: LongerThan, heard: HomeActivity) -> list[Condition]:
+    """Find when a class had gone on for too long, until its pause is longer than one may be."""
+    events = events_of_rule(rule, heard)
+    limits = events.starts + rule.longer_than
+    rows = np.flatnonzero(limits < events.ends)
+    # In a pause it is not known whether the event goes on.
+    spans = np.searchsorted(events.heard.ends, limits[rows], side="right")
+    times = np.maximum(events.heard.starts[spans], limits[rows])
+    over = events.ends[rows] + rule.pause + 1
+    return [Condition(*span) for span in zip(times.tolist(), over.tolist(), strict=True)]
+
+
+def longer_than_start(rule: LongerThan, heard: HomeActivity, time: int) -> int:
+    """Return when the sound began that goes on at a time, in nanoseconds of UTC.
+
+    Parameters
+    ----------
+    time : int
+        In nanoseconds of UTC, at which one does.
+    """
+    starts = events_of_rule(rule, heard).starts
+    return int(starts[np.searchsorted(starts, time, side="right") - 1])
+
+
+def longer_than_text(rule: LongerThan, since: str) -> str:
+    """Say what went on for too long.
+
+    Parameters
+    ----------
+    since : str
+        Time of day.
+    """
+    return f"{rule.words} for longer than {duration_words(rule.longer_than)}, since {since}"
+
+
+def silent_conditions(
+    rule: RecorderSilent, heard: HomeActivity, start: int, end: int, since: int
+) -> list[Condition]:
+    """Find when the recorder had written nothing for too long.
+
+    Parameters
+    ----------
+    start, end : int
+        In nanoseconds of UTC; where nothing was written in as long before the start, nothing was
+        from ever on.
+    since : int
+        From when on the rule is in force, in nanoseconds of UTC: earlier silence does not count.
+    """
+    starts, ends = heard.written
+    before = start - 1 - rule.silent_for
+    lasts = (max(last, since) for last in [before, *ends.tolist()])
+    silences = zip(lasts, [*starts.tolist(), end], strict=True)
+    return [
+        Condition(last + rule.silent_for, first)
+        for last, first in silences
+        if first - last > rule.silent_for
+    ]
+
+
+def silent_text(rule: RecorderSilent) -> str:
+    """Say that the recorder is silent."""
+    return f"Nothing from the recorder for {duration_words(rule.silent_for)}"
+
+
+def wall_times(day: date, minute: int, zone: tzinfo) -> tuple[int, int]:
+    """Return when a clock on the wall shows a minute of a day, the first and the last time.
+
+    Parameters
+    ----------
+    minute : int
+        0 to 1439.
+
+    Returns
+    -------
+    first, last : int
+        In nanoseconds of UTC. They differ where the clock is set back past the minute; where it is
+        set forward past it, both are the moment of the change.
+    """
+    shown = datetime(day.year, day.month, day.day, *divmod(minute, 60), tzinfo=zone)
+    first, last = (int(shown.replace(fold=fold).timestamp()) for fold in (0, 1))
+    if first > last:  # the offset before the change gives a time after it, and the other way round
+        first = last = _change_between(last, first, zone)
+    return first * NANOSECONDS, last * NANOSECONDS
+
+
+def _change_between(before: int, after: int, zone: tzinfo) -> int:
+    """Return the second at which the clock is changed between two times, in seconds of UTC."""
+    offset = datetime.fromtimestamp(before, UTC).astimezone(zone).utcoffset()
+    while after - before > 1:
+        middle = (before + after) // 2
+        if datetime.fromtimestamp(middle, UTC).astimezone(zone).utcoffset() == offset:
+            before = middle
+        else:
+            after = middle
+    return after
+
+
+def days_around(start: int, end: int, zone: tzinfo) -> list[date]:
+    """List the days of the home from the one before a time to the one of a later time."""
+    first = local_time(start, zone).date() - timedelta(days=1)
+    last = local_time(end, zone).date()
+    return [first + timedelta(days=number) for number in range((last - first).days + 1)]
+
+
+def end_of_quiet(hours: list[QuietHours], time: int, zone: tzinfo) -> int:
+    """Return when quiet hours are over; the time itself outside of them.
+
+    Returns
+    -------
+    int
+        In nanoseconds of UTC; where all of the day is quiet, no later than a day from the time.
+    """
+    until = time
+    for _ in hours:  # one may begin where another ends
+        moment = local_time(until, zone)
+        left = max(each.minutes_left(60 * moment.hour + moment.minute) for each in hours)
+        if not left:
+            break
+        day, minute = divmod(60 * moment.hour + moment.minute + left, 24 * 60)
+        ends = wall_times(moment.date() + timedelta(days=day), minute, zone)
+        until = next(end for end in (*ends, until + left * 60 * NANOSECONDS) if end > until)
+    return until
+
+
+_MINUTE = 60 * NANOSECONDS
+
+
+def none_by_conditions(
+    rule: NoneBy, heard: HomeActivity, start: int, end: int, zone: tzinfo
+) -> list[Condition]:
+    """Find the days on which nothing of a class was heard by a time, or too little to tell."""
+    windows = [
+        (first, last)
+        for day in days_around(start, end, zone)
+        for first, last in [_window(rule, day, zone)]
+        if start <= last < end and first < last
+    ]
+    if not windows:
+        return []
+    events = events_of_rule(rule, heard)
+    listened = heard.listened(rule.label, rule.microphone)
+    conditions = []
+    for first, last in windows:
+        if ((events.counted < last) & (events.ends > first)).any():
+            continue
+        share = cut(listened, first, last).length / (last - first)
+        is_known = share >= rule.least_share
+        conditions.append(
+            Condition(last, last + 1, _none_text(rule, share, is_known=is_known), is_known)
+        )
+    return conditions
+
+
+def _window(rule: NoneBy, day: date, zone: tzinfo) -> tuple[int, int]:
+    """Return the window that ends on a day: the longest one that the clock may mean."""
+    began = day if rule.since < rule.by else day - timedelta(days=1)
+    return wall_times(began, rule.since, zone)[0], wall_times(day, rule.by, zone)[1]
+
+
+def _none_text(rule: NoneBy, share: float, *, is_known: bool) -> str:
+    hours = f"from {_clock(rule.since)} to {_clock(rule.by)}"
+    if is_known:
+        return f"{rule.words}: none {hours}"
+    heard = f"{int(100 * share)} %"
+    return f"{rule.words} {hours}: not known, for only {heard} of that time was heard"
+
+
+def _clock(minute: int) -> str:
+    hours, minutes = divmod(minute, 60)
+    return f"{hours:02}:{minutes:02}"
+
+
+def unlike_conditions(
+    rule: UnlikeUsual, heard: HomeActivity, start: int, end: int, zone: tzinfo
+) -> list[Condition]:
+    """Find the days, or nights, that were outside of what the four weeks before them had.
+
+    Parameters
+    ----------
+    heard : HomeActivity
+        From 31 days before the start on.
+    """
+    days = judged_days(rule, start, end, zone)
+    if not days:
+        return []
+    figures = _Figures(rule, heard, zone)
+    conditions = []
+    for day, time in days:
+        own = figures.of(day)
+        baseline = usual_range(
+            [figures.of(day - timedelta(days=ago)) for ago in range(1, BASELINE_DAYS + 1)]
+        )
+        if own is not None and baseline is not None and _is_unlike(rule, own.middle, baseline):
+            conditions.append(Condition(time, time + 1, _unlike_text(rule, day, own, baseline)))
+    return conditions
+
+
+def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tuple[date, int]]:
+    """List the days on which a rule is to be evaluated in a span of time, and when.
+
+    Returns
+    -------
+    list of (date, int)
+        The times are in nanoseconds of UTC.
+    """
+    times = [(day, wall_times(day, rule.at, zone)[1]) for day in days_around(start, end, zone)]
+    return [(day, time) for day, time in times if start <= time < end]
+
+
+class _Figures:
+    """The figure that is compared, of each day that was heard for the most part."""
+
+    def __init__(self, rule: UnlikeUsual, heard: HomeActivity, zone: tzinfo) -> None:
+        self._rule = rule
+        self._zone = zone
+        self._events = events_of_rule(rule, heard)
+        self._heard = self._events.heard_counted()
+        self._listened = heard.listened(rule.label, rule.microphone)
+        self._known: dict[date, Count | Duration | None] = {}
+
+    def of(self, day: date) -> Count | Duration | None:
+        """Return the figure that is judged on a day."""
+        if day not in self._known:
+            self._known[day] = self._figure(*_part(self._rule, day, self._zone))
+        return self._known[day]
+
+    def _figure(self, start: int, end: int) -> Count | Duration | None:
+        listened = cut(self._listened, start, end).length
+        if listened < self._rule.least_share * (end - start):
+            return None
+        counted = self._events.counted
+        events = int(np.searchsorted(counted, end) - np.searchsorted(counted, start))
+        if self._rule.of == "count":
+            return Count(events)
+        lump = self._rule.least_seconds / 60 * events
+        return Duration(cut(self._heard, start, end).length / _MINUTE + lump)
+
+
+def _part(rule: UnlikeUsual, day: date, zone: tzinfo) -> tuple[int, int]:
+    before = day - timedelta(days=1)
+    if rule.part == "day":
+        return day_span(before, zone)
+    return at_hour(before, EVENING, zone), at_hour(day, MORNING, zone)
+
+
+def _is_unlike(rule: UnlikeUsual, value: float, baseline: UsualRange) -> bool:
+    more = value > baseline.highest * (1 + rule.margin)
+    less = value < baseline.lowest * (1 - rule.margin)
+    return (more and rule.which != "less") or (less and rule.which != "more")
+
+
+def _unlike_text(rule: UnlikeUsual, day: date, own: Count | Duration, baseline: UsualRange) -> str:
+    when = f"on {day - timedelta(days=1)}" if rule.part == "day" else f"in the night to {day}"
+    times = " times" if rule.of == "count" else ""
+    usually = own.spread(*baseline)
+    return f"{rule.words} {when}: {own.show(own.middle)}{times}, usually {usually}"
+
+
+def unusual_conditions(
+    rule: UnusualDay, heard: HomeActivity, start: int, end: int, zone: tzinfo
+) -> list[Condition]:
+    """Find the days that were unlike the four weeks before them, each in the morning after it.
+
+    Parameters
+    ----------
+    heard : HomeActivity
+        From 34 days before the start on.
+    """
+    mornings = judged_days(rule, start, end, zone)
+    if not mornings:
+        return []
+    routines = Routines(Profiles(home_sound(heard), zone, night_after=True))
+    conditions = []
+    for morning, time in mornings:
+        judged = routines.judge(morning - timedelta(days=1))
+        if judged is not None and judged.once_in >= rule.once_in:
+            day = short_day(judged.day)
+            why = differences_text(judged)
+            text = f"{day} and the night after it, {rarity_text(judged)}: {why}"
+            conditions.append(Condition(time, time + 1, text))
+    return conditions
+
+
+def home_sound(heard: HomeActivity) -> HomeSegments:
+    """Return what routines are learned from."""
+    coverage = heard.listened(ANY_SOUND, "")
+    parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
+    parts += [_labelled(name, own.starts, own.ends) for name, own in heard.sounds.items()]
+    starts, ends, labels = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("starts", "ends", "labels")
+    )
+    order = np.argsort(starts, kind="stable")
+    of_home = [own for name, own in heard.classes.items() if not is_of_scenario(name)]
+    known = dict.fromkeys(sorted(set(heard.sounds).union(*of_home)))
+    return HomeSegments(
+        Labelling(starts[order], ends[order], labels[order]),
+        {name: heard.listened(name, "") for name in known},
+    )
+
+
+def _labelled(name: str, starts: Int64, ends: Int64) -> Labelling:
+    return Labelling(starts, ends, np.full(len(starts), name, object))
+
+
+NEW = RuleState()
+
+
+def notifications(  # noqa: PLR0913, PLR0917
+    rule: AlertRule,
+    heard: HomeActivity,
+    start: int,
+    end: int,
+    zone: tzinfo,
+    state: RuleState = NEW,
+) -> tuple[list[Notification], RuleState]:
+    """Find the notifications of a rule in a span of time.
+
+    There is one when its condition begins, and no other while it lasts. Where it begins within
+    the cooldown of the one before, the notification comes at the cooldown's end, if the condition
+    still lasts then.
+
+    Parameters
+    ----------
+    start, end : int
+        In nanoseconds of UTC: from the start on, before the end.
+    state : RuleState, optional
+        What an evaluation up to the start has returned; by default there was none.
+    """
+    found: list[Notification] = []
+    last, has_rung = state.last, False
+    for condition in _conditions(rule, heard, start, end, zone, state.since):
+        if condition.end <= start or condition.start >= end:
+            continue
+        goes_on = condition.start < start
+        rung = goes_on and state.has_rung
+        time = max(condition.start, start, last + rule.cooldown)
+        if not rung and time < min(condition.end, end):
+            found.append(_notification(rule, heard, condition, time, zone))
+            last, rung = time, True
+        has_rung = rung and condition.end >= end
+    return found, RuleState(last, has_rung, state.since)
+
+
+def _conditions(  # noqa: PLR0913, PLR0917
+    rule: AlertRule, heard: HomeActivity, start: int, end: int, zone: tzinfo, since: int
+) -> Sequence[Condition]:
+    """Find when what a rule looks for is the case; ascending, and apart from each other."""
+    if isinstance(rule, MoreThan):
+        return more_than_conditions(rule, heard, end)
+    if isinstance(rule, LongerThan):
+        return longer_than_conditions(rule, heard)
+    if isinstance(rule, RecorderSilent):
+        return silent_conditions(rule, heard, start, end, since)
+    if isinstance(rule, NoneBy):
+        return none_by_conditions(rule, heard, start, end, zone)
+    if isinstance(rule, UnusualDay):
+        return unusual_conditions(rule, heard, start, end, zone)
+    return unlike_conditions(rule, heard, start, end, zone)
+
+
+def _notification(
+    rule: AlertRule, heard: HomeActivity, condition: Condition, time: int, zone: tzinfo
+) -> Notification:
+    due = end_of_quiet(rule.hours(), time, zone)
+    return Notification(
+        rule.name, time, _text(rule, heard, condition, time, zone), condition.is_known, due
+    )
+
+
+def _text(
+    rule: AlertRule, heard: HomeActivity, condition: Condition, time: int, zone: tzinfo
+) -> str:
+    if isinstance(rule, MoreThan):
+        return more_than_text(rule, heard, time)
+    if isinstance(rule, LongerThan):
+        began = longer_than_start(rule, heard, time)
+        return longer_than_text(rule, f"{local_time(began, zone):%H:%M}")
+    return silent_text(rule) if isinstance(rule, RecorderSilent) else condition.text

@@ -1,0 +1,180 @@
+"""Checks of rules against the configuration and its models, for rules that cannot ring."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.bridge.alerts.rules import (
+    MINUTE,
+    AlertRule,
+    MoreThan,
+    SoundRule,
+    UnlikeUsual,
+    UnusualDay,
+    duration_words,
+    pause_of,
+)
+from hearthlog.analyzer.bridge.events import ANY_SOUND
+from hearthlog.analyzer.bridge.home import source_microphone, source_name
+from hearthlog.analyzer.report.values import FEWEST as FEWEST_USUAL
+from hearthlog.analyzer.routine.day_anomaly import FEWEST as FEWEST_ROUTINE
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
+from hearthlog.models.classifiers.names import AUDIOSET
+from hearthlog.models.embedding.sound_names import audioset_names
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.modelfile import SUFFIX, load_model, starter_for
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, DEFAULT_MODEL, list_models
+from hearthlog.models.starter import GENERAL
+from hearthlog.recorder.config import NO_MODEL, Settings
+from hearthlog.recorder.labelling.embedder_probe import likely_network
+from hearthlog.schemas.errors import listed
+
+
+def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> str:
+    """Say that no model knows the class of a rule; empty if one does, or if nothing is known."""
+    if not isinstance(rule, SoundRule) or rule.label == ANY_SOUND:
+        return ""
+    own = [
+        names for name, names in classes.items() if rule.microphone in {"", source_microphone(name)}
+    ]
+    if not own or any(rule.label in names for names in own):
+        return ""
+    there = listed(sorted(set().union(*own) - {SILENCE}), "and")
+    return (
+        f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard; "
+        f"there are {there}{_of_network(rule.label)}"
+    )
+
+
+def _of_network(label: str) -> str:
+    """Say what the names of the network of sounds have of a class; empty if they have it not."""
+    name = next((each for each in audioset_names() if each.name == label), None)
+    if name is None:
+        return ""
+    if name.is_event:
+        return f'; scenarios = {{{AUDIOSET} = "{AUDIOSET}"}} brings it, with a network of sounds'
+    return "; a network of sounds has a name for it, which is a hint alone: it is not counted"
+
+
+def unknown_microphone(
+    rule: AlertRule, microphones: Collection[str], *, recorded: bool = False
+) -> str:
+    """Say that there is no microphone of the name that a rule has; empty if there is.
+
+    Parameters
+    ----------
+    recorded : bool, optional
+        Whether these are the ones that logs have something of, not those that are configured.
+    """
+    name = rule.microphone if isinstance(rule, SoundRule) else ""
+    if not microphones or name in {"", *microphones}:
+        return ""
+    lacks = (
+        f"nothing of the microphone {name!r} was recorded in this time"
+        if recorded
+        else f"there is no microphone {name!r}, so that it hears nothing"
+    )
+    return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
+
+
+def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
+    """Say that nothing labels what the microphone of a rule hears; empty if something does."""
+    if not isinstance(rule, SoundRule) or rule.microphone not in microphones:
+        return ""
+    return (
+        f"{rule.name}: the microphone {rule.microphone!r} has no model, so that no sound of it has "
+        "a class"
+    )
+
+
+_JUDGED_AND_TODAY = 2  # days, besides those that a day is compared with
+
+
+def rule_doubts(
+    rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
+) -> Iterator[str]:
+    """Say which rules cannot ring, whatever sounds, by what the recorder is configured to do.
+
+    Parameters
+    ----------
+    microphones : sequence of str
+        The names of those that are configured; without any nothing is known of them.
+    """
+    for rule in rules:
+        lines = unknown_microphone(rule, microphones), impossible_amount(rule)
+        yield from filter(None, (*lines, unkept_days(rule, settings)))
+
+
+def impossible_amount(rule: AlertRule) -> str:
+    """Say that a window cannot hold what a rule asks for; empty if it can."""
+    if not isinstance(rule, MoreThan):
+        return ""
+    if rule.minutes is not None and rule.minutes * MINUTE >= rule.window:
+        amount = f"{rule.minutes:g} minutes"
+    # Events have more than a pause between them, and the first one may end as the window begins.
+    elif rule.count is not None and rule.count > rule.window // pause_of(rule) + 1:
+        amount = f"{rule.count} events"
+    else:
+        return ""
+    return (
+        f"{rule.name}: there cannot be more than {amount} in a window of "
+        f"{duration_words(rule.window)}, so that it never rings"
+    )
+
+
+def unkept_days(rule: AlertRule, settings: Settings) -> str:
+    """Say that logs are deleted before there are enough days to compare with; empty if not."""
+    if isinstance(rule, UnlikeUsual):
+        fewest = FEWEST_USUAL
+    elif isinstance(rule, UnusualDay):
+        fewest = FEWEST_ROUTINE
+    else:
+        return ""
+    needed, kept = fewest + _JUDGED_AND_TODAY, settings.retention_days
+    if not 0 < kept < needed:
+        return ""
+    return (
+        f"{rule.name}: retention_days = {kept} leaves it no {fewest} days to compare with, so that "
+        f"it never rings; keep {needed} or more"
+    )
+
+
+def unheard_classes(
+    rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
+) -> Iterator[str]:
+    """Say which rules have a class that no model knows, or a microphone without a model."""
+    models = {
+        each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
+        for each in settings.microphone
+    }
+    network = likely_network(settings.embedding)
+    classes: dict[str, set[str]] = {}
+    for name, (model, scenarios) in models.items():
+        if model != NO_MODEL and (own := _classes_of(model, network)):
+            beside = (_classes_of(each, network) for each in _beside(model))
+            classes[name] = own.union(*beside)
+        for scenario, file in scenarios.items():
+            if own := _classes_of(file, network) - OF_EVERY_SCENARIO:
+                classes[source_name(name, scenario)] = own
+    without = [name for name in microphones if models[name] == (NO_MODEL, {})]
+    for rule in rules:
+        line = unheard_microphone(rule, without) or unknown_class(rule, classes)
+        yield from filter(None, [line])
+
+
+def _classes_of(path: Path, network: str) -> set[str]:
+    is_none_yet = path == DEFAULT_MODEL and not path.is_symlink()
+    model = starter_for(Path(GENERAL) if is_none_yet else path, network)
+    try:
+        return set(map(class_name, load_model(model).classes))
+    except ModelError:  # which is said where models are checked
+        return set()
+
+
+def _beside(path: Path) -> list[Path]:
+    """Return the models of the same folder, any of which may be promoted."""
+    folder = path.parent if path.suffix == SUFFIX else DEFAULT_FOLDER
+    try:
+        entries = list_models(folder)
+    except ModelError:
+        return []
+    return [folder / f"{one.name}{SUFFIX}" for one in entries if one.model and not one.starter]

@@ -1,0 +1,301 @@
+"""Commands to the bridge: corrections of events as marks, pauses and muted classes."""
+
+import errno
+import queue
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from datetime import timedelta
+from itertools import pairwise
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Annotated, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hearthlog.analyzer.bridge.events import SoundEvent
+from hearthlog.analyzer.bridge.home import class_words
+from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.models.classes import CLASS_NAME, CLASSES, SILENCE, class_name
+from hearthlog.recorder import pause_schedule
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs, log_name, review_path, time_span
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic, spelt
+
+_LATER = 60 * NANOSECONDS  # than its end a segment is written at most
+_FIELDS = "header.stamp", "duration", "label"
+
+
+def correct_event(
+    folder: Path, node: str, event: SoundEvent, label: str, reviewer: str
+) -> list[Path]:
+    """Mark the segments of an event with another class, in the name of who says so.
+
+    Raise `BridgeError` if no log has the event any more, or a layer cannot be written.
+    """
+    try:
+        logs = _logs_of(folder, node, event)
+        spans = _segments(list(logs), event)
+        made = time.time_ns()
+        layers = []
+        for log, (first, end) in logs.items():
+            pieces = ((max(a, first), min(b, end)) for a, b in spans)
+            marks = [
+                Mark(event.microphone, a, b, label, reviewer, made, LIVE)
+                for a, b in pieces
+                if a < b
+            ]
+            if marks:
+                layers.append(write_marks(log, marks))
+    except (HearthlogError, OSError) as error:
+        raise BridgeError(f"{event.id}: cannot be marked ({error})") from error
+    if not layers:
+        raise BridgeError(f"{event.id}: no log in {folder} has this event")
+    return layers
+
+
+def _logs_of(folder: Path, node: str, event: SoundEvent) -> dict[Path, tuple[int, int]]:
+    """Return the logs of the time of an event, and which part of that time each has."""
+    begins = {}
+    for log in reversed(find_logs(folder)):
+        name = log_name(log)
+        span = time_span(log) if name.node == node and not name.layer else None
+        if span is None or span[0] > event.end:
+            continue
+        if span[1] < event.start:
+            break
+        begins[log] = span[0]
+    logs = sorted(begins)
+    edges = [event.start, *(begins[log] for log in logs[1:]), event.end]
+    return dict(zip(logs, pairwise(edges), strict=True)) if logs else {}
+
+
+def _segments(logs: list[Path], event: SoundEvent) -> list[tuple[int, int]]:
+    """Return when the segments of an event begin and end."""
+    if not logs:
+        return []
+    segments = labelling_topic(event.microphone, LIVE, "segment")
+    columns = read_columns(logs, [segments], event.start, event.end + _LATER, _FIELDS)
+    if segments not in columns:
+        return [(event.start, event.end)]
+    starts, durations, labels = (columns[segments][name].tolist() for name in _FIELDS)
+    return [
+        (start, start + duration)
+        for start, duration, label in zip(starts, durations, labels, strict=True)
+        if label == event.label and event.start <= start and start + duration <= event.end
+    ]
+
+
+REVIEWER = "page of the home"
+READ_ONLY = (
+    "It was not saved: the bridge may only read the logs, not write beside them. Whoever set up "
+    "the box can change that."
+)
+_MOST_LOGS = 64  # whose marks are read: of more than a day and a half
+_FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_BY_WORDS = {spelt(row.words): row.name for row in CLASSES}
+
+
+class EventCorrections:
+    """Corrections of the events of a recorder by people."""
+
+    def __init__(self, folder: Path, node: str) -> None:
+        self._folder = folder
+        self._node = node
+        self._marks: list[Mark] = []
+        self._own: dict[str, str] = {}  # labels by the ids of events
+        self._lock = Lock()
+
+    def read_back(self) -> None:
+        """Read what the layers of the newest logs say.
+
+        Raise `HearthlogError` if one of them is damaged.
+        """
+        logs = [log for log in find_logs(self._folder) if self._is_of_node(log)]
+        marked = [log for log in logs[-_MOST_LOGS:] if review_path(log).exists()]
+        self._marks = [mark for log in marked for mark in read_marks(log)]
+
+    def of(self, event: SoundEvent) -> str:
+        """Return what people said that an event was, in a few words; empty for nothing."""
+        label = self._own.get(event.id)
+        if label is not None:
+            return f"You said: {_in_words(label)}"
+        found = list(_over(event, self._marks))
+        if not found:
+            return ""
+        mark = max(found, key=lambda mark: min(mark.end, event.end) - max(mark.start, event.start))
+        who = "You said" if mark.reviewer == REVIEWER else "Marked"
+        return f"{who}: {_in_words(mark.label)}"
+
+    def add(self, event: SoundEvent, text: str) -> str:
+        """Mark what an event was, and return that in words.
+
+        Raise `BridgeError` if the text cannot be a class, or the event cannot be marked.
+        """
+        label = class_of(text)
+        with self._lock:
+            try:
+                correct_event(self._folder, self._node, event, label, REVIEWER)
+            except BridgeError as error:
+                raise _explained(error) from error
+            self._own[event.id] = label
+            while len(self._own) > 1000:
+                del self._own[next(iter(self._own))]
+        return self.of(event)
+
+    def _is_of_node(self, log: Path) -> bool:
+        name = log_name(log)
+        return name.node == self._node and not name.layer
+
+
+def class_of(text: str) -> str:
+    """Return the name of the class that somebody means: `Water tap` is `tap_water`.
+
+    Raise `BridgeError` if no class can have this name.
+    """
+    spelling = spelt(text.strip()).strip("_")
+    label = class_name(_BY_WORDS.get(spelling, spelling))
+    if not CLASS_NAME.fullmatch(label):
+        raise BridgeError(
+            "This name cannot be used: write it with the letters a to z, digits and spaces, "
+            "beginning with a letter."
+        )
+    return label
+
+
+def _in_words(label: str) -> str:
+    return "nothing" if label == SILENCE else class_words(label)
+
+
+def _over(event: SoundEvent, marks: list[Mark]) -> Iterator[Mark]:
+    for mark in marks:
+        if (
+            mark.microphone == event.microphone
+            and mark.start < event.end
+            and mark.end > event.start
+        ):
+            yield mark
+
+
+def _explained(error: BridgeError) -> HearthlogError:
+    """Say for people at home why something was not saved."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in _FORBIDDEN:
+            return BridgeError(READ_ONLY)
+        cause = cause.__cause__
+    return BridgeError(f"It was not saved: {error}")
+
+
+_WAITING = 20  # commands; more are refused
+_LONGEST = 4096  # bytes of one
+_MOST_MINUTES = 7 * 24 * 60
+
+FindEvent = Callable[[str], SoundEvent | None]
+
+
+class Answer(NamedTuple):
+    """What became of a command."""
+
+    done: bool
+    text: str
+
+
+class _Command(BaseModel):
+    """One of `correct` and `told`, both with `label`, `pause_minutes` and `resume`."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    by: Annotated[str, Field(max_length=100, pattern=r"^[^\x00-\x1f\x7f]*$")] = ""
+    correct: str | None = None
+    told: bool | None = None
+    label: str | None = None
+    pause_minutes: Annotated[float, Field(gt=0, le=_MOST_MINUTES)] | None = None
+    resume: bool = False
+
+    def problem(self) -> str:
+        """Return what is wrong with the command; empty if nothing is."""
+        of_class = self.correct is not None, self.told is not None
+        if sum([*of_class, self.pause_minutes is not None, self.resume]) != 1:
+            return "one of correct, told, pause_minutes and resume has to be there"
+        if (self.label is not None) != any(of_class):
+            return "label belongs to correct and told"
+        return ""
+
+
+class Commands:
+    """Carries commands out, one after the other, in a thread of its own."""
+
+    def __init__(
+        self,
+        folder: Path,
+        node: str,
+        switch: Callable[[str, bool], None],
+        answered: Callable[[Answer], None],
+    ) -> None:
+        self._folder = folder
+        self._node = node
+        self._switch = switch
+        self._answered = answered
+        self._waiting: queue.Queue[tuple[bytes, FindEvent] | None] = queue.Queue(_WAITING)
+        self._thread = Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def add(self, payload: bytes, find_event: FindEvent) -> None:
+        """Have a command carried out."""
+        try:
+            self._waiting.put_nowait((payload[: _LONGEST + 1], find_event))
+        except queue.Full:
+            self._answered(Answer(False, f"refused: {_WAITING} commands are waiting already"))
+
+    def close(self) -> None:
+        """End when the command that is carried out is done."""
+        with suppress(queue.Empty):
+            while True:
+                self._waiting.get_nowait()
+        self._waiting.put(None)
+
+    def _work(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            try:
+                self._answered(Answer(True, self._carry_out(*item)))
+            except Exception as error:  # noqa: BLE001  the next one is to be carried out
+                self._answered(Answer(False, f"refused: {error}"))
+
+    def _carry_out(self, payload: bytes, find_event: FindEvent) -> str:
+        command = _parse(payload)
+        by = command.by or "mqtt"
+        if command.resume:
+            was_paused = pause_schedule.resume(self._folder)
+            return "it listens again" if was_paused else "it was not paused"
+        if command.pause_minutes is not None:
+            pause_schedule.pause(self._folder, timedelta(minutes=command.pause_minutes), by)
+            return f"paused for {command.pause_minutes:g} minutes by {by}"
+        label = spelt(command.label or "")
+        if not CLASS_NAME.fullmatch(label):
+            raise BridgeError(f"{label[:64]!r} cannot be the name of a class")
+        if command.told is not None:
+            self._switch(label, command.told)
+            return f"{label} is {'' if command.told else 'not '}told of, says {by}"
+        event = find_event(command.correct or "")
+        if event is None:
+            raise BridgeError(f"{(command.correct or '')[:100]!r} is no event since last evening")
+        correct_event(self._folder, self._node, event, label, by)
+        return f"{event.id} was {label}, says {by}"
+
+
+def _parse(payload: bytes) -> _Command:
+    if len(payload) > _LONGEST:
+        raise BridgeError(f"a command has {_LONGEST} bytes at most")
+    try:
+        command = _Command.model_validate_json(payload)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "command"
+        raise BridgeError(f"{where}: {first['msg']}") from error
+    if problem := command.problem():
+        raise BridgeError(problem)
+    return command
