@@ -14,6 +14,7 @@ from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.replay.player import ReplayOptions
 from hearthlog.analyzer.replay.replay import LogSet
 from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.analyzer.training.train import (
     FRAME_SECONDS,
     LAG_SECONDS,
@@ -47,7 +48,6 @@ from hearthlog.schemas.messages.message_types import (
     nanoseconds,
     time_message,
 )
-from hearthlog.tools.lab.hidden_markov import viterbi
 
 SECOND = 1_000_000_000
 START = 1_772_350_200 * SECOND
