@@ -6,7 +6,7 @@ import re
 import shlex
 import shutil
 from importlib.resources import files
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import collectionfolders as made
@@ -401,3 +401,21 @@ def test_a_command_that_is_shown_can_be_run(home, command, tmp_path, monkeypatch
 def test_most_of_the_shown_commands_are_run():
     skipped = [line for line in SHOWN if NOT_HERE.match(line)]
     assert len(skipped) < len(SHOWN) / 2
+
+
+def contributions():
+    """Yield the rows of the table of changes: what is added, and the files to write and to change."""
+    table = (ROOT / "CONTRIBUTING.md").read_text().partition("| to add |")[2]
+    for row in table.partition("\n\n")[0].splitlines()[2:]:
+        what, *cells = (cell.strip() for cell in row.strip("|").split("|"))
+        path = re.compile(r"`([\w./]+/[\w./]*)`(?! or)")  # of two alternatives, one
+        yield what, [path.findall(cell) for cell in cells]
+
+
+@pytest.mark.parametrize(("what", "paths"), [*contributions()])
+def test_a_typical_change_touches_at_most_three_files_that_exist(what, paths):
+    *changed, tested = paths
+    assert 1 <= len([*chain(*changed)]) <= 3
+    assert tested
+    for path in chain(*paths):
+        assert (ROOT / path).exists(), f"{what}: {path}"

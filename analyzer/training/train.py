@@ -190,7 +190,6 @@ def merged_spans(spans: Int64) -> list[list[int]]:
 
 
 MOST_FOLDS = 5
-SMOOTHINGS = ("hmm", "merge")
 _SHUFFLES = 20
 
 

@@ -146,6 +146,9 @@ class Elsewhere(_Record):
     calibration_errors: dict[_ClassName, _Share] = {}
 
 
+SmoothingMethod = Literal["hmm", "merge"]
+
+
 class Smoothing(_Record):
     """How labels become segments.
 
@@ -160,7 +163,7 @@ class Smoothing(_Record):
         then the probability of silence counts by itself. None: the probabilities count as they are.
     """
 
-    method: Literal["merge", "hmm"]
+    method: SmoothingMethod
     lag_seconds: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
     weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)] = 1.0
     reach_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -318,10 +318,10 @@ def _tell_left_out(left_out: "Sequence[SkippedClip]") -> None:
 
 
 def _check_smoothing(name: str) -> None:
-    from hearthlog.analyzer.training.train import SMOOTHINGS
+    from hearthlog.models.classifiers.model import SmoothingMethod
 
-    if name not in SMOOTHINGS:
-        wrong_use(f"--smoothing {name}: choose one of {', '.join(SMOOTHINGS)}")
+    if name not in get_args(SmoothingMethod):
+        wrong_use(f"--smoothing {name}: choose one of {', '.join(get_args(SmoothingMethod))}")
 
 
 def _learned_voices(
