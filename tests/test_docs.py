@@ -404,7 +404,7 @@ def test_most_of_the_shown_commands_are_run():
 
 
 def contributions():
-    """Yield the rows of the table of changes: what is added, and the files to write and to change."""
+    """Yield what each row of the table of changes adds, and the files that it names."""
     table = (ROOT / "CONTRIBUTING.md").read_text().partition("| to add |")[2]
     for row in table.partition("\n\n")[0].splitlines()[2:]:
         what, *cells = (cell.strip() for cell in row.strip("|").split("|"))
