@@ -423,7 +423,7 @@ def test_a_network_that_was_changed_is_refused(own):
 
 
 def test_a_network_that_never_ends_is_refused(own, monkeypatch):
-    monkeypatch.setattr("hearthlog.models.embedding.onnx_session._PATIENCE_SECONDS", 0.3)
+    monkeypatch.setattr("hearthlog.models.embedding.session._PATIENCE_SECONDS", 0.3)
     body = helper.make_graph(
         [
             helper.make_node(kind, [a], [b])

@@ -14,9 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.onnx_session import OnnxSession
 from hearthlog.models.embedding.projection import Int8, Projection, read_projection
-from hearthlog.models.embedding.session import NetworkOutput, NetworkSession, TfliteSession
+from hearthlog.models.embedding.session import (
+    NetworkOutput,
+    NetworkSession,
+    OnnxSession,
+    TfliteSession,
+)
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32

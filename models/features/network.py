@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from hearthlog.models.embedding.networks import network_folders
-from hearthlog.models.embedding.onnx_session import OnnxModel
+from hearthlog.models.embedding.session import OnnxModel
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32, Float64
