@@ -17,7 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.gate.recent_time import reference
 from hearthlog.analyzer.logs.catalog import read_catalog
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labelling import Labellings, LogContents, find_labellings
+from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings, find_labellings
 from hearthlog.analyzer.marks.marks import (
     PERSON,
     RANDOM,
@@ -145,7 +145,7 @@ def test_a_scenario_that_is_called_like_something_else_is_not_taken_for_it(home,
     with pytest.raises(DataError, match="no labelling 'relabel/water'"):
         reference(home)
     topics = frozenset(f"/mic/{name}/segment" for name in (WATER, "relabel/water"))
-    sources = Labellings([LogContents(home, 0, 0, True, topics, {})])
+    sources = Labellings([LabelledFile(home, 0, 0, True, topics, {})])
     with pytest.raises(DataError, match=f"which 'water'. There is relabel/water and {WATER}"):
         sources.find("mic", "water")
     assert [sources.find("mic", name) for name in (WATER, "relabel")] == [WATER, "relabel/water"]

@@ -153,7 +153,7 @@ LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
 _EVER = 1 << 62  # nanoseconds
 
 
-class LogContents(NamedTuple):
+class LabelledFile(NamedTuple):
     """A log or a layer, and what labels it has."""
 
     path: Path
@@ -182,7 +182,7 @@ class NamedLabelling(NamedTuple):
 class Labellings:
     """The labellings of a log, or of a folder of logs."""
 
-    logs: Sequence[LogContents]  # with their layers, in the order of time
+    logs: Sequence[LabelledFile]  # with their layers, in the order of time
     losses: list[str] = field(default_factory=list)  # what could not be used, and why
 
     def microphone(self, name: str | None) -> str:
@@ -307,7 +307,7 @@ class Labellings:
 
     def with_topic(
         self, topic: str, start: int | None = None, end: int | None = None
-    ) -> list[LogContents]:
+    ) -> list[LabelledFile]:
         """List the logs that have a topic and may have messages in a span of time.
 
         Parameters
@@ -320,7 +320,7 @@ class Labellings:
 
         Returns
         -------
-        list of LogContents
+        list of LabelledFile
             In the order of time.
         """
         return [
@@ -407,14 +407,14 @@ def find_labellings(*paths: Path) -> Labellings:
         If there is no log, if none can be read, or if none has a message.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
-    logs = [log for log in opened if isinstance(log, LogContents)]
+    logs = [log for log in opened if isinstance(log, LabelledFile)]
     losses = [str(error) for error in opened if isinstance(error, LogError)]
     if not logs:
         raise LogError(losses[0] if losses else f"{paths[0]}: there is no message in these logs")
     return Labellings(sorted(logs, key=lambda log: log.first), losses)
 
 
-def _opened(path: Path) -> LogContents | LogError | None:
+def _opened(path: Path) -> LabelledFile | LogError | None:
     """Look into a log; None if it is sound, and empty."""
     try:
         selection = select([path])
@@ -427,7 +427,7 @@ def _opened(path: Path) -> LogContents | LogError | None:
     return None if complete else LogError(f"{path}: unfinished, and nothing of it is whole")
 
 
-def _log(path: Path, selection: LogSelection) -> LogContents:
+def _log(path: Path, selection: LogSelection) -> LabelledFile:
     classes = {
         topic: [
             name
@@ -437,4 +437,4 @@ def _log(path: Path, selection: LogSelection) -> LogContents:
         for topic in selection.topics_of(message_types.LABEL, LABEL_FIELDS)
     }
     segments = frozenset(selection.topics_of(message_types.SEGMENT, SEGMENT_FIELDS))
-    return LogContents(path, *selection.span, not selection.unfinished, segments, classes)
+    return LabelledFile(path, *selection.span, not selection.unfinished, segments, classes)

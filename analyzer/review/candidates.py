@@ -12,7 +12,7 @@ from hearthlog.analyzer.evaluation.event_scores import Events, events_of
 from hearthlog.analyzer.gate.paired_labels import ChangedTime, find_changed_time
 from hearthlog.analyzer.gate.promotion_check import find_champion, other_features
 from hearthlog.analyzer.gate.recent_time import recent_logs
-from hearthlog.analyzer.logs.labelling import Labelling, Labellings, LogContents, NamedLabelling
+from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay
 from hearthlog.analyzer.marks.marks import RANDOM, read_review
@@ -140,7 +140,7 @@ def _named(
     return Events(starts, ends, labels), np.array([row[3] for row in kept], np.float64)
 
 
-def _embedded(log: LogContents, microphone: str) -> Iterator[tuple[Embeddings, Projection]]:
+def _embedded(log: LabelledFile, microphone: str) -> Iterator[tuple[Embeddings, Projection]]:
     """Yield the embeddings of a log, of which frames follow, with their projection."""
     name = topic(microphone, "embedding")
     columns = read_columns([log.path], {name}, fields=EMBEDDING_FIELDS).get(name)

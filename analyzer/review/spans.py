@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events
-from hearthlog.analyzer.logs.labelling import Labellings, LogContents
+from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
@@ -287,7 +287,7 @@ class SpanSounds(NamedTuple):
 
 
 def labelling_model(
-    logs: list[LogContents], microphone: str, models: Path, scenario: str = ""
+    logs: list[LabelledFile], microphone: str, models: Path, scenario: str = ""
 ) -> Model | None:
     """Find the model that labelled a microphone in the latest of some logs or layers.
 
