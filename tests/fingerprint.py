@@ -30,7 +30,9 @@ _CLIPS_PER_CLASS = 24
 _HEADER = ("classes", "scenario", "cost", "gamma", "inverse_temperature", "smoothing", "metrics")
 _NOT_FIELDS = {"__msgtype__", "made"}  # a mark says when it was made
 # What differs from run to run, or is not the content: versions, digests, times, folders.
-_NOT_CONTENT = re.compile(r"\b(\d+\.\d+\.\d+|[0-9a-f]{12,64}|\d+\.\d+ MB)\b")
+_NOT_CONTENT = re.compile(
+    r"\b(\d+\.\d+\.\d+|[0-9a-f]{12,64}|\d+\.\d+ MB)\b|\"took_seconds\": [\d.e-]+"
+)
 
 
 def main() -> None:
