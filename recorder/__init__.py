@@ -1,1 +1,1 @@
-"""The box in the home: capture, features, statistics and the log being written."""
+"""Recorder: capture, features, statistics and the live log."""

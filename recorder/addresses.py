@@ -1,4 +1,4 @@
-"""Addresses of sound in the network, and the names under which the log has them."""
+"""Network addresses of sound, and their public names for the log."""
 
 import re
 from typing import NamedTuple
@@ -13,14 +13,14 @@ _MOST_CHARACTERS = 2000
 
 
 def is_address(device: str) -> bool:
-    """Return whether a device is one in the network, and not at this machine."""
+    """Return whether a device is a network address rather than a local device."""
     return "://" in device
 
 
 class TopicAddress(NamedTuple):
-    """A topic of ROS 2 on which sound is published.
+    """A ROS 2 topic with sound.
 
-    `rate` (Hz) and `channels` are those of messages that do not say so themselves.
+    `rate` (Hz) and `channels` apply to messages without these fields.
     """
 
     topic: str
@@ -29,17 +29,17 @@ class TopicAddress(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The address, without these."""
+        """The address without parameters."""
         return f"{_TOPIC_SCHEME}://{self.topic}"
 
 
 def is_topic(device: str) -> bool:
-    """Return whether a device is a topic of ROS 2."""
+    """Return whether a device is a ROS 2 topic."""
     return device.startswith(f"{_TOPIC_SCHEME}://")
 
 
 def read_topic(address: str) -> TopicAddress:
-    """Read the address of a topic.
+    """Parse the address of a topic.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def read_topic(address: str) -> TopicAddress:
     Raises
     ------
     SourceError
-        If it is none.
+        If it is no such address.
     """
     form = "write it as ros2:///robot/audio, or ros2:///robot/audio?rate=48000&channels=4"
     topic, _, parameters = address.removeprefix(f"{_TOPIC_SCHEME}://").partition("?")
@@ -64,10 +64,10 @@ def read_topic(address: str) -> TopicAddress:
 
 
 def check_address(address: str) -> None:
-    """Check what can be known of an address without the network.
+    """Check an address as far as possible without the network.
 
-    Raise `SourceError` if it is of a kind that is not taken, has no host, or cannot be read.
-    The message does not repeat it, for it may have a password.
+    Raise `SourceError` if its scheme is unsupported, its host is missing, or it cannot be parsed.
+    The message does not repeat the address, as it may contain a password.
     """
     if re.search(r"[\0-\x20\x7f]", address) or len(address) > _MOST_CHARACTERS:
         raise SourceError(
@@ -92,7 +92,7 @@ def check_address(address: str) -> None:
 
 
 def _has_host(address: str) -> bool:
-    """Return whether it is clear which part is the host."""
+    """Return whether the host is unambiguous."""
     try:
         parts = urlsplit(address)
         host, _ = parts.hostname, parts.port
@@ -102,7 +102,7 @@ def _has_host(address: str) -> bool:
 
 
 def public_name(device: str) -> str:
-    """Name a device for the log: an address without its user, password and parameters."""
+    """Return a device's name for the log: an address without user, password and parameters."""
     if not is_address(device):
         return device
     if is_topic(device):
@@ -110,7 +110,7 @@ def public_name(device: str) -> str:
     scheme, _, rest = device.partition("://")
     place = re.split(r"[/?#]", rest, maxsplit=1)[0]
     path = rest.removeprefix(place)
-    if "@" in path:  # where the password ends cannot be told
+    if "@" in path:  # the end of the password is ambiguous
         return f"{scheme}://…"
     # Some cameras have `user=…&password=…` in their paths.
     return f"{scheme}://{place.rpartition('@')[2]}" + re.sub(r"[^/]*[=&?#].*", "…", path)

@@ -38,13 +38,13 @@ from hearthlog.schemas.messages.topics import check_microphone_name, check_scena
 
 ReadableBy = Literal["owner", "group", "all"]
 Keep = Literal["off", "events", "unsure", "always"]
-NO_MODEL = Path("none")  # in place of a model file: there are no labels
-BRIDGE = "bridge"  # the table of the file that is not the recorder's
+NO_MODEL = Path("none")  # instead of a model file: no labels
+BRIDGE = "bridge"  # table of the bridge, ignored by the recorder
 _MOST_DAYS = 700_000
 _MOST_FILES = 1 << 31
 _MOST_FRAMES = 1 << 31
 _MOST_MEGABYTES = 1_000_000_000
-_LEAST_BAG_SIZE = 1_000_000  # so that no two files begin in one second
+_LEAST_BAG_SIZE = 1_000_000  # no two files may begin in the same second
 
 
 def _checked(check: Any) -> AfterValidator:
@@ -127,12 +127,12 @@ class MicrophoneSettings(BaseModel):
 
     @property
     def geometry(self) -> ArrayGeometry | None:
-        """Where the microphones of the array are; None without one."""
+        """Microphone positions of the array; None without an array."""
         return array_geometry(self.array) if self.array else None
 
     @property
     def channels(self) -> int | None:
-        """How many channels the array has; None without one."""
+        """Number of channels of the array; None without an array."""
         return len(self.array) or None
 
     @model_validator(mode="after")
@@ -269,7 +269,7 @@ class Settings(BaseModel):
     )
 
     def keeping_rules(self) -> KeepingRules:
-        """Return what is kept of the finished logs."""
+        """Return the retention and thinning rules."""
         limits = Limits(
             self.retention_days, self.max_bag_files, self.max_record_size, self.min_free_space
         )
@@ -279,15 +279,15 @@ class Settings(BaseModel):
         return KeepingRules(str(self.output), self.node, limits, thinning)
 
     def settings_of(self, microphone: str) -> MicrophoneSettings:
-        """Return what is configured of a microphone."""
+        """Return the settings of a microphone by name."""
         return next(each for each in self.microphone if each.name == microphone)
 
     def scenarios_of(self, microphone: MicrophoneSettings) -> dict[str, Path]:
-        """Return the model files of the scenarios of a microphone, by their names."""
+        """Return the model files of a microphone's scenarios, by scenario name."""
         return self.scenarios if microphone.scenarios is None else microphone.scenarios
 
     def rest(self) -> PauseSchedule:
-        """Return when the microphones are closed."""
+        """Return the pause schedule."""
         hours = [quiet_hours(text) for text in self.quiet_hours]
         return PauseSchedule(hours, time_zone(self.timezone), self.output)
 
@@ -299,7 +299,7 @@ class Settings(BaseModel):
         return size
 
 
-_OTHERS: dict[str, type[BaseModel]] = {  # tables whose keys may have been meant
+_OTHERS: dict[str, type[BaseModel]] = {  # tables with keys to suggest
     "above the first table": Settings,
     "below [[microphone]]": MicrophoneSettings,
 }
@@ -308,9 +308,9 @@ _OTHERS: dict[str, type[BaseModel]] = {  # tables whose keys may have been meant
 def load_settings(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> Settings:
-    """Combine the command line, the environment, the file and the defaults.
+    """Load settings from the command line, the environment, the file and the defaults.
 
-    The first of these that has a value gives it.
+    Earlier sources take precedence.
 
     Parameters
     ----------
@@ -320,14 +320,14 @@ def load_settings(
     Raises
     ------
     ConfigurationError
-        If the file cannot be read or is no TOML, if a variable of the environment is unknown or no
-        JSON, or if a key is unknown or its value makes no sense; the message names it.
+        If the file is unreadable or not TOML, if an environment variable is unknown or not JSON, or
+        if a key is unknown or its value invalid; the message names it.
     """
     return load_with_origins(file, command_line, microphone)[0]
 
 
 def _without_scenarios(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the microphones of a file without scenarios of their own."""
+    """Return the microphones of a file without their own scenarios."""
     microphones = content.get("microphone")
     if not isinstance(microphones, list):
         return {}
@@ -344,7 +344,7 @@ def _without_scenarios(content: dict[str, Any]) -> dict[str, Any]:
 def load_with_origins(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> tuple[Settings, Origins]:
-    """Load settings as `load_settings` does, and tell where their values come from.
+    """Load settings as `load_settings` does; also return the origins of the values.
 
     Raise `ConfigurationError` as `load_settings`.
     """
@@ -373,7 +373,7 @@ def load_with_origins(
 
 
 def _environment() -> dict[str, Any]:
-    """Read the variables of the environment: one that is unknown, or no JSON, is refused."""
+    """Parse the environment variables; reject unknown names and invalid JSON."""
     values: dict[str, Any] = {}
     for variable in (name for name in sorted(os.environ) if name.upper().startswith(ENVIRONMENT)):
         name = variable[len(ENVIRONMENT) :].lower()
@@ -394,7 +394,7 @@ def _from_json(variable: str) -> Any:
 
 
 def exposed_passwords(settings: Settings, file: Path | None) -> list[str]:
-    """Return the line that says that everybody may read a file with a password; or none."""
+    """Return a warning line if everybody can read a file with a password, else no line."""
     devices = [name for each in settings.microphone for name in (each.device, each.fallback)]
     if file is None or all(public_name(device) == device for device in devices):
         return []

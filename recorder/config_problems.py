@@ -1,4 +1,4 @@
-"""Errors in a configuration: where each value comes from, and what to write instead."""
+"""Errors in a configuration: the origin of each value, and suggested corrections."""
 
 import json
 import math
@@ -24,7 +24,7 @@ Key = tuple[str | int, ...]  # such as ("microphone", 1, "device")
 
 
 class Origins(NamedTuple):
-    """What values were given, and where."""
+    """Given values and their origins."""
 
     command_line: Mapping[str, Any]
     file: Mapping[str, Any]
@@ -32,7 +32,7 @@ class Origins(NamedTuple):
     lines: Mapping[Key, int]
 
     def origin(self, key: Key) -> str:
-        """Say where the value of a key comes from."""
+        """Format the origin of a key's value."""
         first = str(key[0]) if key else ""
         if first in self.command_line:
             return "command line"
@@ -44,8 +44,8 @@ class Origins(NamedTuple):
         return f"{self.path}" if line is None else f"{self.path}, line {line}"
 
     def place(self, key: Key) -> str:
-        """Say where something is wrong: a line of the file, or what else the value comes from."""
-        every = (self.origin(key[:end]) for end in range(len(key), 0, -1))  # of what it is in
+        """Format the place of an error: a line of the file, or another origin of the value."""
+        every = (self.origin(key[:end]) for end in range(len(key), 0, -1))  # innermost first
         return next((origin for origin in every if origin != DEFAULT), "configuration")
 
     def _is_given(self, key: Key) -> bool:
@@ -59,12 +59,12 @@ class Origins(NamedTuple):
 
 
 def key_lines(text: str) -> dict[Key, int]:
-    """Return on which line each key, and each table, of a TOML file begins.
+    """Return the line on which each key and table of a TOML file begins.
 
     Parameters
     ----------
     text : str
-        Its content. Keys in tables within a line are not looked for.
+        Content of the file. Keys of inline tables are not found.
 
     Returns
     -------
@@ -93,19 +93,19 @@ def _parts(name: str) -> Key:
 
 def _variable(name: str) -> str | None:
     wanted = f"{ENVIRONMENT}{name}".upper()
-    is_a_key = name and name == name.lower()  # NODE in a file is none
+    is_a_key = name and name == name.lower()  # NODE in a file is no key
     return next((each for each in os.environ if each.upper() == wanted), None) if is_a_key else None
 
 
 def _upwards(key: Key) -> list[Key]:
-    """Return a key, and what it is in."""
+    """Return a key and the keys that contain it, innermost first."""
     return [key[:end] for end in range(len(key), 0, -1)]
 
 
 Schema = Mapping[str, Any]
 
-_LONGEST = 40  # characters of a value that are shown
-_MOST = 100  # slips that are said
+_LONGEST = 40  # characters shown of a value
+_MOST = 100  # reported errors
 _MOST_LISTED = 16  # keys of a table
 _DAY = 86_400
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": _DAY, "w": 7 * _DAY}  # seconds, by the first letter
@@ -126,14 +126,14 @@ _PLURALS = {"array": "lists", "integer": "whole numbers", "number": "numbers", "
 
 
 class _Place(NamedTuple):
-    """Where in a configuration something is wrong.
+    """Location of an error in a configuration.
 
     Attributes
     ----------
     about : Schema
-        Of the value; empty if it is unknown.
+        Schema of the value; empty if unknown.
     name : str
-        The innermost key of a table that is described; the value may be one element of its value.
+        The innermost key with a schema; the value may be one element of its value.
     """
 
     key: Key
@@ -150,12 +150,12 @@ def configuration_error(
     table: Key = (),
     others: Mapping[str, type[BaseModel]] | None = None,
 ) -> ConfigurationError:
-    """Describe everything that is wrong, a line for each slip.
+    """Format all errors, one line each.
 
     Parameters
     ----------
     others : mapping of str to type of BaseModel, optional
-        Other tables of the file, by what is written to begin them, whose keys may have been meant.
+        Other tables of the file, by their header, for suggestions of misplaced keys.
     """
     schema = model.model_json_schema()
     unknown: list[str] = []
@@ -171,7 +171,7 @@ def configuration_error(
             unknown.append(f"{where}: unknown key {_dotted(key)!r}{words}")
         else:
             rest.append((key, f"{where}: {_dotted(key)}: {_words(each, place, key)}"))
-    # A key that is missing because it is misspelt is said once.
+    # Report a misspelt key once, not also as missing.
     lines = [*unknown, *(line for key, line in rest if key not in meant)]
     more = [f"{origins.path}: {len(lines) - _MOST} more"] if len(lines) > _MOST else []
     return ConfigurationError(*dict.fromkeys(lines[:_MOST]), *more)
@@ -182,7 +182,7 @@ def _dotted(key: Key) -> str:
 
 
 def _find(root: Schema, location: Key) -> _Place:
-    """Follow the location of an error through a JSON schema; tags of unions are no keys."""
+    """Follow the location of an error through a JSON schema; union tags are not keys."""
     node = table = named = _resolved(root, root)
     key: list[str | int] = []
     name = ""
@@ -206,7 +206,7 @@ def _find(root: Schema, location: Key) -> _Place:
 
 
 def _resolved(root: Schema, node: Schema) -> Schema:
-    """Return a schema without references, and without null as another choice."""
+    """Return a schema with references resolved and null choices removed."""
     while True:
         kinds = [each for each in node.get("anyOf", ()) if each.get("type") != "null"]
         rest = {name: value for name, value in node.items() if name not in {"$ref", "anyOf"}}
@@ -221,7 +221,7 @@ def _resolved(root: Schema, node: Schema) -> Schema:
 def _unknown_key(
     name: str, table: Schema, others: Mapping[str, type[BaseModel]]
 ) -> tuple[str, str]:
-    """Return the key that was meant, and the words that say so; both empty if none is alike."""
+    """Return the suggested key and the text of the suggestion; both may be empty."""
     known = table.get("properties", {})
     if f"{name}_file" in known:
         near = f"{name}_file"
@@ -240,7 +240,7 @@ def _unknown_key(
 
 
 def _words(error: Any, place: _Place, key: Key) -> str:
-    """Say what is wrong with a value, and what to write."""
+    """Format the fault of a value and its correction."""
     kind, value, about = error["type"], error["input"], place.about
     name = place.name
     if kind in {"value_error", "assertion_error"}:
@@ -264,7 +264,7 @@ def _words(error: Any, place: _Place, key: Key) -> str:
 
 
 def _problem_of_table(value: Any, about: Schema, key: Key, name: str) -> str:
-    """Say how the table is written that something else stands for; empty if it is no table."""
+    """Format the syntax of the expected table; empty if the value is no table."""
     items = about.get("items", {})
     head = _dotted(tuple(part for part in key if isinstance(part, str)))
     if about.get("type") == "array" and ("$ref" in items or "oneOf" in items):
@@ -279,7 +279,7 @@ def _problem_of_table(value: Any, about: Schema, key: Key, name: str) -> str:
 
 
 def _description(about: Schema) -> str:
-    """Describe the values that a key takes."""
+    """Format the values that a key accepts."""
     if choices := about.get("enum", [about["const"]] if "const" in about else []):
         return f"one of {', '.join(map(json.dumps, choices))}"
     if "anyOf" in about:
@@ -305,7 +305,7 @@ def _description_of_number(about: Schema, kind: str) -> str:
 
 
 def _example_of_value(name: str, value: Any, place: _Place) -> str:
-    """Return what to write instead of a value: that value, if only its form is wrong."""
+    """Return a replacement for a value: the value itself, if only its form is wrong."""
     about = place.named
     kind, items = about.get("type"), about.get("items", {})
     is_word = isinstance(value, str) and "://" not in value and 0 < len(value) <= _LONGEST
@@ -322,14 +322,14 @@ def _example_of_value(name: str, value: Any, place: _Place) -> str:
 
 
 def _has_form_of_examples(value: str, about: Schema) -> bool:
-    """Return whether a text has its digits where the examples have theirs, if those have any."""
+    """Return whether a text has digits at the same positions as an example, if any has digits."""
     examples = [text for each in about.get("examples", ()) for text in each]
     forms = [re.sub(r"\d", "0", text) for text in examples]
     return all("0" not in form for form in forms) or re.sub(r"\d", "0", value) in forms
 
 
 def _without_unit(name: str, found: re.Match[str], about: Schema) -> str:
-    """Return a number that was written with a unit, in what the key counts; empty if unknown."""
+    """Convert a number with a unit to the unit of the key; empty if unknown."""
     number, unit = float(found[1]), _UNIT.fullmatch(found[2].lower())
     if name.endswith("_space"):
         size = _SIZE.fullmatch(found[2].lower())
@@ -371,7 +371,7 @@ def _toml(value: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Show a value, but for what may be a secret: an address, or what is in a list or a table."""
+    """Format a value, except possible secrets: addresses, and elements of lists and tables."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):

@@ -42,12 +42,12 @@ from hearthlog.schemas.new_files import (
 )
 from hearthlog.schemas.salvage.recover import lock_abandoned, thin_log, thinned_step
 
-_STATISTICS = 1  # the step that lessons do not miss
-_RIGHTS = 0o666  # of a file that nobody runs
+_STATISTICS = 1  # thinning step without effect on training
+_RIGHTS = 0o666  # no execute bits
 
 
 class Thinned(NamedTuple):
-    """A log that is to be thinned, and the step."""
+    """A log to thin, and the step."""
 
     log: RecordedLog
     step: int
@@ -56,7 +56,7 @@ class Thinned(NamedTuple):
 def plan_thinning(
     logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays
 ) -> Iterator[Thinned]:
-    """Choose the logs to thin; one that is reviewed only of statistics, for it is learned from."""
+    """Select the logs to thin; reviewed logs lose only statistics, as training needs the rest."""
     for log in logs[:-1]:
         due = limits.step(days.since(log.start))
         if not due or (kept := kept_because(log)) not in {"", REVIEWED}:
@@ -65,22 +65,22 @@ def plan_thinning(
         try:
             if thinned_step(log.path) < step:
                 yield Thinned(log, step)
-        except LogError:  # of a newer version
+        except LogError:  # log of a newer version
             continue
 
 
 def thin(log: Path, step: int) -> bool:
-    """Put a thinner log in the place of one, in one step that nothing can halve.
+    """Replace a log atomically by a thinned copy.
 
     Returns
     -------
     bool
-        False if somebody else is at it, or it was reviewed meanwhile.
+        False if another process uses the log, or it was reviewed in the meantime.
 
     Raises
     ------
     LogError
-        If it is damaged.
+        If the log is damaged.
     OSError
         If the copy cannot be written.
     """
@@ -92,7 +92,7 @@ def thin(log: Path, step: int) -> bool:
             thin_log(log, copy, step)
             hand_over(copy, stat.S_IMODE(log.stat().st_mode) & _RIGHTS)
             sync_file(copy)
-            with locked_folder(log.parent):  # a reviewer that writes a layer holds it
+            with locked_folder(log.parent):  # held by a reviewer that writes a layer
                 if step > _STATISTICS and is_reviewed(log):
                     copy.unlink(missing_ok=True)
                     return False
@@ -100,23 +100,23 @@ def thin(log: Path, step: int) -> bool:
         except BaseException:
             copy.unlink(missing_ok=True)
             raise
-        sync_folder(log.parent)  # where it fails, a copy of this name is another process's
+        sync_folder(log.parent)  # outside the try: a copy of this name is now another process's
     return True
 
 
 _SHOWN = 300  # characters
-_AT_ONCE = 100  # logs that are thinned, so that nothing else waits for an hour
+_AT_ONCE = 100  # logs thinned per run, so that deletion does not wait for an hour
 
 
 class DiskReport(NamedTuple):
-    """What was found on the disk, and what was done.
+    """Result of a disk check.
 
     Attributes
     ----------
     done : str
-        What was deleted and thinned; empty for nothing.
+        Deletions and thinnings; empty for none.
     problem : str
-        What cannot be done; empty for nothing.
+        Failures; empty for none.
     """
 
     done: str
@@ -125,13 +125,13 @@ class DiskReport(NamedTuple):
     more: bool = False
 
     def notices(self) -> list[Notice]:
-        """Say what people should know: at most what was done, and the problem."""
+        """Return at most two notices: actions, and the problem."""
         done = [Notice(OK, self.done)] if self.done else []
         return [*done, *([Notice(WARNING, self.problem)] if self.problem else [])]
 
 
 def keep_disk(rules: KeepingRules, *, may_thin: bool = True) -> DiskReport:
-    """Delete what the rules say, unless that would leave only the newest of several logs, and thin.
+    """Delete logs by the rules, unless only the newest of several would remain, and thin others.
 
     Raise `OSError` if the disk cannot be measured.
     """
@@ -187,7 +187,7 @@ class _Thinnings(NamedTuple):
 def _thin(
     logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays, problems: list[str]
 ) -> _Thinnings:
-    """Thin some logs, and add to the problems the first of those that cannot be."""
+    """Thin some logs, and append the first failure to the problems."""
     count = freed = 0
     failed: list[str] = []
     for log, step in plan_thinning(logs, days, limits):
@@ -199,7 +199,7 @@ def _thin(
                 count, freed = count + 1, freed + before - log.path.stat().st_size
         except LogError as error:
             failed.append(str(error))
-        except OSError as error:  # no room for a copy: there is none for the others
+        except OSError as error:  # no space for a copy, nor for the others
             failed.append(f"{log.path}: cannot be thinned ({error.strerror or error})")
             break
     problems += failed[:1]
@@ -216,13 +216,13 @@ def _failed(failures: list[OSError]) -> list[str]:
 
 _COMMAND = module_command("hearthlog.recorder.disk_keeper")
 _EVERY = 3600 * NANOSECONDS
-_THIN = 24 * _EVERY  # for that all old logs are opened
-_LOOK = 60 * NANOSECONDS  # at how much is free
+_THIN = 24 * _EVERY  # thinning opens all old logs
+_LOOK = 60 * NANOSECONDS  # between checks of the free space
 _NICENESS = 19
 
 
 class DiskKeeper:
-    """Keeps the disk as configured while a recorder goes on, which never waits for it."""
+    """Applies the rules in a child process during recording; the recorder never waits for it."""
 
     def __init__(self, rules: KeepingRules) -> None:
         self._rules = rules
@@ -234,7 +234,7 @@ class DiskKeeper:
         self._helpless = False
 
     def tick(self, now: int) -> tuple[list[EncodedMessage], list[str]]:
-        """Look after the disk if it is time, and tell what came of the last time."""
+        """Start a check if it is due, and report the result of the previous one."""
         if self._process is not None:
             if self._process.poll() is None:
                 return [], []
@@ -250,7 +250,7 @@ class DiskKeeper:
             self._began = now
             may_thin = self._thinned is None or abs(now - self._thinned) >= _THIN
             self._thinned = now if may_thin else self._thinned
-            with suppress(OSError):  # no memory for a process: in an hour again
+            with suppress(OSError):  # no memory for a process: retry in an hour
                 self._process = subprocess.Popen(  # noqa: S603  our own module
                     [*_COMMAND, json.dumps([self._rules, may_thin])],
                     stdin=subprocess.DEVNULL,
@@ -259,7 +259,7 @@ class DiskKeeper:
         return [], []
 
     def close(self) -> None:
-        """End what is going on, at any moment of it."""
+        """Kill a running check; this is safe at any time."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -289,7 +289,7 @@ class DiskKeeper:
 
 
 def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMessage]:
-    """Tell what came of a look at the disk."""
+    """Encode the report of a disk check."""
     level = WARNING if report.problem else OK
     text = report.problem or report.done or "nothing to delete"
     health = SourceHealth(stamp, level, text, report.values)
@@ -301,7 +301,7 @@ def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMe
 
 
 def main() -> None:
-    """Look after the disk once by the rules in the argument, and print the report."""
+    """Run one check with the rules in the argument, and print the report."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the recorder decides when this ends
     os.nice(_NICENESS)

@@ -4,11 +4,11 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 class SourceError(HearthlogError):
-    """An audio file cannot be read, or a microphone cannot be opened."""
+    """An unreadable audio file, or a microphone that cannot be opened."""
 
 
 class ConfigurationError(HearthlogError):
-    """The configuration is unknown, wrong or contradicts itself."""
+    """An unknown, invalid or contradictory configuration."""
 
     status = 2
 
@@ -18,4 +18,4 @@ class ConfigurationError(HearthlogError):
 
 
 class DeviceError(SourceError):
-    """A microphone is not there, or cannot be opened now."""
+    """A missing microphone, or one that cannot be opened now."""

@@ -11,13 +11,13 @@ from typing import NamedTuple, Protocol
 from hearthlog.schemas.arrays import Float32, Int64
 
 OK, WARNING, ERROR = 0, 1, 2  # levels of diagnostic_msgs
-LISTENING = "listening"  # the summary of the health of a microphone
-READING = "reading"  # the summary of the health of audio files
+LISTENING = "listening"  # health summary of a microphone
+READING = "reading"  # health summary of audio files
 
 
 @dataclass(frozen=True)
 class SourceHealth:
-    """State of a source of sound."""
+    """Health of a sound source."""
 
     stamp: int  # in nanoseconds of UTC
     level: int  # `OK`, `WARNING` or `ERROR`
@@ -36,8 +36,8 @@ class Frames:
     stamps : np.ndarray [shape=(n,)], int64
         Time of each frame's first sample in nanoseconds of UTC.
     channels : np.ndarray [shape=(n, 800, c)], float32, or None
-        The same of all microphones of an array, of which `samples` is the first one; None of a
-        single microphone.
+        Samples of all microphones of an array, with `samples` as the first; None for a single
+        microphone.
     """
 
     first: int
@@ -47,7 +47,7 @@ class Frames:
     reports: tuple[SourceHealth, ...] = ()
 
     def part(self, start: int, stop: int) -> "Frames":
-        """Return the frames from one row to before another, at least one, with their reports."""
+        """Return the frames in a range of at least one row, with their reports."""
         rows = slice(start, stop)
         stamps = self.stamps[rows]
         channels = None if self.channels is None else self.channels[rows]
@@ -69,19 +69,19 @@ Event = Frames | Gap | SourceHealth
 
 
 class SoundSource(Protocol):
-    """Where sound comes from."""
+    """A source of sound."""
 
     @property
     def device(self) -> str:
-        """Name of what is heard."""
+        """Name of the device in use."""
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield what the source gives.
+        """Yield the events of the source.
 
         Parameters
         ----------
         stop : threading.Event
-            Ends the source when it is set.
+            Ends the source when set.
 
         Yields
         ------
@@ -91,26 +91,26 @@ class SoundSource(Protocol):
 
 
 def event_time(event: Event) -> int:
-    """Return the last time that an event speaks of, in nanoseconds of UTC."""
+    """Return the last time of an event, in nanoseconds of UTC."""
     if isinstance(event, Frames):
         return int(event.stamps[-1])
     return event.end if isinstance(event, Gap) else event.stamp
 
 
 class Notice(NamedTuple):
-    """A sentence about the recorder for its log."""
+    """A text about the recorder for its log."""
 
     level: int  # `OK`, `WARNING` or `ERROR`
     text: str
 
 
-# Three minutes of a microphone, beyond what its pipe holds: so long the disk may be waited for.
+# Three minutes of a microphone, in addition to its pipe: the longest tolerated wait for the disk.
 _EVENTS = 300
 _LOOK_SECONDS = 1.0
 
 
 def merged_events(sources: Mapping[str, SoundSource], stop: Flag) -> Iterator[tuple[str, Event]]:
-    """Yield the events of microphones, each of several read by a thread of its own."""
+    """Yield the events of microphones; several microphones are read in a thread each."""
     if len(sources) == 1:
         yield from ((name, event) for name in sources for event in sources[name].events(stop))
         return
@@ -140,7 +140,7 @@ def _read(
     events: "Queue[tuple[str, Event | BaseException | None]]",
     closed: Flag,
 ) -> None:
-    """Put the events of a source into a queue, then None, or why it cannot go on."""
+    """Put the events of a source into a queue, then None, or the error that ended it."""
     try:
         for event in source.events(stop):
             _put(events, (name, event), closed)

@@ -20,26 +20,26 @@ from hearthlog.recorder.events import OK, WARNING, Event, Frames, SourceHealth
 _ZONES = "class/thermal/thermal_zone*/temp"
 _THROTTLED = "devices/platform/soc/soc:firmware/get_throttled"  # of a Raspberry Pi
 _SYS = Path("/sys")
-_SECONDS = 9.5  # the health of a microphone comes every ten
-_HOT = 80.0  # degrees Celsius, from which on small boards slow down
+_SECONDS = 9.5  # microphones report their health every ten
+_HOT = 80.0  # degrees Celsius; small boards throttle from here
 _LOW_VOLTAGE, _SLOWED = 1 << 0, (1 << 1) | (1 << 2) | (1 << 3)
-_TIME_ERROR = 5  # the state of a clock that nobody sets
+_TIME_ERROR = 5  # adjtimex state of an unsynchronised clock
 _TIMEX_BYTES = 512  # more than any kernel writes
 _STATUS = Path("/proc/self/status")
-_TIMESYNC = Path("/run/systemd/timesync")  # for a service, which may not ask the kernel
+_TIMESYNC = Path("/run/systemd/timesync")  # for a service without access to adjtimex
 
 
 class Disk(NamedTuple):
-    """How large a disk is, and how much of it is free, in bytes."""
+    """Size and free space of a disk, in bytes."""
 
     size: int
     free: int
 
 
 def disk_of(folder: Path) -> Disk:
-    """Measure the disk of a folder, or of the one that it will be made in.
+    """Measure the disk of a folder, or of its nearest existing parent.
 
-    Raise `OSError` if it cannot be.
+    Raise `OSError` if it cannot be measured.
     """
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     usage = shutil.disk_usage(there)
@@ -47,7 +47,7 @@ def disk_of(folder: Path) -> Disk:
 
 
 class MachineWatch:
-    """Looks at the machine every ten seconds."""
+    """Checks the host's health every ten seconds."""
 
     def __init__(self, folder: Path, sys: Path = _SYS) -> None:
         self._folder = folder
@@ -55,7 +55,7 @@ class MachineWatch:
         self._looked = -math.inf
 
     def tick(self, stamp: int) -> SourceHealth | None:
-        """Look if it is time; return what was seen then."""
+        """Check the host if it is due; return the result, else None."""
         now = time.monotonic()
         if now - self._looked < _SECONDS:
             return None
@@ -64,7 +64,7 @@ class MachineWatch:
 
 
 def machine_health(stamp: int, folder: Path, sys: Path = _SYS) -> SourceHealth:
-    """Look at the machine."""
+    """Return the host's health."""
     temperature, throttled = _temperature(sys), _throttled(sys)
     is_set = clock_is_synchronized()
     values = {
@@ -80,7 +80,7 @@ def machine_health(stamp: int, folder: Path, sys: Path = _SYS) -> SourceHealth:
 
 
 def clock_is_synchronized() -> bool | None:
-    """Tell whether something keeps the clock right; None if the machine does not say."""
+    """Return whether the clock is synchronised; None if unknown."""
     try:
         libc = ctypes.CDLL(None, use_errno=True)
         state = libc.adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
@@ -124,7 +124,7 @@ def _free_bytes(folder: Path) -> int | None:
 
 
 def _memory() -> int | None:
-    """Return how much memory this process has to itself, in bytes."""
+    """Return the private memory of this process, in bytes."""
     with suppress(OSError, ValueError, StopIteration):
         lines = _STATUS.read_text(encoding="ascii").splitlines()
         line = next(line for line in lines if line.startswith("RssAnon:"))
@@ -132,15 +132,15 @@ def _memory() -> int | None:
     return None
 
 
-_SEND_SECONDS = 5.0  # at most to wait for systemd
+_SEND_SECONDS = 5.0  # timeout of a message to systemd
 _SILENT_SECONDS = 3.0
 
 
 class ServiceManager:
-    """Tells systemd of a recorder, where it has started it; the protocol is `sd_notify(3)`.
+    """Reports a recorder's state to systemd, if started by it; the protocol is `sd_notify(3)`.
 
-    It is told that the recorder lives once every microphone has given frames or a report of its
-    health: so also while one is gone or the disk refuses the log, but not when one of them hangs.
+    A watchdog message is sent once every microphone has given frames or a health report: also while
+    a microphone is missing or the disk refuses the log, but not while a microphone hangs.
     """
 
     def __init__(self, microphones: Iterable[str]) -> None:
@@ -148,13 +148,13 @@ class ServiceManager:
         self._feed_seconds = _watchdog_seconds() / 4 or math.inf
         self._health = dict.fromkeys(microphones, "starting")
         self._heard: dict[str, float] = {}  # when, by CLOCK_MONOTONIC
-        self._awaited = set(self._health)  # before systemd is told that the recorder lives
+        self._awaited = set(self._health)  # no event since the last watchdog message
         self._fed = 0.0
         self._is_ready = False
         self._status = ""
 
     def add(self, microphone: str, event: Event) -> None:
-        """Tell what there is to tell, after an event was recorded."""
+        """Send systemd the changes after a recorded event."""
         if not self._is_there:
             return
         now = time.monotonic()
@@ -178,7 +178,7 @@ class ServiceManager:
         notify(lines)
 
     def stop(self, *, restarts: bool) -> None:
-        """Tell that the recorder completes its log and ends."""
+        """Report that the recorder completes its log and ends."""
         now = time.monotonic_ns() // 1000
         state = [f"RELOADING=1\nMONOTONIC_USEC={now}"] if restarts else ["STOPPING=1"]
         notify([*state, "STATUS=completing the log"])
@@ -193,18 +193,18 @@ class ServiceManager:
 
 
 def notify(lines: Sequence[str]) -> None:
-    """Tell systemd something, if it has started this process.
+    """Send lines to systemd, if it has started this process.
 
     Parameters
     ----------
     lines : sequence of str
-        Such as `READY=1`, as of `sd_notify(3)`.
+        Such as `READY=1`; see `sd_notify(3)`.
     """
     address = _address()
     if address is None or not lines:
         return
     with (
-        suppress(OSError),  # it is asked again, by what comes next
+        suppress(OSError),  # the next message makes up for it
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as connection,
     ):
         connection.settimeout(_SEND_SECONDS)
@@ -212,7 +212,7 @@ def notify(lines: Sequence[str]) -> None:
 
 
 def _address() -> str | None:
-    """Return the address of systemd's socket; None if it has not started this process."""
+    """Return the address of systemd's socket; None if systemd has not started this process."""
     path = os.environ.get("NOTIFY_SOCKET", "")
     if path.startswith("@"):
         return f"\0{path[1:]}"
@@ -220,7 +220,7 @@ def _address() -> str | None:
 
 
 def _watchdog_seconds() -> float:
-    """Return after how long without a word systemd kills this process; 0 if it does not."""
+    """Return systemd's watchdog timeout of this process; 0 for none."""
     microseconds = os.environ.get("WATCHDOG_USEC", "")
     process = os.environ.get("WATCHDOG_PID", str(os.getpid()))
     is_asked = microseconds.isdecimal() and process == str(os.getpid())
@@ -233,7 +233,7 @@ _takers: list[Callable[[str], None]] = []
 
 @contextmanager
 def lines_to(take: Callable[[str], None]) -> Iterator[None]:
-    """Give the lines of the recorder to somebody else while the block runs."""
+    """Redirect the recorder's lines to a callable for the duration of the block."""
     _takers.append(take)
     try:
         yield
@@ -246,13 +246,13 @@ def say(text: str) -> None:
     if _takers:
         _takers[-1](f"hearthlog: {text}")
         return
-    with suppress(OSError):  # the log says it too
+    with suppress(OSError):  # the log has it too
         sys.stderr.write(f"hearthlog: {text}\n")
         sys.stderr.flush()
 
 
 def writes_to_journal() -> bool:
-    """Return whether standard error is the journal of systemd, which says so as DEVICE:INODE."""
+    """Return whether standard error is the systemd journal (JOURNAL_STREAM is DEVICE:INODE)."""
     with suppress(OSError):
         status = os.fstat(2)
         return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
@@ -260,14 +260,14 @@ def writes_to_journal() -> bool:
 
 
 class HealthJournal:
-    """Says what is wrong with a microphone, from time to time again, and when nothing is."""
+    """Prints faults of microphones, repeated from time to time, and their end."""
 
     def __init__(self) -> None:
         self._trouble: dict[str, str] = {}
         self._said_at: dict[str, float] = {}
 
     def add(self, microphone: str, health: SourceHealth) -> None:
-        """Say the state of a microphone, if that is news."""
+        """Print the state of a microphone, if it changed or is due again."""
         before = self._trouble.get(microphone, "")
         trouble = self._trouble[microphone] = health.summary if health.level != OK else ""
         now = time.monotonic()
@@ -278,21 +278,22 @@ class HealthJournal:
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of malloc.h
-_MMAP_BYTES = 32 << 20  # up to which glibc raises it by itself, if nobody sets either
+_MMAP_BYTES = 32 << 20  # glibc's own maximum for its dynamic threshold
 
 
 def keep_one_heap() -> None:
-    """Let all threads use one heap, where the C library can: others are never given back."""
+    """Make all threads share one heap, if the C library can: others never return memory."""
     with suppress(OSError, AttributeError):  # not every C library has it
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 @cache
 def keep_freed_blocks() -> None:
-    """Let freed arrays be used again, instead of giving them back to the system.
+    """Reuse freed arrays instead of returning their memory to the system.
 
-    Of what is free above the last block in use, glibc keeps 64 MB then. Otherwise a tenth of the
-    time of relabelling goes into having it again, and half where a nanny of Dask has set less.
+    glibc then keeps up to 64 MB of free memory at the top of the heap. Otherwise a tenth of the
+    time of relabelling goes into allocating it again, and half of it under a Dask nanny that has
+    set less.
     """
     with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL(None).mallopt
@@ -301,12 +302,12 @@ def keep_freed_blocks() -> None:
 
 
 def give_back() -> None:
-    """Free what only refers to itself, and give free memory back, where the C library can."""
+    """Collect reference cycles, and return free memory to the system, if the C library can."""
     gc.collect()
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def module_command(module: str) -> list[str]:
-    """Return the command that runs a module, with the current folder not on its path."""
+    """Return the command that runs a module without the current folder on its path."""
     return [sys.executable, "-P", "-m", module]

@@ -1,4 +1,4 @@
-"""Pause schedule of a recorder: quiet hours, requested pauses, and the time zone of a home."""
+"""Pause schedule of a recorder: quiet hours, requested pauses, and time zones."""
 
 import os
 import re
@@ -18,24 +18,24 @@ from hearthlog.schemas.new_files import replaced_file
 _FORM = re.compile(r"([01]\d|2[0-3]):([0-5]\d)-([01]\d|2[0-3]):([0-5]\d)")
 _DAY = 24 * 60
 _PAUSE_FILE = ".pause"
-_LONGEST = 600  # bytes of what the file says
-_LONGEST_NAME = 100  # characters of who asked for a pause
+_LONGEST = 600  # bytes read from the file
+_LONGEST_NAME = 100  # characters of the requester's name
 _LAST = 1 << 32  # seconds of UTC: in 2106
 
 
 class QuietHours(NamedTuple):
-    """Hours of every day, in minutes of the home's time of day; the end may be on the next day."""
+    """Daily hours in minutes of the local day; the end may be on the next day."""
 
     start: int
     end: int
 
     def minutes_left(self, minute: int) -> int:
-        """Return how many minutes of them are left, 0 outside.
+        """Return the remaining minutes, 0 outside of the hours.
 
         Parameters
         ----------
         minute : int
-            Of the day.
+            Minute of the day.
         """
         length = (self.end - self.start) % _DAY or _DAY
         return max(length - (minute - self.start) % _DAY, 0)
@@ -45,9 +45,9 @@ _DASHES = frozenset("\N{HYPHEN}\N{NON-BREAKING HYPHEN}\N{EN DASH}\N{EM DASH}\N{M
 
 
 def quiet_hours(text: str) -> QuietHours:
-    """Read hours such as `22:00-06:30`.
+    """Parse hours such as `22:00-06:30`.
 
-    Raise `ConfigurationError` if they are written otherwise.
+    Raise `ConfigurationError` if the format is wrong.
     """
     found = _FORM.fullmatch(text)
     if found is None:
@@ -58,16 +58,16 @@ def quiet_hours(text: str) -> QuietHours:
 
 
 def check_quiet_hours(text: str) -> str:
-    """Return hours as `quiet_hours` takes them.
+    """Validate hours as `quiet_hours` does, and return them.
 
-    Raise `ConfigurationError` if they are written otherwise.
+    Raise `ConfigurationError` if the format is wrong.
     """
     quiet_hours(text)
     return text
 
 
 class PauseSchedule:
-    """Tells whether the microphones of a home are to be closed."""
+    """Schedule of the times at which microphones are closed."""
 
     def __init__(self, hours: list[QuietHours], zone: tzinfo, folder: Path) -> None:
         self._hours = hours
@@ -75,13 +75,13 @@ class PauseSchedule:
         self._folder = folder
 
     def reason(self) -> str:
-        """Return why nobody is listened to now; empty if somebody is."""
+        """Return why the microphones are closed now; empty if they are open."""
         if _is_paused(self._folder):
             return PAUSED
         return QUIET_HOURS if self._minutes_left() else ""
 
     def describe(self) -> str:
-        """Say until when nobody is listened to."""
+        """Format the reason and end of the current pause."""
         if _is_paused(self._folder):
             end = paused_until(self._folder)
             until = "hearthlog resume" if end is None else self._local(end)
@@ -102,20 +102,20 @@ class PauseSchedule:
 
 
 def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
-    """Ask the recorders of a folder to close their microphones.
+    """Request the recorders of a folder to close their microphones.
 
     Parameters
     ----------
     duration : timedelta or None
-        How long; None until `resume`.
+        None until `resume`.
 
     Raises
     ------
     LogError
-        If the folder cannot be written to.
+        If the folder is not writable.
     """
     end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
-    # A recorder of another account has to read until when.
+    # A recorder of another account must be able to read the end.
     is_own = folder.stat().st_uid == os.geteuid()
     readers = log_readers(folder) if is_own else stat.S_IRGRP | stat.S_IROTH
     with replaced_file(folder / _PAUSE_FILE, readers=readers) as temporary:
@@ -125,7 +125,7 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
 def resume(folder: Path) -> bool:
     """End a pause; return whether there was one.
 
-    Raise `OSError` if the folder cannot be written to.
+    Raise `OSError` if the folder is not writable.
     """
     was_paused = _is_paused(folder)
     (folder / _PAUSE_FILE).unlink(missing_ok=True)
@@ -133,16 +133,16 @@ def resume(folder: Path) -> bool:
 
 
 def paused_until(folder: Path) -> float | None:
-    """Return the end of a pause in seconds of UTC; None for one that somebody has to end."""
+    """Return the end of a pause in seconds of UTC; None for a pause without an end."""
     try:
         end = int(_read_pause(folder).partition(b"\n")[0])
-    except (OSError, ValueError):  # in doubt nobody is listened to
+    except (OSError, ValueError):  # in doubt the microphones stay closed
         return None
     return float(end) if end < _LAST else None
 
 
 def _paused_by(folder: Path) -> str:
-    """Return who asked for a pause; empty if the file does not say."""
+    """Return who requested a pause; empty if unknown."""
     try:
         name = _read_pause(folder).partition(b"\n")[2].decode(errors="replace")
     except OSError:
@@ -152,7 +152,7 @@ def _paused_by(folder: Path) -> str:
 
 def _read_pause(folder: Path) -> bytes:
     path = folder / _PAUSE_FILE
-    if not path.is_file():  # what a pipe says would be waited for
+    if not path.is_file():  # reading a pipe would block
         return b""
     with path.open("rb") as file:
         return file.read(_LONGEST)
@@ -177,7 +177,7 @@ def time_zone(name: str) -> tzinfo:
     Parameters
     ----------
     name : str
-        As in the IANA database, such as "Europe/Berlin", or "UTC".
+        Name in the IANA database, such as "Europe/Berlin", or "UTC".
 
     Raises
     ------
@@ -185,7 +185,7 @@ def time_zone(name: str) -> tzinfo:
         If this machine has no such zone.
     """
     if name == DEFAULT:
-        return UTC  # known where there is no database, too
+        return UTC  # available without a database
     try:
         return ZoneInfo(name)
     except (KeyError, ValueError, OSError) as error:
@@ -195,7 +195,7 @@ def time_zone(name: str) -> tzinfo:
 
 
 def check_time_zone(name: str) -> str:
-    """Return the name of a time zone if this machine knows it.
+    """Validate the name of a time zone, and return it.
 
     Raise `LogError` if this machine has no such zone.
     """
@@ -204,7 +204,7 @@ def check_time_zone(name: str) -> str:
 
 
 def machine_zone() -> str:
-    """Return the name of this machine's time zone; UTC where none is set or known."""
+    """Return the name of this machine's time zone; UTC if unset or unknown."""
     for name in (os.environ.get("TZ", "").removeprefix(":"), _name_in_file(), _name_of_link()):
         if name and not name.startswith("/"):
             try:

@@ -1,4 +1,4 @@
-"""The recorder: sources of sound, a pipeline for each, and the log that they write."""
+"""Recorder: sound sources, a pipeline for each, and their log."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -47,26 +47,26 @@ def record_files(
     Parameters
     ----------
     reload_requests : ReloadRequests or None
-        Make the recorder check at once whether a model's file has been replaced.
+        Trigger immediate checks for a replaced model file.
 
     Raises
     ------
     SourceError
-        If one of the files turns out to be damaged, or all together are shorter than a frame.
+        If a file is damaged, or all files together are shorter than a frame.
     ModelError
         If the model cannot be used, or the configured feature set is not installed.
     ConfigurationError
-        If the model is for another feature set than the configured one, or sound is to be kept
-        and the model cannot tell what must not be.
+        If the model is for another feature set than the configured one, or sound is to be kept and
+        the model lacks a class that must not be kept.
     LogError
-        If another recorder of this name uses the folder. If the log cannot be written, in which
-        case what was written stays, for the next start to complete.
+        If another recorder of this name uses the folder. If the log cannot be written; then the
+        written part remains and is completed at the next start.
     """
     keep_freed_blocks()
     with FolderLock(settings.output, settings.node):
         recovered = recover_active(settings.output, settings.node)
         sources = {settings.microphone[0].name: source}
-        # Notices of clips have the time of the block that they were kept in.
+        # Clip notices are stamped with their block, so blocks stay short if clips are kept.
         joins = not source.realtime and settings.keep_audio == "off"
         summary = _record(settings, sources, stop, reload_requests, state=state, joins_blocks=joins)
     summary.recovered = recovered
@@ -79,20 +79,20 @@ def record_microphones(
     reload_requests: ReloadRequests | None = None,
     state: RecorderState | None = None,
 ) -> RecordingSummary:
-    """Record the configured microphones until `stop` is set, whatever happens to them.
+    """Record the configured microphones until `stop` is set, regardless of their failures.
 
     Parameters
     ----------
     reload_requests : ReloadRequests or None
-        Make the recorder check at once whether a model's file has been replaced.
+        Trigger immediate checks for a replaced model file.
 
     Raises
     ------
     SourceError
-        If microphones cannot be captured on this machine.
+        If this machine cannot capture microphones.
     LogError
-        If another recorder of this name uses the folder, or the folder cannot be used; at the end,
-        if the disk has not taken all of the log.
+        If another recorder of this name uses the folder, or the folder is unusable; at the end, if
+        the disk has not accepted the complete log.
     ModelError, ConfigurationError
         As `record_files`.
     """
@@ -100,7 +100,7 @@ def record_microphones(
     with ExitStack() as stack:
         lock = stack.enter_context(FolderLock(settings.output, settings.node))
         rest = settings.rest()
-        # They capture, and their pipes hold, while older logs are completed.
+        # Capture starts now, buffered in pipes, while older logs are completed.
         sources = {
             each.name: stack.enter_context(
                 closing(
@@ -127,19 +127,19 @@ def record_microphones(
 
 
 def check_recording(settings: Settings) -> None:
-    """Check whether microphones could be recorded so, and leave no trace.
+    """Check whether microphones can be recorded with these settings, without side effects.
 
-    Raise `LogError` if the folder of the logs cannot be written to. Raise `SourceError` if an
-    address of a microphone cannot be one of sound, or ffmpeg is not there for it. Raise
-    `ModelError, ConfigurationError` as `record_files`.
+    Raise `LogError` if the log folder is not writable. Raise `SourceError` if a microphone's
+    address is invalid, or needs ffmpeg and it is missing. Raise `ModelError, ConfigurationError` as
+    `record_files`.
     """
     if problems := recording_problems(settings):
         raise problems[0]
 
 
 def recording_problems(settings: Settings) -> list[HearthlogError]:
-    """Return the errors with which microphones could not be recorded so, and leave no trace."""
-    problems: dict[str, HearthlogError] = {}  # by its words: microphones may have the same model
+    """Return the errors of recording microphones with these settings, without side effects."""
+    problems: dict[str, HearthlogError] = {}  # by message: microphones may share a model
 
     def check(step: Callable[[], object]) -> None:
         try:
@@ -165,13 +165,13 @@ def _check_session(
 ) -> None:
     models = open_models(settings, list(sources), None, stack)
     session = RecordingSession(settings, sources, models)
-    if not likely_network(settings.embedding):  # a network that is will give what models take
+    if not likely_network(settings.embedding):  # a network that loads will provide the embeddings
         session.say_lacking_embeddings()
 
 
 @dataclass
 class _Unheard:
-    """A source that gives nothing."""
+    """A source without events."""
 
     device: str
 
@@ -181,7 +181,7 @@ class _Unheard:
 
 
 class _Resumed:
-    """A source with a gap before its first frame: from the end of the last log on."""
+    """A source with a gap before its first frame, from the end of the last log."""
 
     def __init__(self, source: SoundSource, end: int, rest: PauseSchedule) -> None:
         self._source = source
@@ -215,7 +215,7 @@ def record(
     Parameters
     ----------
     reload_requests : ReloadRequests or None
-        Make the recorder check at once whether a model's file has been replaced.
+        Trigger immediate checks for a replaced model file.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def record(
 
 
 def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, str]:
-    """Return the network of sounds, or why there is none; say so if one was to be had."""
+    """Return the embedding network, or why there is none; print the reason if it failed to load."""
     embedder, why = open_embedder(settings.embedding, microphones)
     if why:
         say(why)
@@ -243,7 +243,7 @@ def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, st
 def _report_starters(
     models: Mapping[str, LabellingModels], embedder: Embedder | None, why: str
 ) -> None:
-    """Report which starter models label, and whether they take the embeddings of a network."""
+    """Print the starter models in use, and whether they use embeddings."""
     for name in dict.fromkeys(each.starter for each in models.values()):
         takes_embeddings = embedder is not None and embedder.source.network == NETWORK
         by = f"what the network {NETWORK} hears"
@@ -265,7 +265,7 @@ def _record(  # noqa: PLR0913, PLR0917
     joins_blocks: bool = False,
 ) -> RecordingSummary:
     with ExitStack() as stack:
-        # Who records for years goes on without a scenario that has become impossible.
+        # A long-running recorder continues without a scenario that no longer works.
         leaves_out = lock is not None
         embedder, why = _embedder(settings, len(sources))
         network = "" if embedder is None else embedder.source.network

@@ -1,4 +1,4 @@
-"""A recording session: the streams of its microphones, their log, clips and health."""
+"""Recording session: the streams of its microphones, their log, clips and health."""
 
 from bisect import bisect_left
 from collections import deque
@@ -51,9 +51,8 @@ from hearthlog.schemas.messages.topics import LIVE
 class MicrophoneStream:
     """One microphone of a recording.
 
-    Raise `ModelError` if the configured feature set is not installed. Raise
-    `ConfigurationError` if a model is for another feature set than the configured one, or does
-    not know what is private.
+    Raise `ModelError` if the configured feature set is not installed. Raise `ConfigurationError` if
+    a model is for another feature set than the configured one, or lacks a private class.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class MicrophoneStream:
         self._device = source.device
         self._next_frame = 0
         self._end = 0  # of the last frame, in nanoseconds of UTC
-        self._drops = False  # frames, for the log takes none
+        self._drops = False  # frames, while the log accepts none
         self.models = models
         self.pipeline = Pipeline(
             microphone,
@@ -90,12 +89,12 @@ class MicrophoneStream:
             )
 
     def accepted(self, event: Event, *, log_is_full: bool) -> list[Event]:
-        """Return what is to be recorded now.
+        """Return the events to record now.
 
         Parameters
         ----------
         log_is_full : bool
-            Whether the log takes no sound now; what is dropped so is a gap later.
+            Whether the log accepts no sound now; dropped frames become a gap later.
         """
         if isinstance(event, Frames):
             return self._accepted_frames(event, log_is_full=log_is_full)
@@ -121,30 +120,30 @@ class MicrophoneStream:
 
     @property
     def device(self) -> str:
-        """Name of what is heard."""
+        """Name of the device in use."""
         return self._device
 
     def device_changes(self) -> bool:
-        """Follow the source to another device; return whether there is one."""
+        """Update the device from the source; return whether it changed."""
         before, self._device = self._device, self._source.device
         return before != self._device
 
     def change_models(
         self, changes: list[ModelChange], frames: Frames | None, now: int
     ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
-        """Let other models label from the next frame on.
+        """Switch to other models at the next frame.
 
         Parameters
         ----------
         frames : Frames or None
-            The next ones; None if they have not come yet.
+            The next frames; None if they have not arrived yet.
         now : int
-            Time at which those change whose sound has not begun, in nanoseconds of UTC.
+            Time of the change for a stream without frames, in nanoseconds of UTC.
 
         Returns
         -------
         closing, opening : list of EncodedMessage
-            Last and first messages of the logs of the models before and now.
+            Last messages of the earlier models' log, and first messages of the new models' log.
         """
         number, stamp = self._next_frame, self._end or now
         if frames is not None:
@@ -167,7 +166,7 @@ class MicrophoneStream:
 
 
 def _configured_features(settings: Settings, models: LabellingModels) -> FeatureSet:
-    """Return the configured feature set, which must be that of all models."""
+    """Return the configured feature set; disable secondary models for another one."""
     features = _features_of_model(settings, models)
     for labelling, (model, classifier) in models.secondary().items():
         if classifier.feature_set != features:
@@ -193,29 +192,29 @@ def _features_of_model(settings: Settings, models: LabellingModels) -> FeatureSe
 
 
 NOT_RUNNING = "the recorder was not running"
-_NOT_LOST = (NOT_RUNNING, *ON_PURPOSE)  # with these the reasons of a gap begin
+_NOT_LOST = (NOT_RUNNING, *ON_PURPOSE)  # prefixes of the reasons of a gap
 
 
 @dataclass
 class RecordingSummary:
-    """What was recorded."""
+    """Summary of a recording."""
 
     logs: list[Path]  # finished ones
     recovered: Sequence[Recovered] = ()  # logs of an earlier recorder, completed first
     frames_lost: int = 0
-    gaps: int = 0  # while it was running
+    gaps: int = 0  # while the recorder was running
     models_refused: int = 0  # files that could not be used
-    labels: int = 0  # frames that have one
+    labels: int = 0  # frames with a label
 
 
 @dataclass
 class RecorderState:
-    """The state of a recorder, for a terminal; other threads may read it at any time.
+    """State of a recorder, for a terminal; other threads may read it at any time.
 
     Attributes
     ----------
     trouble : dict of str to str
-        Why a microphone is not heard, or not well; empty if it is.
+        Fault by microphone; empty if there is none.
     """
 
     sound: dict[str, Frames] = field(default_factory=dict)
@@ -227,22 +226,22 @@ class RecorderState:
 
 
 class RecordingSession:
-    """The recording of some sources: their log, the clips beside it, and what labels them.
+    """A recording of some sources: their log, the clips next to it, and the labelling models.
 
     Parameters
     ----------
     sources : mapping of str to SoundSource
-        By the name of the microphone; of audio files no log may be there already.
+        By the name of the microphone; for audio files no log may exist already.
     state : RecorderState or None
-        Is kept true; None if nobody looks at it.
+        Updated with every event; None without a reader.
 
     Raises
     ------
     ModelError
         If the configured feature set is not installed.
     ConfigurationError
-        If the model is for another feature set than the configured one, or sound is to be kept
-        and the model cannot tell what must not be.
+        If the model is for another feature set than the configured one, or sound is to be kept and
+        the model lacks a class that must not be kept.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -284,7 +283,7 @@ class RecordingSession:
         self.summary = RecordingSummary(self._log.finished)
 
     def say_lacking_embeddings(self) -> None:
-        """Say which models do not get the embeddings that they take."""
+        """Print which models do not get the embeddings that they need."""
         for name, stream in self._streams.items():
             for labelling, (model, classifier) in stream.models.in_use.items():
                 of_it = labelling == LIVE or is_by_names(model)
@@ -298,7 +297,7 @@ class RecordingSession:
         """
         stream = self._streams[microphone]
         if self._log.is_full:
-            self._log.write([])  # unless the disk takes it now
+            self._log.write([])  # retries: the disk may accept data now
         for accepted in stream.accepted(event, log_is_full=self._log.is_full):
             self._record(stream, accepted)
         if isinstance(event, Frames):
@@ -314,7 +313,7 @@ class RecordingSession:
             self._update(self._state, microphone, event)
 
     def _update(self, state: RecorderState, microphone: str, event: Event) -> None:
-        """Keep the state of the recorder true after an event."""
+        """Update the state of the recorder after an event."""
         if isinstance(event, Frames):
             pipeline = self._streams[microphone].pipeline
             state.sound[microphone] = pipeline.last_frames or event
@@ -354,7 +353,7 @@ class RecordingSession:
         self._look_after_the_disk(stream)
 
     def _write(self, messages: Sequence[EncodedMessage], event: Event) -> None:
-        """Write messages of an event; those up to each report of the health are a chunk."""
+        """Write messages of an event; the messages up to each health report form a chunk."""
         written = 0
         for report in event.reports if isinstance(event, Frames) else ():
             end = bisect_left(messages, report.stamp, written, key=attrgetter("log_time"))
@@ -370,7 +369,7 @@ class RecordingSession:
                 say(problem)
 
     def _look_at_the_machine(self, stream: MicrophoneStream, stamp: int) -> None:
-        """Tell how the machine is, as often as the first microphone tells how it is."""
+        """Log the health of the host, at most as often as that of the first microphone."""
         if self._machine is None:
             return
         if (health := self._machine.tick(stamp)) is not None:
@@ -381,8 +380,8 @@ class RecordingSession:
     def finish(self) -> None:
         """Complete the log and its clips.
 
-        Raise `LogError` if the log cannot be written; what was written stays, for the next
-        start to complete.
+        Raise `LogError` if the log cannot be written; the written part remains and is completed at
+        the next start.
         """
         last = [message for each in self._streams.values() for message in each.pipeline.finish()]
         stream = next(iter(self._streams.values()))
@@ -405,7 +404,7 @@ class RecordingSession:
         ]
 
     def _look_for_models(self, stream: MicrophoneStream, frames: Frames) -> None:
-        """Report models that were refused, and let others label from these frames on."""
+        """Report refused models, and switch to new models from these frames on."""
         stamp = int(frames.stamps[0])
         for reason in stream.models.refusals():
             self.summary.models_refused += 1
@@ -416,10 +415,10 @@ class RecordingSession:
             self._change_models(stream, frames)
 
     def _change_models(self, stream: MicrophoneStream, frames: Frames) -> None:
-        """Let other models label their microphones, one of them from these frames on.
+        """Switch the models of their microphones, for one microphone from these frames on.
 
-        Their labels begin a log of their own: the names of the classes belong to the channel, and
-        the model card to the file.
+        Their labels begin a new log: the class names belong to the channel, and the model card to
+        the file.
         """
         before = stream.models.model
         changes = stream.models.change()

@@ -1,4 +1,4 @@
-"""Retention of logs: limits in bytes and days, recorded logs, and the choice of those to delete."""
+"""Retention of logs: limits in bytes and days, recorded logs, and the selection for deletion."""
 
 import os
 import re
@@ -20,23 +20,23 @@ from hearthlog.schemas.logs.metadata import provenance_records
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.new_files import locked_folder, sync_folder
 
-KEEP_SUFFIX = ".keep"  # of a file beside a log that is not to be deleted
-THINNING_SUFFIX = ".thinning"  # of a thinner copy of a log in the making
+KEEP_SUFFIX = ".keep"  # of a file next to a log; protects the log from deletion
+THINNING_SUFFIX = ".thinning"  # of an unfinished thinned copy of a log
 _TIME = "%Y%m%dT%H%M%SZ"
 _DAY = 86_400 * NANOSECONDS
-# A clock that was never set says 1970, or when its system was made.
+# An unset clock shows 1970, or the build date of its system.
 _NO_EARLIER = int(datetime(2024, 1, 1, tzinfo=UTC).timestamp()) * NANOSECONDS
 
 
 class RecordedLog(NamedTuple):
-    """A finished log of a node, and the layers beside it.
+    """A finished log of a node, with its layers.
 
     Attributes
     ----------
     start : int
-        By its name, in nanoseconds of UTC.
+        From its name, in nanoseconds of UTC.
     size : int
-        Bytes on the disk, of all of them.
+        Disk usage of log and layers in bytes.
     """
 
     path: Path
@@ -47,32 +47,32 @@ class RecordedLog(NamedTuple):
 
     @property
     def by_age(self) -> tuple[bool, int, str]:
-        """Sorts from old to new; what was recorded without a clock counts as new."""
+        """Sort key from old to new; logs recorded with an unset clock count as new."""
         return self.start < _NO_EARLIER, self.start, self.path.name
 
 
 class RecordedDays:
-    """The days on which something was recorded: the clock of retention.
+    """Days with recordings: the clock of retention.
 
-    A clock that is wrong makes days that hold little, and never makes what was recorded older than
-    the days on which the recorder ran.
+    A wrong clock adds days with few recordings, and never makes a recording older than the number
+    of days on which the recorder ran.
 
     Parameters
     ----------
     starts : iterable of int
-        Of logs, in nanoseconds of UTC.
+        Starts of logs, in nanoseconds of UTC.
     """
 
     def __init__(self, starts: Iterable[int]) -> None:
         self._days = sorted({start // _DAY for start in starts if start >= _NO_EARLIER})
 
     def since(self, start: int) -> int:
-        """Count the days with sound after the day of a time.
+        """Count the recorded days after the day of a time.
 
         Returns
         -------
         int
-            0 for the last day, and for a time that no clock can have said.
+            0 for the last day, and for times of an unset clock.
         """
         if start < _NO_EARLIER:
             return 0
@@ -80,14 +80,14 @@ class RecordedDays:
 
 
 def walk(root: Path, failures: list[OSError]) -> Iterator[tuple[Path, list[str]]]:
-    """Go through the folders of a recorder's days."""
+    """Iterate over the day folders of a recorder."""
     for folder, folders, files in os.walk(root, onerror=failures.append):
         folders[:] = [each for each in folders if each.isdigit()]
         yield Path(folder), files
 
 
 def start_of(name: str, node: str) -> int | None:
-    """Return when a log or a layer of a node began, by its name.
+    """Return the start of a node's log or layer from its name.
 
     Returns
     -------
@@ -106,14 +106,14 @@ def start_of(name: str, node: str) -> int | None:
 
 
 def recorded_days(root: Path, node: str) -> RecordedDays:
-    """Find the days on which a node has recorded."""
+    """Return the days on which a node has recorded."""
     names = (name for _, files in walk(root, []) for name in files)
     ours = (start_of(name, node) for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX)))
     return RecordedDays(start for start in ours if start is not None)
 
 
 def recorded_logs(root: Path, node: str, failures: list[OSError]) -> list[RecordedLog]:
-    """Find the finished logs of a node."""
+    """Return the finished logs of a node, sorted by age."""
     logs = []
     for folder, files in walk(root, failures):
         names = set(files)
@@ -139,16 +139,16 @@ def _size(path: Path) -> int:
 
 
 class Limits(NamedTuple):
-    """What is kept at most; 0 for no limit.
+    """Limits of retention; 0 for no limit.
 
     Attributes
     ----------
     days : int
-        Days on which something was recorded.
+        Days with recordings.
     size : int
         Bytes of finished logs and their layers.
     free : int
-        Bytes that should be free on the disk.
+        Minimum free bytes on the disk.
     """
 
     days: int = 0
@@ -158,26 +158,26 @@ class Limits(NamedTuple):
 
 
 class ThinningDays(NamedTuple):
-    """After how many days with sound a log loses what; 0 for never."""
+    """Age in recorded days at which each part of a log is dropped; 0 for never."""
 
     statistics: int = 0
     features: int = 0
     rest: int = 0
 
     def step(self, age: int) -> int:
-        """Return the step of thinning: a place in `hearthlog.schemas.salvage.recover.STEPS`.
+        """Return the thinning step: an index of `hearthlog.schemas.salvage.recover.STEPS`.
 
         Parameters
         ----------
         age : int
-            Days with sound since.
+            Recorded days since.
         """
         due = [step for step, days in enumerate(self, 1) if days and age >= days]
         return max(due, default=0)
 
 
 class KeepingRules(NamedTuple):
-    """What a recorder keeps of which logs."""
+    """Retention and thinning rules of a recorder."""
 
     root: str
     node: str
@@ -190,7 +190,7 @@ _LARGEST = 10**18
 
 
 def parse_size(value: object) -> int:
-    """Read a size.
+    """Parse a size.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def parse_size(value: object) -> int:
 
 
 def size_text(size: int) -> str:
-    """Say a size in the unit that fits.
+    """Format a size in a suitable unit.
 
     Parameters
     ----------
@@ -229,11 +229,11 @@ Size = Annotated[int, BeforeValidator(parse_size, json_schema_input_type=int | s
 
 
 REVIEWED = "reviewed"
-_FEW = 2  # logs, all of which but the newest may go without a question
+_FEW = 2  # with so few logs, all but the newest may be deleted without confirmation
 
 
 class Deletion(NamedTuple):
-    """A log that is to go, and why."""
+    """A log to delete, and the reason."""
 
     log: RecordedLog
     why: str
@@ -241,12 +241,12 @@ class Deletion(NamedTuple):
 
 @dataclass
 class RetentionPlan:
-    """What retention would do.
+    """Planned deletions.
 
     Attributes
     ----------
     kept : dict of Path to str
-        Logs that a limit asks for, and why they are kept all the same.
+        Logs beyond a limit that are kept, and the reason.
     """
 
     deletions: list[Deletion] = field(default_factory=list)
@@ -258,7 +258,7 @@ class RetentionPlan:
 def plan_retention(
     logs: Sequence[RecordedLog], days: RecordedDays, limits: Limits, disk: Disk
 ) -> RetentionPlan:
-    """Choose the logs that are to be deleted."""
+    """Select the logs to delete."""
     plan = RetentionPlan()
     limits = limits._replace(free=_sensible_floor(logs, limits, disk, plan))
     count, size, free = len(logs), sum(log.size for log in logs), disk.free
@@ -287,7 +287,7 @@ def plan_retention(
 def _sensible_floor(
     logs: Sequence[RecordedLog], limits: Limits, disk: Disk, plan: RetentionPlan
 ) -> int:
-    """Return the floor, or 0 if no deletion can reach it, so that nothing is deleted in vain."""
+    """Return the minimum free space, or 0 if no deletion can reach it."""
     floor, most = limits.free, sum(log.size for log in logs[:-1])
     if floor >= disk.size:
         plan.problems.append(
@@ -305,7 +305,7 @@ def _sensible_floor(
 
 
 def _unmet(limits: Limits, count: int, size: int, free: int) -> list[str]:
-    """Say which limits are not met because of the logs that are kept."""
+    """Format the limits that are exceeded because of protected logs."""
     rest = "the rest is reviewed or locked, or the newest log"
     problems = []
     if limits.files and count > limits.files:
@@ -322,7 +322,7 @@ def _unmet(limits: Limits, count: int, size: int, free: int) -> list[str]:
 
 
 def kept_because(log: RecordedLog) -> str:
-    """Say why a log is never deleted; empty if it may be."""
+    """Return why a log is never deleted; empty if it may be."""
     if log.locked:
         return "locked by its .keep file"
     if is_reviewed(log.path):
@@ -336,7 +336,7 @@ def kept_because(log: RecordedLog) -> str:
 
 
 def is_reviewed(log: Path) -> bool:
-    """Tell whether a log has marks or reviewed time, or may have."""
+    """Return whether a log has or may have marks or reviewed time."""
     layer = review_path(log)
     if not os.path.lexists(layer):
         return False
@@ -348,11 +348,11 @@ def is_reviewed(log: Path) -> bool:
 
 
 def carry_out(plan: RetentionPlan, failures: list[OSError]) -> list[RecordedLog]:
-    """Delete what a plan says, each log after its layers."""
+    """Execute a plan: delete each log after its layers."""
     deleted = []
     for log, _ in plan.deletions:
         try:
-            with locked_folder(log.path.parent):  # a reviewer that writes a layer holds it
+            with locked_folder(log.path.parent):  # held by a reviewer that writes a layer
                 if is_reviewed(log.path):
                     continue
                 left = log.path.with_name(log.path.name + THINNING_SUFFIX)

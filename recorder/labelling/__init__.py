@@ -1,1 +1,1 @@
-"""The models that label: loaded, watched, and replaced while sound is recorded."""
+"""Labelling models: loading, watching, and replacement during recording."""

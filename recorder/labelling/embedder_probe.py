@@ -1,7 +1,7 @@
-"""The network of sounds at the start of a recorder: tried in a process of its own first.
+"""Test of the embedding network in a child process at the start of a recorder.
 
-A runtime that crashes, hangs or takes too much memory must not take the recorder with it. The
-module is that process, too: ``embedder_probe NAME FILE`` answers in one line of JSON.
+A runtime that crashes, hangs or takes too much memory must not affect the recorder. The module is
+also the child process: ``embedder_probe NAME FILE`` answers in one line of JSON.
 """
 
 import json
@@ -30,11 +30,11 @@ from hearthlog.recorder.host import module_command
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
-NO_NETWORK = "none"  # in place of a name
+NO_NETWORK = "none"  # instead of a network's name
 DEFAULT_NETWORK = YAMNET.name
 _HOP_SECONDS = HOP_FRAMES * FRAME_SAMPLES / SAMPLE_RATE
 _MOST_SHARE = 0.5  # of the hop
-_MOST_MEGABYTES = 300  # of the 600 that the service may take
+_MOST_MEGABYTES = 300  # of the service's limit of 600
 _PATIENCE_SECONDS = 30.0
 _WINDOWS = 5
 _MODULE = "hearthlog.recorder.labelling.embedder_probe"
@@ -46,12 +46,12 @@ _SIGNALS: dict[int, str] = {
 
 
 class Probe(NamedTuple):
-    """What came of trying a network.
+    """Result of a network test.
 
     Attributes
     ----------
     megabytes : float
-        Most memory of a process that does nothing else; 0 where that is not known.
+        Peak memory of a process that only runs the network; 0 if unknown.
     """
 
     seconds: float
@@ -60,14 +60,14 @@ class Probe(NamedTuple):
 
     @property
     def hop_seconds(self) -> float:
-        """Hop that this machine could hold."""
+        """Shortest hop that this machine can sustain."""
         return self.seconds / _MOST_SHARE
 
 
 def probe_network(name: str, path: Path) -> Probe:
-    """Load a network in a process of its own, and try it.
+    """Load and test a network in a child process.
 
-    Raise `ModelError` if it cannot be used, crashes, hangs, or takes too much memory.
+    Raise `ModelError` if it is unusable, crashes, hangs, or takes too much memory.
     """
     network = NETWORKS.get(name)
     if missing_modules(network.suffix):
@@ -111,19 +111,19 @@ def probe_network(name: str, path: Path) -> Probe:
 
 
 def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | None, str]:
-    """Load the network that a recorder listens with, if there is one that this machine can run.
+    """Load the recorder's embedding network, if there is one that this machine can run.
 
     Parameters
     ----------
     wanted : str, optional
-        Name of a network, or none; empty for yamnet if it is there.
+        Name of a network, or none; empty for yamnet if it is installed.
 
     Returns
     -------
     embedder : Embedder or None
-        None: it is recorded without a network.
+        None: record without a network.
     line : str
-        Why; empty if there is nothing to say.
+        The reason; empty if there is nothing to report.
     """
     if wanted == NO_NETWORK:
         return None, ""
@@ -137,14 +137,14 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
         return load_embedder(name, path), ""
     except ModelError as error:
         return None, f"{error}; {_GOES_ON}"
-    except Exception as error:  # noqa: BLE001  no runtime may keep a recorder from its start
+    except Exception as error:  # noqa: BLE001  no runtime may prevent the start of a recorder
         return None, f"{path}: cannot be used ({printable(repr(error))[:200]}); {_GOES_ON}"
 
 
 def likely_network(wanted: str = "") -> str:
-    """Name the network that a recorder will listen with, if its file and runtime are there.
+    """Return the name of the network to be used, if its file and runtime are installed.
 
-    Whether this machine is quick enough for it, and whether the file is whole, is not tried.
+    The speed of this machine and the integrity of the file are not tested.
     """
     name = wanted or DEFAULT_NETWORK
     if wanted == NO_NETWORK or not NETWORKS.has(name) or find_network(name) is None:
@@ -154,14 +154,14 @@ def likely_network(wanted: str = "") -> str:
 
 @lru_cache(maxsize=4)
 def _probed(name: str, path: Path, _changed: int) -> Probe:
-    """Try a file once in the life of a process."""
+    """Test a file once per process."""
     return probe_network(name, path)
 
 
 def check_network(wanted: str, microphones: int = 1) -> None:
-    """Check the network that is configured by its name, if one is.
+    """Check the configured network, if one is named.
 
-    Raise `ModelError` if it is not there, or cannot be used.
+    Raise `ModelError` if it is missing or unusable.
     """
     if wanted not in {"", NO_NETWORK}:
         path = network_path(wanted)
@@ -182,9 +182,9 @@ def network_path(name: str) -> Path:
 
 
 def check_pace(path: Path, probe: Probe, microphones: int = 1) -> None:
-    """Check whether this machine is quick enough for a network.
+    """Check whether this machine is fast enough for a network.
 
-    Raise `ModelError` if a window would take more than half of the time to the next.
+    Raise `ModelError` if a window takes more than half of the hop.
     """
     if microphones * probe.seconds > _MOST_SHARE * _HOP_SECONDS:
         of = f" of each of {microphones} microphones" if microphones > 1 else ""
@@ -204,7 +204,7 @@ def _crash(number: int) -> str:
 
 
 def main() -> None:
-    """Try a network, and answer in JSON."""
+    """Test a network, and answer in JSON."""
     name, path = sys.argv[1], Path(sys.argv[2])
     try:
         embedder = load_embedder(name, path)
@@ -219,9 +219,9 @@ def main() -> None:
 
 
 def _most_megabytes() -> float:
-    """Return the most memory that this process had; 0 where the system does not say.
+    """Return the peak memory of this process; 0 if unknown.
 
-    That of `getrusage` counts what the process had that started it.
+    The value of `getrusage` would include the memory of the parent process.
     """
     try:
         status = Path("/proc/self/status").read_text("ascii", "replace")
@@ -232,7 +232,7 @@ def _most_megabytes() -> float:
 
 
 def _window_seconds(embedder: Embedder) -> float:
-    """Return the least time of some windows: others may be busy for a while, as after a boot."""
+    """Return the minimum time over some windows: the machine may be busy, as after a boot."""
     window = np.zeros((WINDOW_FRAMES, FRAME_SAMPLES), np.float32)
     times = []
     for _ in range(_WINDOWS):

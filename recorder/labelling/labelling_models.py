@@ -27,13 +27,13 @@ from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labellin
 
 
 def class_conflict(model: Model, others: Mapping[str, Model]) -> str:
-    """Say which class of a model another one labels as well.
+    """Return a class conflict of a model with another one.
 
     Returns
     -------
     str
-        The rest of a sentence that begins with the model; empty if there is none. Two names of a
-        class are one class; `silence`, `unknown` and `other` may be of every model.
+        The rest of a sentence that begins with the model; empty without a conflict. Aliases of a
+        class are one class; every model may have `silence`, `unknown` and `other`.
     """
     own = _classes(model)
     for labelling, other in others.items():
@@ -49,19 +49,19 @@ def class_conflict(model: Model, others: Mapping[str, Model]) -> str:
 
 
 def shared_classes(model: Model, others: Iterable[Model]) -> list[str]:
-    """Return the classes of a model that others label as well, by its names."""
+    """Return the classes that a model shares with others, as the model names them."""
     theirs = {name for other in others for name in _classes(other)}
     return [label for name, label in _classes(model).items() if name in theirs]
 
 
 def _classes(model: Model) -> dict[str, str]:
-    """Return the names of classes of a model, by those that two spellings share."""
+    """Return the class labels of a model, by canonical name."""
     names = {class_name(spelt(label)): label for label in model.classes}
     return {name: label for name, label in names.items() if name not in OF_EVERY_SCENARIO}
 
 
 class ModelChange(NamedTuple):
-    """A model takes over a labelling.
+    """A change of the model of a labelling.
 
     Attributes
     ----------
@@ -75,18 +75,18 @@ class ModelChange(NamedTuple):
 
 
 class LabellingModels:
-    """The models of some microphones, and those that may take their place.
+    """The models of some microphones, and their possible replacements.
 
     Parameters
     ----------
     watch : ModelWatch or None
-        Gives the models, one after the other; None for no labels.
+        Source of the live models; None for no labels.
 
     Raises
     ------
     ConfigurationError
-        If one of a scenario is for another feature set, or two of them, the one on trial aside,
-        label the same class.
+        If a scenario's model is for another feature set, or two models except the candidate label
+        the same class.
     """
 
     def __init__(
@@ -118,27 +118,27 @@ class LabellingModels:
 
     @property
     def model(self) -> Model | None:
-        """The model that labels; None for no labels."""
+        """The live model; None for no labels."""
         return self.in_use[LIVE].model if LIVE in self.in_use else None
 
     @property
     def starter(self) -> str:
-        """Name of the starter model that labels from the start on; empty for another one."""
+        """Name of the starter model in use at the start; empty for another model."""
         return self._watches[LIVE].starter if LIVE in self._watches else ""
 
     @property
     def classifier(self) -> Classifier | None:
-        """Of that model."""
+        """Classifier of the live model."""
         return self.in_use[LIVE].classifier if LIVE in self.in_use else None
 
     def secondary(self) -> dict[str, Loaded]:
-        """Return what labels beside that model, by labelling."""
+        """Return the models other than the live one, by labelling."""
         return {name: loaded for name, loaded in self.in_use.items() if name != LIVE}
 
     def leave_out(self, labelling: str, reason: str) -> None:
-        """Let a scenario not label, and say why at the next call of `refusals`.
+        """Disable a scenario; `refusals()` reports the reason.
 
-        Raise `ConfigurationError` if none may be left out.
+        Raise `ConfigurationError` if scenarios may not be disabled.
         """
         text = f"{labelling.replace('/', ' ')}: {reason}"
         if self._left_out is None:
@@ -148,7 +148,7 @@ class LabellingModels:
         self.in_use.pop(labelling, None)
 
     def refusals(self) -> Sequence[str]:
-        """Return why models were refused since the last call, and look for others."""
+        """Return the refusals of models since the last call, and check for new models."""
         refusals = [f"{text}; it is left out until the next start" for text in self._left_out or ()]
         for text in refusals:
             say(text)
@@ -168,7 +168,7 @@ class LabellingModels:
         return refusals
 
     def _refuse_clashes(self) -> list[str]:
-        """Refuse what is ready and shares a class with what would label beside it."""
+        """Refuse ready models that share a class with another model in use."""
         refused = []
         for labelling, watch in self._watches.items():
             if watch.ready is None or is_by_names(watch.first.model):
@@ -178,12 +178,12 @@ class LabellingModels:
         return refused
 
     def may_change(self) -> bool:
-        """Tell whether another model is ready to label."""
+        """Return whether another model is ready to label."""
         is_ready = any(watch.ready is not None for watch in self._watches.values())
         return is_ready or self._trial_changes()
 
     def change(self) -> list[ModelChange]:
-        """Put the models in use that are ready."""
+        """Put the ready models into use."""
         changes = []
         for labelling, watch in self._watches.items():
             if watch.ready is not None:
@@ -195,7 +195,7 @@ class LabellingModels:
         return changes
 
     def _change_names(self) -> list[ModelChange]:
-        """Leave to other models the classes that they were taught, and names only what is left."""
+        """Reduce models by names to the classes that no trained model labels."""
         changes = []
         for labelling, watch in self._watches.items():
             if not is_by_names(watch.first.model):
@@ -216,7 +216,7 @@ class LabellingModels:
         return changes
 
     def _others(self, labelling: str) -> dict[str, Model]:
-        """Return the models that a model of a labelling must not share classes with."""
+        """Return the models that must not share classes with the model of a labelling."""
         others = {
             name: watch
             for name, watch in self._watches.items()
@@ -257,21 +257,21 @@ def open_models(  # noqa: PLR0913
     leaves_out: bool = False,
     network: str = "",
 ) -> dict[str, LabellingModels]:
-    """Load the models of microphones, and watch their files; once for those that have the same.
+    """Load and watch the models of microphones; microphones with equal models share them.
 
     Parameters
     ----------
     reload_requests : ReloadRequests or None
-        Make the recorder check at once whether a file has been replaced.
+        Trigger immediate checks for a replaced file.
     leaves_out : bool
-        Whether scenarios that cannot label are left out; else they are an error.
+        Whether scenarios that cannot label are disabled; else they are an error.
 
     Raises
     ------
     ModelError
         If a model cannot be used.
     ConfigurationError
-        If models cannot label side by side.
+        If models conflict with each other.
     """
     reload_requests = reload_requests or ReloadRequests()
     chosen = {
@@ -316,7 +316,7 @@ def _watched_models(  # noqa: PLR0913, PLR0917
         return LabellingModels(scenarios=watches, left_out=left_out, features=features)
     watch = ModelWatch(path, reload_requests.queue(), network=network)
     stack.enter_context(closing(watch))
-    is_file = path.suffix == SUFFIX  # else the name of a starter
+    is_file = path.suffix == SUFFIX  # else the name of a starter model
     folder = path.parent if is_file else DEFAULT_FOLDER
     candidates = CandidateWatch(folder, watch.first.classifier.feature_set)
     stack.enter_context(closing(candidates))

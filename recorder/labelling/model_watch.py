@@ -1,7 +1,6 @@
-"""Watched model files: a replaced model or candidate is loaded and checked in a thread.
+"""Watched model files: a thread loads and checks replaced models and candidates.
 
-A model that replaces another one labels only with a judgement that permits it; the model of a
-scenario needs none.
+A replacement labels only after a promotion check that permits it; a scenario's model needs none.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,48 +33,48 @@ FileIdentity = tuple[int, int, int, int] | None
 
 
 class Loaded(NamedTuple):
-    """A model that was checked, with its classifier."""
+    """A checked model with its classifier."""
 
     model: Model
     classifier: Classifier
 
 
 class ReloadRequests:
-    """Asks all watches to look at their files at once; a signal handler may do so."""
+    """Requests immediate checks from all watches; safe in a signal handler."""
 
     def __init__(self) -> None:
         self.restart = False
         self._queues: list[SimpleQueue[None]] = []
 
     def queue(self) -> SimpleQueue[None]:
-        """Return what another watch is to be asked by."""
+        """Return a new queue, for the requests to one watch."""
         self._queues.append(SimpleQueue())
         return self._queues[-1]
 
     def ask(self) -> None:
-        """Ask them."""
+        """Request a check from all watches."""
         for queue in self._queues:
             queue.put(None)
 
 
 class ModelWatch:
-    """Checks every second, in a thread of its own, whether a model's file was replaced.
+    """Checks in a thread every second whether a model file was replaced.
 
     Parameters
     ----------
     path : Path
-        A model file, a symbolic link to one, or the name of a starter model. As long as there is no
-        file `DEFAULT_MODEL`, the starter model `general` labels in its place.
+        A model file, a symbolic link to one, or the name of a starter model. While the file
+        `DEFAULT_MODEL` is missing, the starter model `general` replaces it.
     requests : SimpleQueue
-        An item makes the watch check at once, and report again what it has refused. Unlike an
-        event, a queue can be used from a signal handler at any moment.
+        An item triggers an immediate check, which repeats earlier refusals. Unlike an event, a
+        queue is safe in a signal handler.
 
     Attributes
     ----------
     starter : str
-        Name of the starter model at the start; empty if it is a file.
+        Name of the starter model at the start; empty for a file.
     ready : Loaded or None
-        The last model that replaced it; to be set to None by who uses it.
+        The last replacement; the user sets it to None.
 
     Raises
     ------
@@ -89,7 +88,7 @@ class ModelWatch:
         self._path = path = starter_for(path, network)
         self._requests = requests
         self._scenario = scenario
-        self._seen = file_identity(path)  # before it is loaded: a later file is another one
+        self._seen = file_identity(path)  # before loading, so that a later replacement is detected
         is_default = path == DEFAULT_MODEL and not scenario
         self._starts_with_starter = is_default and self._seen is None
         begins = starter_for(Path(GENERAL), network) if self._starts_with_starter else path
@@ -97,17 +96,17 @@ class ModelWatch:
         self.first = self._load_first(begins)
         self.ready: Loaded | None = None
         self.held: Loaded | None = None
-        self._awaited: Path | None = None  # the judgement that the model in the file lacks
+        self._awaited: Path | None = None  # file of the missing promotion check
         self._judged: FileIdentity = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
-        self._results: SimpleQueue[Loaded | str | None] = SimpleQueue()  # None: that in use
+        self._results: SimpleQueue[Loaded | str | None] = SimpleQueue()  # None: the model in use
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
         self._thread.start()
 
     def _load_first(self, path: Path) -> Loaded:
-        """Load it; one of which a bit has changed labels all the same, rather than none."""
+        """Load the first model; a model with a changed bit still labels, rather than none."""
         damaged: list[str] = []
         try:
             loaded = load_checked(path, damaged.append)
@@ -120,7 +119,7 @@ class ModelWatch:
         return loaded
 
     def refusals(self) -> Iterator[str]:
-        """Yield why models were refused since the last call, and update `ready`."""
+        """Yield the refusals of models since the last call, and update `ready`."""
         with suppress(Empty):
             while True:
                 result, self.held = self._results.get_nowait(), None
@@ -130,17 +129,17 @@ class ModelWatch:
                     self.ready = result
 
     def offer_again(self) -> None:
-        """Let what is held be ready, for another model may give up the class that it lacked."""
+        """Make a held model ready again: another model may have given up the conflicting class."""
         if self.ready is None and self.held is not None:
             self.ready, self._last = self.held, self.held.model
 
     def refuse_ready(self, reason: str, in_use: Model) -> str:
-        """Refuse the model that is ready, and hold it.
+        """Refuse the ready model, and hold it.
 
         Returns
         -------
         str
-            A sentence about it; empty if it was refused before.
+            The refusal; empty if it was reported before.
         """
         assert self.ready is not None
         is_known, self.held, self.ready = self.ready is self.held, self.ready, None
@@ -152,7 +151,7 @@ class ModelWatch:
         return text
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._closed.set()
         self._requests.put(None)
         self._thread.join()
@@ -186,7 +185,7 @@ class ModelWatch:
         try:
             if name_and_digest(self._path) == (self._last.name, self._last.sha256):
                 self._results.put(None)
-                return  # a second copy of it in memory would not all be given back
+                return  # the memory of a second copy would not be returned completely
             loaded = load_checked(self._path)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on
             if file_identity(self._path) == self._seen:  # else it is still being written
@@ -205,12 +204,12 @@ class ModelWatch:
         self._results.put(loaded)
 
     def _unjudged(self, model: Model) -> str:
-        """Tell why a model may not label; empty if it may."""
+        """Return why a model may not label; empty if it may."""
         if self._scenario:
             return ""
         folder = self._path.parent
         awaited = judgement_path(folder, model.sha256)
-        judged = file_identity(awaited)  # before it is read: a later one is another one
+        judged = file_identity(awaited)  # before reading, so that a later replacement is detected
         judgement = read_judgement(folder, model.sha256)
         if judgement is not None and judgement.may_label:
             return ""
@@ -241,7 +240,10 @@ def _warn_if_simulated(model: Model) -> None:
 
 
 def _warn_if_changed(path: Path, champion: Model) -> None:
-    """Say that the file of a champion is not the one that was promoted, which left a judgement."""
+    """Print a warning if a champion's file is not the promoted one.
+
+    A missing promotion check shows that the file was replaced or damaged.
+    """
     is_kept = path.is_symlink() and judgements_of(path.parent)
     is_known = is_starter(champion.name, champion.sha256)
     if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
@@ -262,7 +264,7 @@ def load_checked(path: Path, on_damage: Callable[[str], object] | None = None) -
 
 
 def file_identity(path: Path) -> FileIdentity:
-    """Return what differs between two files of one name; None if there is no file."""
+    """Return an identity of a file's version; None if there is no file."""
     try:
         status = path.stat()
     except OSError:
@@ -271,9 +273,9 @@ def file_identity(path: Path) -> FileIdentity:
 
 
 class CandidateWatch:
-    """Checks every second, in a thread of its own, whether there is another candidate.
+    """Checks in a thread every second whether there is another candidate.
 
-    The candidate is the link `candidate.safetensors` beside the model in use. It need not be there.
+    The candidate is the optional link `candidate.safetensors` next to the model in use.
     """
 
     def __init__(self, folder: Path, features: FeatureSet) -> None:
@@ -289,16 +291,16 @@ class CandidateWatch:
         self._thread.start()
 
     def refusals(self) -> list[str]:
-        """Return why candidates were refused since the last call."""
+        """Return the refusals of candidates since the last call."""
         refusals, self._refusals = self._refusals, []
         return refusals
 
     def news(self) -> list[Loaded | None]:
-        """Return the candidates since the last call; None where there was none any more."""
+        """Return the candidates since the last call; None where a candidate was removed."""
         return list(self._news())
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._closed.set()
         self._thread.join()
 

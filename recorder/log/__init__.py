@@ -1,1 +1,1 @@
-"""The log that is being recorded: its files, what the disk refuses of them, and their recovery."""
+"""The live log: its files, buffering during disk errors, and recovery."""

@@ -1,4 +1,4 @@
-"""Clips: sound of chosen events, written to layers beside the log, and their retention."""
+"""Audio clips of selected events: layers next to the log, and their retention."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ _AFTER_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
 
 
 class KeptSound(NamedTuple):
-    """Successive frames of sound to be kept.
+    """Successive frames of a clip.
 
     Attributes
     ----------
@@ -55,17 +55,17 @@ class KeptSound(NamedTuple):
 
 
 class ClipFinder:
-    """Holds sound back until it is certain whether it may be kept, and is worth keeping.
+    """Buffers sound until it is decided whether to keep it: not private, and worth keeping.
 
-    A frame may be kept unless it is private, as of `PrivateFrames`.
+    `PrivateFrames` decides which frames are private.
 
     Parameters
     ----------
     keep : Keep
-        `events`: sound around all that is not labelled silence; `unsure`: around what the model is
-        not sure of, or has not learned; `always`: everything.
+        `events`: sound around every label other than silence; `unsure`: sound around labels of low
+        confidence or high novelty; `always`: all sound.
     window_frames : int
-        A second, or the length of the window of a label, if that is longer.
+        Length of a label's window, at least one second.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -80,17 +80,17 @@ class ClipFinder:
         self._window = window_frames
         self._keep = keep
         self._guard = PrivateFrames(never, window_frames, most_ahead)
-        # How many frames before a label's own frame are kept because of the label.
+        # Frames kept before the frame of a label.
         self._before = 0 if keep == "always" else self._window - 1 + pre_roll_frames
         self._most_ahead = most_ahead
         self._ahead = max(self._before, self._window - 1 + late_frames) + most_ahead
         self._begin()
 
     def _begin(self) -> None:
-        """Hold nothing.
+        """Reset the buffers.
 
-        `_private` is of the first frames that are held. `_worth` begins some frames before them:
-        these frames are decided, but what follows them is kept because of them.
+        `_private` covers the first buffered frames. `_worth` starts some frames before the buffer:
+        those frames are decided, but the frames after them are kept because of them.
         """
         self._next = -1
         self._samples: Int16 = np.empty((0, FRAME_SAMPLES), np.int16)
@@ -104,9 +104,11 @@ class ClipFinder:
         Parameters
         ----------
         frames : Frames
-            Where they do not follow the frames before, those are decided first, as by `close`.
+            If they do not follow the previous frames, the previous frames are decided first, as by
+            `close`.
         labels : FrameLabels or None
-            Of the last of these frames; their classes include all that are never kept.
+            Labels of the last of these frames; their classes include all classes that are never
+            kept.
         """
         sounds = []
         if frames.first != self._next:
@@ -116,7 +118,7 @@ class ClipFinder:
         return [*sounds, *self._decide(len(self._samples) - self._ahead)]
 
     def close(self) -> list[KeptSound]:
-        """Return what is to be kept of a sound that ends, and begin anew."""
+        """Return the buffered sound to keep at the end of a stream, and reset."""
         self._private = np.append(self._private, self._guard.close())
         self._worth = np.append(self._worth, np.zeros(self._ahead, bool))
         sounds = self._decide(len(self._samples))
@@ -144,7 +146,7 @@ class ClipFinder:
         return loud[labels.probabilities.argmax(axis=1)]
 
     def _decide(self, count: int) -> list[KeptSound]:
-        """Decide on the first frames that are held."""
+        """Decide on the first `count` buffered frames."""
         if count <= 0:
             return []
         kept = ~self._private[:count]
@@ -169,12 +171,12 @@ _EVERY = 3600 * NANOSECONDS
 
 
 class ClipRetention:
-    """Deletes the old clips of a recorder once an hour, by the days that were recorded since.
+    """Deletes old clips of a recorder once an hour; age is counted in recorded days.
 
     Parameters
     ----------
     days : int
-        Age at which a layer is deleted: on so many later days something was recorded.
+        Age limit: a layer is deleted once so many later days have recordings.
     """
 
     def __init__(self, root: Path, node: str, days: int) -> None:
@@ -184,12 +186,12 @@ class ClipRetention:
         self._last: int | None = None
 
     def tick(self, now: int) -> list[Notice]:
-        """Delete old clips, unless the last time was less than an hour ago.
+        """Delete old clips, at most once an hour.
 
         Returns
         -------
         list of Notice
-            At most two: how many layers were deleted, and the first failure.
+            At most two: the number of deleted layers, and the first failure.
         """
         if self._last is not None and abs(now - self._last) < _EVERY:
             return []
@@ -217,12 +219,12 @@ class ClipRetention:
 
 
 def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple[Path, int]]:
-    """Find the layers of sound of a node, whole or damaged.
+    """Find the audio layers of a node, including damaged ones.
 
     Yields
     ------
     start : int
-        When its log began, in nanoseconds of UTC.
+        Start of the log, in nanoseconds of UTC.
     """
     for folder, files in walk(root, failures):
         for file in files:
@@ -239,7 +241,7 @@ _FRAME_BYTES = FRAME_SAMPLES * _SAMPLE_BYTES
 _MINUTE_FRAMES = 60 * NANOSECONDS // FRAME_NANOSECONDS
 _MEGABYTE = 1_000_000
 _LONGEST_FILE = 86_400 * NANOSECONDS
-_LONGEST_HELD = 60 * NANOSECONDS  # a pre-roll, a second, a block of frames
+_LONGEST_HELD = 60 * NANOSECONDS  # pre-roll, one second and a block of frames
 
 
 CLIPS_AGAIN = Notice(OK, "clips are kept again")
@@ -247,15 +249,15 @@ _ALL_KEPT = "minutes of this day are kept already"
 
 
 class ClipWriter:
-    """Writes sound into layers, as long as the day's minutes and the disk allow.
+    """Writes clips to layers, within the daily minutes and the free space of the disk.
 
-    Whatever happens here, the logs go on: errors become notices and are not raised.
+    Errors become notices and are never raised, so that the logs continue.
 
     Parameters
     ----------
     file_at : callable
-        Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
-        log; see `RollingLog.file_at`.
+        Maps a time in nanoseconds of UTC to the log that contains it and the end of that log; see
+        `RollingLog.file_at`.
     """
 
     def __init__(
@@ -270,7 +272,7 @@ class ClipWriter:
         self._zone = time_zone(settings.timezone)
         self._log: Path | None = None
         self._writer: LogWriter | None = None
-        self._rolled: int | None = None  # when the next log had begun
+        self._rolled: int | None = None  # time at which the next log was noticed
         self._broken = ""  # why the layer of this log cannot be written
         self._stopped = ""
         self._day = range(0)
@@ -283,7 +285,7 @@ class ClipWriter:
         Returns
         -------
         list of Notice
-            One when sound begins to be refused, and one when it is kept again.
+            One when clips stop being written, and one when they are written again.
         """
         notices = []
         for sound in sounds:
@@ -298,7 +300,7 @@ class ClipWriter:
         return notices
 
     def tick(self, now: int) -> list[Notice]:
-        """Complete the layer of a log that has ended, once no sound of it is held back."""
+        """Complete the layer of an ended log, once none of its sound is still buffered."""
         if self._writer is None or self._file_at(now)[0] == self._log:
             self._rolled = None
         elif self._rolled is None:
@@ -308,7 +310,7 @@ class ClipWriter:
         return []
 
     def finish(self) -> list[Notice]:
-        """Complete the layer that is open."""
+        """Complete the open layer."""
         writer, self._writer = self._writer, None
         if writer is None:
             return []
@@ -330,17 +332,17 @@ class ClipWriter:
         return [*notices, *self._report(reason)]
 
     def _report(self, reason: str) -> list[Notice]:
-        """Report why no sound is kept (or that it is), if that is new."""
+        """Report a change of the reason for writing no clips; an empty reason means recovery."""
         if reason == self._stopped:
             return []
         self._stopped = reason
         if not reason:
             return [CLIPS_AGAIN]
-        # What the configuration asks for is no trouble.
+        # A configured limit is no fault.
         return [Notice(OK if reason.endswith(_ALL_KEPT) else WARNING, f"no clips: {reason}")]
 
     def _append(self, log: Path, topic: str, sound: KeptSound) -> str:
-        """Write one message; return why that failed, or an empty text."""
+        """Write one message; return the reason for a failure, or an empty text."""
         start = int(sound.stamps[0])
         data = encode(
             message(
@@ -384,7 +386,7 @@ class ClipWriter:
             self._begin_day(stamp)
         minutes = self._settings.clip_minutes_a_day
         if self._used + frames > minutes * _MINUTE_FRAMES:
-            self._used = minutes * _MINUTE_FRAMES  # so that no shorter sound is written either
+            self._used = minutes * _MINUTE_FRAMES  # refuse shorter sounds too
             return f"{minutes} {_ALL_KEPT}"
         least = self._settings.clip_min_free_space
         try:
@@ -394,7 +396,7 @@ class ClipWriter:
         return f"less than {least} MB are free on the disk" if free < least * _MEGABYTE else ""
 
     def _begin_day(self, stamp: int) -> None:
-        """Count the frames that are kept already of the home's day that contains a time."""
+        """Count the frames already kept on the local day that contains a time."""
         day = datetime.fromtimestamp(stamp // NANOSECONDS, self._zone).date()
         begin, end = (
             int(datetime.combine(day + timedelta(days), time(), self._zone).timestamp())
@@ -411,7 +413,7 @@ class ClipWriter:
 
 
 def _frames_in(layer: Path, start: int, end: int) -> int:
-    """Count the frames of a layer between two times; none if it cannot be read."""
+    """Count the frames of a layer between two times; 0 if the layer is unreadable."""
     try:
         with LogFile(layer) as file:
             chunks = file.chunks
@@ -422,18 +424,18 @@ def _frames_in(layer: Path, start: int, end: int) -> int:
 
 
 class ClipRecorder:
-    """Keeps the clips of a recording, if that is configured, and always deletes old ones.
+    """Writes the clips of a recording, if configured, and always deletes old clips.
 
     Parameters
     ----------
     file_at : callable
-        Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
-        log; see `RollingLog.file_at`.
+        Maps a time in nanoseconds of UTC to the log that contains it and the end of that log; see
+        `RollingLog.file_at`.
 
     Raises
     ------
     ConfigurationError
-        If sound is to be kept and a model cannot tell what must not be.
+        If sound is to be kept and a model lacks a class that must not be kept.
     """
 
     def __init__(
@@ -454,7 +456,7 @@ class ClipRecorder:
 
     @property
     def kept_frames(self) -> int:
-        """Frames of sound that were kept."""
+        """Number of frames kept."""
         return self._writer.kept_frames
 
     def before(self, microphone: str, event: Event) -> list[Notice]:
@@ -463,17 +465,17 @@ class ClipRecorder:
         Returns
         -------
         list of Notice
-            What people should know: sound that cannot be kept, or is kept again.
+            Clips failed, or are kept again.
         """
         return self._microphones[microphone].close() if isinstance(event, Gap) else []
 
     def after(self, microphone: str, event: Event, labels: FrameLabels | None) -> list[Notice]:
-        """Keep the sound of an event that was logged, and delete what is old.
+        """Keep the sound of a logged event, and delete old clips.
 
         Returns
         -------
         list of Notice
-            What people should know: sound that cannot be kept or deleted, and what was deleted.
+            Failures to write or delete clips, recovery, and the number of deleted clips.
         """
         now = event_time(event)
         notices = [*self._retention.tick(now), *self._writer.tick(now)]
@@ -487,14 +489,14 @@ class ClipRecorder:
         Returns
         -------
         list of Notice
-            What people should know: sound that cannot be kept, or is kept again.
+            Clips failed, or are kept again.
         """
         notices = [notice for each in self._microphones.values() for notice in each.close()]
         return [*notices, *self._writer.finish()]
 
 
 class _MicrophoneClips:
-    """Chooses the clips of one microphone."""
+    """Selects the clips of one microphone."""
 
     def __init__(self, settings: Settings, pipeline: Pipeline, writer: ClipWriter) -> None:
         self._keep = settings.keep_audio
@@ -516,13 +518,13 @@ class _MicrophoneClips:
             raise ConfigurationError(self._refused)
 
     def close(self) -> list[Notice]:
-        """Write the sound that is held back."""
+        """Write the buffered sound."""
         if self._refused or self._keep == "off":
             return []
         return self._writer.write(self._microphone, self._finder.close())
 
     def push(self, frames: Frames, labels: FrameLabels | None) -> list[Notice]:
-        """Write the sound of frames that is to be kept."""
+        """Add frames and write the sound to keep."""
         if self._keep == "off":
             return []
         notices = []
@@ -533,7 +535,7 @@ class _MicrophoneClips:
         return notices
 
     def _change_classes(self, classes: Sequence[str]) -> list[Notice]:
-        """Go on with another model, unless it cannot tell what is never kept."""
+        """Continue with another model; stop clips if it lacks a class that is never kept."""
         before, self._classes = self._refused, classes
         self._refused = self._refusal()
         if self._refused == before:

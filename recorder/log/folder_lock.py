@@ -1,4 +1,4 @@
-"""One recorder of a name in a folder of logs: a second one is refused at its start."""
+"""Folder lock: one recorder per node name in a log folder."""
 
 import errno
 import fcntl
@@ -15,21 +15,19 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import is_node_name
 from hearthlog.schemas.new_files import make_folders, open_lock
 
-# With these a disk may be used again later; the recorder waits for that.
+# Temporary disk errors; the recorder waits for their end.
 _PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 _NUMBER = re.compile(rb"([1-9]\d{0,9})\n?")
 _NUMBER_SIZE = 20  # bytes
 
 
 class FolderLock:
-    """The lock of a node in a folder of logs, which is made if it is not there.
+    """Lock of a node in a log folder, which is created if missing.
 
-    It is the file `.<node>.lock`, in which the process writes its number. It stays there with the
-    logs, but is nobody's once the process has ended. Where the disk takes no file now, nothing is
-    locked.
-
-    Raise `LogError` as a context manager at its start: if another recorder holds it, or the
-    folder cannot be written to.
+    The lock is the file `.<node>.lock`, which holds the process number. The file remains with the
+    logs, but is released when the process ends. If the disk cannot take a file now, nothing is
+    locked. Entering the context raises `LogError` if another recorder holds the lock, or the folder
+    is not writable.
     """
 
     def __init__(self, folder: Path, node: str) -> None:
@@ -55,9 +53,9 @@ class FolderLock:
             self._remove_unused()
 
     def renew(self) -> None:
-        """Hold the lock again if its folder has been deleted, moved away or mounted since.
+        """Acquire the lock again if its folder was deleted, moved away or mounted since.
 
-        Raise `LogError` if another recorder holds it now, or the folder cannot be written to.
+        Raise `LogError` if another recorder holds it now, or the folder is not writable.
         """
         if self._descriptor is None or not self._is_here(self._descriptor):
             self._release()
@@ -92,7 +90,7 @@ class FolderLock:
             self._descriptor = None
 
     def _remove_unused(self) -> None:
-        with suppress(OSError):  # the folder is gone, or its disk
+        with suppress(OSError):  # the folder or its disk is gone
             if list(self._folder.iterdir()) == [self._path]:  # nothing was recorded
                 self._path.unlink()
                 self._folder.rmdir()
@@ -116,9 +114,9 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Check whether a folder can be written to, or made, and leave no trace.
+    """Check whether a folder is writable, or can be created, without side effects.
 
-    Raise `LogError` if it cannot be.
+    Raise `LogError` if not.
     """
     folder = folder.absolute()
     there = next(path for path in (folder, *folder.parents) if path.exists())
@@ -127,14 +125,14 @@ def check_writable(folder: Path) -> None:
 
 
 class NodeLock(NamedTuple):
-    """The lock of a node, as it was found in a folder.
+    """Lock of a node found in a folder.
 
     Attributes
     ----------
     process : int
-        The last one that held it; 0 if the file does not name one.
+        The last holder; 0 if the file has no number.
     is_held : bool or None
-        None if the file may not be read by this account.
+        None if this account may not read the file.
     """
 
     path: Path
@@ -144,10 +142,10 @@ class NodeLock(NamedTuple):
 
 
 def node_locks(folder: Path) -> list[NodeLock]:
-    """List the locks of recorders in a folder, by name; other files that end in `.lock` are none.
+    """List the locks of recorders in a folder, by name; ignore other `.lock` files.
 
-    A lock is a regular file, no link, has the name that `FolderLock` gives it, and holds the number
-    of a process or nothing.
+    A lock is a regular file, not a link, with the name that `FolderLock` gives it, and holds a
+    process number or nothing.
     """
     return list(_node_locks(folder))
 

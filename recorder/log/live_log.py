@@ -1,4 +1,4 @@
-"""Live log: messages held in memory while the disk refuses them."""
+"""Live log: buffers messages in memory during disk errors."""
 
 import errno
 import mmap
@@ -22,19 +22,19 @@ from hearthlog.schemas.frames import NANOSECONDS
 _ENTRY = struct.Struct("<qHI")  # log time, bytes of the topic, bytes of the data
 _FIRST_BYTES = 1 << 18
 
-Held = EncodedMessage | LogDescription  # a description: here another log begins
+Held = EncodedMessage | LogDescription  # a description begins another log
 
 
 class HeldMessages:
-    """A queue of messages, and of the descriptions of the logs that begin between them.
+    """Queue of messages, and of the descriptions of logs that begin between them.
 
-    Their bytes lie in one piece of memory: as many small objects they would leave holes that the
-    process never gives back to the system.
+    The bytes are in one block of memory: many small objects would leave holes in the heap that the
+    process never returns to the system.
 
     Attributes
     ----------
     size : int
-        Bytes that are held.
+        Bytes held.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class HeldMessages:
 
     @property
     def begins_log(self) -> bool:
-        """Whether the first that is held is a description."""
+        """Whether the first item is a description."""
         return not _ENTRY.unpack_from(self._memory, self._begin)[1]
 
     def extend(self, items: Iterable[Held]) -> None:
@@ -77,7 +77,7 @@ class HeldMessages:
                 self._append(item.log_time, item.topic.encode(), item.data)
 
     def drop_first(self) -> None:
-        """Forget what was held first."""
+        """Drop the first item."""
         _, topic_size, size = _ENTRY.unpack_from(self._memory, self._begin)
         if not topic_size:
             self._descriptions.popleft()
@@ -101,21 +101,21 @@ class HeldMessages:
 
 _HELD_BYTES = 8 << 20  # twenty minutes of one microphone
 _RETRY_SECONDS = 2.0
-_SPARE_BYTES = 1 << 20  # what must be free beside what is held
+_SPARE_BYTES = 1 << 20  # free space required in addition to the held messages
 
-_WRITTEN_AT_ONCE = 256  # messages of those that were held
+_WRITTEN_AT_ONCE = 256  # held messages per batch
 
 
 class LiveLog:
-    """Writes messages to a rolling log, and holds them in memory while the disk refuses them."""
+    """Writes messages to a rolling log, and buffers them in memory during disk errors."""
 
     def __init__(self, log: RollingLog, root: Path, lock: FolderLock | None = None) -> None:
         self._log = log
         self._root = root
         self._lock = lock
         self._mount = _mount_of(root)
-        self._held = HeldMessages()  # not yet known to be on the disk
-        self._safe = 0  # messages that were held and no longer are
+        self._held = HeldMessages()  # not yet synced to the disk
+        self._safe = 0  # messages dropped from `_held`
         self._failing = False
         self._reason = ""
         self._retry_at = 0.0
@@ -123,41 +123,41 @@ class LiveLog:
 
     @property
     def is_full(self) -> bool:
-        """Whether nothing more can be held, so that sound must be dropped."""
+        """Whether the buffer is full, so that sound must be dropped."""
         return self._failing and self._held.size >= _HELD_BYTES
 
     @property
     def finished(self) -> list[Path]:
-        """Files that are complete."""
+        """Completed files."""
         return self._log.finished
 
     def write(self, messages: Sequence[EncodedMessage]) -> None:
-        """Append messages, or hold them."""
+        """Append messages, or buffer them."""
         self._held.extend(messages)
         self._write(messages)
 
     def notices(self) -> list[Notice]:
-        """Return what people should know of the disk, since the last call."""
+        """Return the notices about the disk since the last call."""
         notices, self._notices = self._notices, []
         return notices
 
     def may_begin(self, stamp: int) -> bool:
-        """Tell whether a file may begin at a time, as `RollingLog.may_begin` does."""
+        """Return whether a file may begin at a time, as `RollingLog.may_begin` does."""
         return not self._failing and self._log.may_begin(stamp)
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
-        """Find the file that contains a time, as `RollingLog.file_at` does."""
+        """Return the file that contains a time, as `RollingLog.file_at` does."""
         return self._log.file_at(stamp)
 
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
-        """Complete the open file, and let the next message begin one of another description."""
+        """Complete the open file; the next message begins a file with another description."""
         self._held.extend([*messages, description])
         self._write([*messages, description])
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
         """Append the last messages, and complete the open file.
 
-        Raise `LogError` if the disk refuses them.
+        Raise `LogError` on a disk error.
         """
         self._held.extend(messages)
         self._retry_at = 0.0
@@ -170,7 +170,7 @@ class LiveLog:
         self._log.finish()
 
     def _write(self, items: Sequence[Held]) -> None:
-        """Write what was just held, or all that is held if the disk refused it before."""
+        """Write the new items, or all held items after a disk error."""
         if self._failing and time.monotonic() < self._retry_at:
             return
         was_failing = self._failing
@@ -208,7 +208,7 @@ class LiveLog:
                 self._log.begin_anew(description, [])
 
     def _check_disk(self) -> None:
-        if not self._mount.is_mount():  # the folder below it is on another disk
+        if not self._mount.is_mount():  # the folder under the mount point is on another disk
             raise OSError(errno.ENODEV, f"{self._mount} is not mounted")
         if shutil.disk_usage(self._mount).free < 2 * self._held.size + _SPARE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -223,7 +223,7 @@ class LiveLog:
             self._notices.append(Notice(WARNING, f"{what}: it is held in memory until it can"))
 
     def _let_go(self) -> None:
-        """Forget the messages that are on the disk."""
+        """Drop the messages that are on the disk."""
         while self._held:
             begins_log = self._held.begins_log
             if self._safe == self._log.safe and (self._failing or not begins_log):
@@ -233,7 +233,7 @@ class LiveLog:
 
 
 def _batches(held: Iterable[Held]) -> Iterator[list[Held]]:
-    """Cut what is held where the time moves on: files may begin there."""
+    """Split held items at a change of the log time: files may begin there."""
     batch: list[Held] = []
     last = -1
     for item in held:
@@ -247,6 +247,6 @@ def _batches(held: Iterable[Held]) -> Iterator[list[Held]]:
 
 
 def _mount_of(folder: Path) -> Path:
-    """Return the mount point of the disk of a folder that may not exist yet."""
+    """Return the mount point of a folder that may not exist yet."""
     folder = folder.resolve()
     return next(path for path in (folder, *folder.parents) if path.is_mount())

@@ -1,7 +1,7 @@
 """Recovery of interrupted logs, and the final rewrite of closed ones in a child process.
 
-A live log has chunks of half a second, so that little is lost when the recorder is killed. It is
-read three times as fast with chunks of ten, in which it is written anew.
+A live log has chunks of half a second, so that a killed recorder loses little. The rewrite has
+chunks of ten seconds and is read three times as fast.
 """
 
 import os
@@ -30,19 +30,19 @@ from hearthlog.schemas.salvage.recover import (
     recover_log,
 )
 
-_CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log: it is read as a whole, not as it grows
+_CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log, which is read completely, not followed
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """A log that was completed.
+    """A completed log.
 
     Attributes
     ----------
     damage : str
-        What is damaged in the file, and what was lost; empty if the file only ended early.
+        Damage in the file and losses; empty if the file only ended early.
     completed : bool
-        False for a log that cannot be completed now, or that was empty.
+        False for a log that cannot be completed now, or was empty.
     """
 
     path: Path
@@ -51,17 +51,17 @@ class Recovered:
 
 
 def recover_active(root: Path, node: str) -> list[Recovered]:
-    """Complete all logs of a node that no recorder writes any more.
+    """Complete all logs of a node that no recorder is writing.
 
-    What is whole is copied to the final name, read again and counted; only then the original is
-    removed. A log that is damaged, or holds no message, is kept beside it as `*.damaged`. Layers
-    of sound are not kept, for they are to be forgotten some day. A log that cannot be completed is
-    left for the next start; an empty file, as a power cut leaves it, is deleted.
+    Intact messages are copied to the final name, read again and counted; only then the original is
+    removed. A log that is damaged, or has no message, is also kept as `*.damaged`. Audio layers are
+    not kept, as they must expire some day. A log that cannot be completed is left for the next
+    start; an empty file, as left by a power cut, is deleted.
 
     Returns
     -------
     list of Recovered
-        By name; a log that begins but has no message is not there.
+        By name; logs without messages are omitted.
     """
     completed = []
     for active in active_logs(root, node):
@@ -75,7 +75,7 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
 
 
 def active_logs(root: Path, node: str) -> list[Path]:
-    """Return the logs of a node, and their clips, that have no final name yet, by name."""
+    """Return the logs and clips of a node without a final name, by name."""
     return sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}")))
 
 
@@ -85,12 +85,12 @@ def complete_log(active: Path) -> list[Recovered]:
     Parameters
     ----------
     active : Path
-        If it is gone, or somebody else is at it, nothing is done.
+        Ignored if it is gone, or in use by another process.
 
     Returns
     -------
     list of Recovered
-        None or one.
+        Zero or one.
 
     Raises
     ------
@@ -110,18 +110,17 @@ def complete_log(active: Path) -> list[Recovered]:
 
 
 def end_of_sound(root: Path, node: str, microphone: str, before: int) -> int:
-    """Find until when a node has recorded a microphone, in all its logs.
+    """Return the end of a node's recordings of a microphone, over all its logs.
 
     Parameters
     ----------
     before : int
-        Logs that begin later are not looked at: the clock was wrong when they were made. In
-        nanoseconds of UTC.
+        Logs that begin later are ignored, as their clock was wrong. In nanoseconds of UTC.
 
     Returns
     -------
     int
-        End of the last frame, or of the gap behind it, in nanoseconds of UTC; 0 if there is none.
+        End of the last frame, or of the gap after it, in nanoseconds of UTC; 0 if there is none.
     """
     latest = log_path(root, node, before).name
     ours = [path for path in root.rglob(f"{node}_*{SUFFIX}*") if _is_log_of(path, node)]
@@ -184,7 +183,7 @@ def _recover(active: Path, path: Path) -> list[Recovered]:
 
 
 def _complete(active: Path, path: Path) -> Recovery:
-    """Copy what is whole in a log to its final name, unless an earlier start has done so."""
+    """Copy the intact part of a log to its final name, unless an earlier start has done so."""
     copy = active.with_name(path.name + ".recovering")
     try:
         recovery = recover_log(active, copy, path.name, chunk_span=_CHUNK_SPAN)
@@ -195,7 +194,7 @@ def _complete(active: Path, path: Path) -> Recovery:
             return recovery
         sync_file(copy)
         if all(damage.cut for damage in recovery.damages):
-            with lock_abandoned(copy):  # the log has one name at any time, and one owner
+            with lock_abandoned(copy):  # the log has one name and one owner at any time
                 copy.replace(active)
                 active.rename(path)
         else:
@@ -211,9 +210,9 @@ _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # it ends within seco
 
 
 class LogFinisher:
-    """Has completed logs written anew while the recorder goes on.
+    """Rewrites completed logs in child processes while the recorder continues.
 
-    The processes end with this one: what they leave is completed at the next start.
+    The children end with this process; unfinished logs are completed at the next start.
     """
 
     def __init__(self) -> None:
@@ -221,20 +220,20 @@ class LogFinisher:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def add(self, active: Sequence[Path]) -> None:
-        """Begin to write logs anew that are completed or cut, but not named; return at once."""
+        """Start to rewrite completed or cut logs under their final names; return immediately."""
         self._forget([process for process in self._processes if process.poll() is not None])
         self._left = [path for path in dict.fromkeys([*self._left, *active]) if path.exists()]
         command = [*_COMMAND, *map(str, self._left)]
-        with suppress(OSError, RuntimeError):  # no memory: the next one does it
+        with suppress(OSError, RuntimeError):  # no memory: the next process does it
             process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603
             self._processes.append(process)
-            # Collects its status as soon as it ends, which the next log may do an hour later.
+            # Reaps the process as soon as it ends; the next log may come an hour later.
             threading.Thread(target=process.wait, daemon=True).start()
 
     def close(self) -> None:
-        """Give all logs their names that can get them.
+        """Give all logs their final names, as far as possible.
 
-        Whoever ends the recorder waits: on a busy machine a process of low priority takes minutes.
+        This runs in the foreground: on a busy machine a process of low priority takes minutes.
         """
         for process in self._processes:
             process.kill()
@@ -251,19 +250,19 @@ class LogFinisher:
 
 
 def finish_log(active: Path) -> None:
-    """Write a completed log anew and give it its name; if that fails, name it as it is.
+    """Rewrite a completed log under its final name; if that fails, only rename it.
 
     Parameters
     ----------
     active : Path
-        Its active name. If it is gone, or somebody else is at it, nothing is done. What is damaged
-        in it is said on standard error.
+        Active name of the log. Ignored if it is gone, or in use by another process. Damage is
+        reported on standard error.
     """
     try:
         for recovered in complete_log(active):
             if recovered.damage:
                 sys.stderr.write(f"hearthlog: {recovered.damage}\n")
-    except (LogError, OSError):  # there is no room for a copy
+    except (LogError, OSError):  # no space for a copy
         with suppress(LogError, OSError):  # else it is left for the next start
             _name_as_it_is(active)
 
@@ -278,7 +277,7 @@ def _name_as_it_is(active: Path) -> None:
 
 
 def main() -> None:
-    """Finish the logs that the arguments name, unless the process that asks for it ends."""
+    """Finish the logs named by the arguments; exit if the parent process ends."""
     for number in _IGNORED:
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICENESS)
@@ -288,7 +287,7 @@ def main() -> None:
 
 
 def _end_with_parent() -> None:
-    os.read(sys.stdin.fileno(), 1)  # its end comes with the end of the other process
+    os.read(sys.stdin.fileno(), 1)  # end of file when the parent ends
     os._exit(1)
 
 

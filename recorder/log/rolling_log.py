@@ -1,4 +1,4 @@
-"""The log of a recorder: files of a limited length and size, and their description."""
+"""A recorder's log: files of limited length and size, and their description."""
 
 import hashlib
 import time
@@ -39,7 +39,7 @@ from hearthlog.schemas.messages.topics import (
 
 @dataclass(frozen=True)
 class LogDescription:
-    """What every file of a recording says of itself."""
+    """Description of a recording, written to every file."""
 
     root: Path  # folder of the logs
     node: str  # name of the recorder
@@ -47,7 +47,7 @@ class LogDescription:
     infos: Sequence[Any]  # `AudioStreamInfo` of each microphone; each file sets their stamps
     metadata: Mapping[str, str]  # the `hearthlog` record
     attachments: Sequence[Attachment]
-    # By microphone, what the lines of `/rosout` at the start of a file say besides.
+    # By microphone, additional lines of `/rosout` at the start of a file.
     lines: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
@@ -64,9 +64,9 @@ def describe_log(  # noqa: PLR0913, PLR0917
     Parameters
     ----------
     model : Model or None
-        The model that labels the sound; None for no labels.
+        Labelling model; None for no labels.
     embedding : EmbeddingSource, optional
-        Of the embeddings; None without a network.
+        Source of the embeddings; None without a network.
     """
     secondary = secondary or {}
     microphone = info.header.frame_id
@@ -113,7 +113,7 @@ def describe_log(  # noqa: PLR0913, PLR0917
 def with_scenarios(
     description: LogDescription, microphone: str, scenarios: Mapping[str, Model]
 ) -> LogDescription:
-    """Add what logs say of the scenarios of a microphone, but their topics."""
+    """Add metadata, attachments and lines of a microphone's scenarios, without their topics."""
     entries = dict(description.metadata)
     attachments = list(description.attachments)
     for name, model in scenarios.items():
@@ -132,12 +132,12 @@ def with_scenarios(
 
 
 def _scenario_attachments(scenario: str, model: Model) -> list[Attachment]:
-    own = f"{SCENARIO}-{scenario}"  # no microphone is called so
+    own = f"{SCENARIO}-{scenario}"  # not a valid microphone name
     return [replace(each, name=attachment_of(each.name, own)) for each in model_attachments(model)]
 
 
 def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
-    """Return the description of the logs of several microphones."""
+    """Join the descriptions of several microphones."""
     first = descriptions[0]
     attachments = {each.name: each for each in first.attachments}
     for other in descriptions[1:]:
@@ -167,16 +167,16 @@ def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
     )
 
 
-# The longest time from a sound to its writing: a block of frames, and the delay of the capture.
+# Maximum delay from a sound to its writing: a block of frames, and the capture delay.
 _DELAY_SECONDS = 0.9
 _QUIET_SECONDS = 2.0  # without a flush; sound has one every half a second
-_FILES = 256  # to remember: even with one a second, longer than clips are held back
-_LATE = 10 * NANOSECONDS  # of one microphone behind another: beyond that the clock was set back
+_FILES = 256  # remembered: longer than clips are buffered, even with one file per second
+_LATE = 10 * NANOSECONDS  # lag between microphones; more means that the clock was set back
 _NEVER = (1 << 63) - 1
 
 
 class RollingLog:
-    """Writes messages into one file after another.
+    """Writes messages into successive files.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class RollingLog:
     sync_seconds : float
         A power cut loses at most this much sound.
     file_bytes : int
-        Another file begins where one has grown so large; 0 for any size.
+        Size at which the next file begins; 0 for no limit.
     """
 
     def __init__(  # noqa: PLR0913
@@ -203,7 +203,7 @@ class RollingLog:
     ) -> None:
         self.finished: list[Path] = []
         self.safe = 0
-        self._given = 0  # messages that were appended, those that open a file not counted
+        self._given = 0  # appended messages, without the opening messages of files
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
         self._file_bytes = file_bytes
@@ -213,9 +213,9 @@ class RollingLog:
         self._name = free_log_path if live else log_path
         self._finisher = finisher
         self._writer: LogWriter | None = None
-        self._abandoned: LogWriter | None = None  # of the file that the disk refused
+        self._abandoned: LogWriter | None = None  # of the file with the disk error
         self._late = _LATE if len(description.infos) > 1 else 0
-        self._last = self._until = 0  # no time lies between: the first message opens a file
+        self._last = self._until = 0  # empty range: the first message opens a file
         self._flush_at: int | None = None
         self._flushed = time.monotonic()
         self._synced = time.monotonic()
@@ -224,10 +224,9 @@ class RollingLog:
     def write(self, messages: Sequence[EncodedMessage]) -> None:
         """Append messages.
 
-        Where time runs backwards, because the clock was set, another file begins.
-
-        Raise `LogError` if the disk refuses: what was written stays, for the next start to
-        complete. Also if there is a file already with the name of one that begins, unless live.
+        If time runs backwards, because the clock was set, a new file begins. Raise `LogError` on a
+        disk error: the written part remains and is completed at the next start. Also, unless live,
+        if the name of a new file is taken.
         """
         with self._keeping_what_was_written():
             for part in self._parts(messages):
@@ -243,14 +242,14 @@ class RollingLog:
     def _is_flush_due(self) -> bool:
         if self._flush_at is None:
             return False
-        # Without sound there is a message every ten seconds, which is not to wait for the next.
+        # Without sound there is one message in ten seconds; it must not wait for the next.
         waits = self._live and time.monotonic() - self._flushed >= _QUIET_SECONDS
         return waits or self._last >= self._flush_at
 
     def flush(self) -> None:
-        """Hand what was written over to the operating system.
+        """Pass written data to the operating system.
 
-        Raise `OSError` if the disk refuses.
+        Raise `OSError` on a disk error.
         """
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
@@ -260,9 +259,9 @@ class RollingLog:
                 self._until = 0
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk.
+        """Wait until written data is on the disk.
 
-        Raise `OSError` if the disk refuses.
+        Raise `OSError` on a disk error.
         """
         self.flush()
         if self._writer is not None:
@@ -281,7 +280,7 @@ class RollingLog:
         Raises
         ------
         LogError
-            If the disk refuses; what was written stays, for the next start to complete.
+            On a disk error; the written part remains and is completed at the next start.
         """
         with self._keeping_what_was_written():
             if self._writer is not None:
@@ -290,22 +289,22 @@ class RollingLog:
             self._finish_file()
 
     def may_begin(self, stamp: int) -> bool:
-        """Tell whether a file may begin at a time: each second has one name."""
+        """Return whether a file may begin at a time: each second has one name."""
         description = self._description
         path = log_path(description.root, description.node, stamp)
         return free_log_path(description.root, description.node, stamp) == path
 
     @property
     def is_full(self) -> bool:
-        """Whether sound must be dropped; what cannot be written raises an error instead."""
+        """Whether sound must be dropped; always false, as disk errors raise."""
         return False
 
     def notices(self) -> list[Notice]:
-        """Return what people should know of the disk."""
+        """Return notices about the disk; none, as disk errors raise."""
         return []
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
-        """Find the file that contains a time; the later one where the clock was set back.
+        """Return the file that contains a time; the later one if the clock was set back.
 
         Parameters
         ----------
@@ -315,7 +314,7 @@ class RollingLog:
         Returns
         -------
         end : int
-            When the next file begins, in nanoseconds of UTC.
+            Start of the next file, in nanoseconds of UTC.
         """
         until = _NEVER
         if not self._begun:
@@ -327,7 +326,7 @@ class RollingLog:
         return self._begun[0][1], until
 
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
-        """Complete the open file, and let the next message begin one of another description.
+        """Complete the open file; the next message begins a file with another description.
 
         Raise `LogError` as `finish` does.
         """
@@ -336,18 +335,18 @@ class RollingLog:
         self._until = 0
 
     def complete_what_was_cut(self) -> None:
-        """Have the files completed that the disk has refused, clips among them; return at once."""
+        """Start the completion of files with disk errors, including clips; return immediately."""
         if self._finisher is None:
             return
-        # What is open stays out of it: the disk may refuse it before that process has begun.
+        # The open file is excluded: the disk may refuse it before that process has started.
         is_open = None if self._writer is None else self._writer.active_path
         logs = active_logs(self._description.root, self._description.node)
         self._finisher.add([path for path in logs if path != is_open])
 
     def begin_after_failure(self) -> None:
-        """Go on after an error: the messages that are not `safe` are to be written again.
+        """Continue after an error: messages that are not `safe` must be written again.
 
-        Raise `OSError` if the disk still refuses.
+        Raise `OSError` if the disk error persists.
         """
         if self._abandoned is not None:
             self._abandoned.discard_unsynced()
@@ -382,7 +381,7 @@ class RollingLog:
         self.safe = self._given
 
     def _parts(self, messages: Sequence[EncodedMessage]) -> Iterator[Sequence[EncodedMessage]]:
-        """Divide messages where one may begin a file: nowhere, as long as all are in order."""
+        """Split messages where a file may begin; ordered messages within the file stay together."""
         times = [message.log_time for message in messages]
         if times and times[-1] < self._until and times == sorted(times):
             yield messages
@@ -413,5 +412,5 @@ class RollingLog:
             info.header = header(stamp, info.header.frame_id)
             lines = description.lines.get(info.header.frame_id, ())
             self._append(opening_messages(info, lines))
-        self._writer.flush()  # the file now says what it is, whatever happens next
+        self._writer.flush()  # the file is identifiable whatever happens next
         self._flush_at = None

@@ -1,1 +1,1 @@
-"""Where sound comes from: audio files and microphones."""
+"""Sound sources: audio files and microphones."""

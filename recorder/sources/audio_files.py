@@ -1,4 +1,4 @@
-"""Audio files in place of a microphone."""
+"""Audio files as a sound source."""
 
 import os
 import time
@@ -32,38 +32,37 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECON
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
-_LONG_FRAMES = 6 * _HEALTH_FRAMES  # what a block costs besides is a fifth of 10 s of frames
-_NAMED = 10  # of the files that are damaged
+_LONG_FRAMES = 6 * _HEALTH_FRAMES  # a block's overhead is a fifth of the cost of 10 s
+_NAMED = 10  # damaged files listed
 _NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
 
 
 class FileSource:
     """Several audio files in a row, as one stream of frames.
 
-    The last samples are dropped where they do not fill a frame.
+    Trailing samples that do not fill a frame are dropped.
 
     Parameters
     ----------
     start : int
         Time of the first sample in nanoseconds of UTC.
     times : sequence of (FileTime or None), optional
-        When each file begins, as of `arrange`; None, or no sequence: where the one before it ends.
-        A later start makes a gap; an earlier one is not possible, and the file follows.
+        Start of each file, from `arrange`; None, or no sequence: the end of the previous file. A
+        later start makes a gap; an earlier one is ignored, and the file follows.
     realtime : bool
-        Whether to yield each frame only once as much time has passed since the first one.
+        Whether to yield frames in real time.
     channels : int or None
-        Of an array, which the files must have; None: they become one, as of `read_audio`.
+        Channels of an array, which the files must have; None: mixed to one, as by `read_audio`.
     channel : int or None
-        The one to hear, from 1 on.
+        Selected channel, counted from 1.
     progress : callable
-        Told the share of the sound that was read, 0 to 1.
+        Called with the share of the sound read so far, 0 to 1.
 
     Raises
     ------
     SourceError
-        If one of the files is missing, is not audio, holds none, has a sample rate that cannot be
-        recorded, other channels than the array, or not the one to hear; if a log cannot have their
-        times.
+        If a file is missing, is not audio, is empty, has an unsupported sample rate, other channels
+        than the array, or not the selected one; if the times are out of the range of a log.
     """
 
     def __init__(  # noqa: PLR0913
@@ -87,8 +86,8 @@ class FileSource:
         self.device = _name(paths)
         self.frames = 0
         self._faults: list[str] = []
-        self._overlaps: list[tuple[float, Path]] = []  # seconds, and the file that begins too early
-        self._choices: list[str] = []  # of one channel of a file
+        self._overlaps: list[tuple[float, Path]] = []  # seconds, and the file with the early start
+        self._choices: list[str] = []  # selected channels of files
         self._hole_seconds = 0.0
         self._paths = paths
         self._start = start
@@ -101,7 +100,7 @@ class FileSource:
 
     @property
     def warnings(self) -> list[str]:
-        """Parts of the files that were not heard, or not at their time, so far."""
+        """Parts of the files that were skipped or shifted in time, so far."""
         lines = list(self._choices)
         if self._hole_seconds:
             lines.append(f"{self.device}: {self._hole_seconds:.2f} s are left out: {_NO_NUMBERS}")
@@ -121,10 +120,8 @@ class FileSource:
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield the frames, the gaps between files, and the health of the source.
 
-        The health comes every ten seconds of sound.
-
-        Raise `SourceError` if a file cannot be opened any more, or if all together are shorter
-        than a frame.
+        The health comes every ten seconds of sound. Raise `SourceError` if a file cannot be opened
+        any more, or if all files together are shorter than a frame.
         """
         began = time.monotonic()
         next_frame, end, report = 0, self._start, 0
@@ -161,7 +158,7 @@ class FileSource:
             raise SourceError("; ".join(self._faults) or f"{files}: {what}")
 
     def _frames(self) -> Iterator["Float32 | _Pause"]:
-        """Yield blocks of frames whose number divides the interval of the health reports."""
+        """Yield blocks with a number of frames that divides the interval of the health reports."""
         size = (_REALTIME_FRAMES if self.realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
         shape = () if self._channels is None else (self._channels,)
         held = np.empty((0, *shape), np.float32)
@@ -195,14 +192,14 @@ class FileSource:
             yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)
 
     def _choose(self, path: Path, sentence: str) -> None:
-        """Note which channels of a file are heard, if it is not all of them."""
+        """Record which channels of a file are selected; an empty text is the default."""
         self._problem = sentence
         self._changes.append(sentence)
         if sentence and (choice := f"{path}: {sentence}") not in self._choices:
             self._choices.append(choice)
 
     def _is_later(self, path: Path, moment: FileTime, end: int) -> bool:
-        """Whether a file begins after the end of those before it, as far as it says."""
+        """Whether a file begins after the end of the previous files, by more than the time step."""
         late = moment.start - end
         step = max(moment.step, FRAME_NANOSECONDS)
         if late <= -step:
@@ -211,12 +208,12 @@ class FileSource:
 
 
 class LongBlocks:
-    """Another source, whose successive frames come a minute at once.
+    """Wraps a source to yield its frames in blocks of a minute.
 
     Parameters
     ----------
     source : SoundSource
-        What it reports between frames becomes a part of them, as their `reports`.
+        Its reports between frames become the `reports` of the frames.
     """
 
     def __init__(self, source: SoundSource) -> None:
@@ -228,7 +225,7 @@ class LongBlocks:
         return self._source.device
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield the events of the source; those before an error come before it."""
+        """Yield the events of the source; pending events come before an error."""
         held = list[Frames | SourceHealth]()
         frames = 0
         try:
@@ -251,7 +248,7 @@ class LongBlocks:
 
 
 def _joined(events: Sequence[Frames | SourceHealth]) -> Iterator[Event]:
-    """Yield successive frames as one block with the reports between them, then those behind."""
+    """Yield frames as one block with the reports between them, then the reports after them."""
     blocks = [event for event in events if isinstance(event, Frames)]
     reports = [event for event in events if isinstance(event, SourceHealth)]
     if blocks:
@@ -270,21 +267,21 @@ def _joined(events: Sequence[Frames | SourceHealth]) -> Iterator[Event]:
 
 
 class _Pause(NamedTuple):
-    """A time between two files that no file is of."""
+    """Time between two files."""
 
     until: int  # in nanoseconds of UTC
     reason: str
 
 
 class _Hole(NamedTuple):
-    """Frames of a file that hold what is no sound."""
+    """Frames of a file with NaN or infinity."""
 
     nanoseconds: int
     reason: str = _NO_NUMBERS
 
 
 def _finite_runs(blocks: Iterator[Float32 | _Pause]) -> Iterator[Float32 | _Pause | _Hole]:
-    """Replace frames that are not finite by holes."""
+    """Replace frames with NaN by holes."""
     lost = 0  # frames of a hole that may go on
     for block in blocks:
         for run in [block] if isinstance(block, _Pause) else _runs(block):
@@ -300,7 +297,7 @@ def _finite_runs(blocks: Iterator[Float32 | _Pause]) -> Iterator[Float32 | _Paus
 
 
 def _runs(block: Float32) -> list[Float32]:
-    """Divide frames where finite ones border on others."""
+    """Split frames at the borders of finite and other frames."""
     is_hole = np.isnan(block).reshape(len(block), -1).any(axis=1)
     return np.split(block, np.flatnonzero(np.diff(is_hole)) + 1) if is_hole.any() else [block]
 
@@ -308,17 +305,17 @@ def _runs(block: Float32) -> list[Float32]:
 def find_audio(
     paths: Sequence[Path], check: Callable[[Path], object] = str
 ) -> tuple[list[Path], list[str]]:
-    """Replace folders by the audio files in them and in their folders.
+    """Replace folders by the audio files in them and their subfolders.
 
     Returns
     -------
     list of Path
-        Those of a folder in the order of their names, without hidden ones.
+        Files of a folder in the order of their names, without hidden ones.
 
     Raises
     ------
     SourceError
-        If no audio that can be read is in a folder.
+        If a folder has no readable audio.
     """
     found: list[Path] = []
     refused: list[str] = []
@@ -342,9 +339,9 @@ def find_audio(
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Yield all files in a folder and its folders, also those behind links, sorted by folder.
+    """Yield all files below a folder, following links, sorted by folder.
 
-    Hidden folders are left out.
+    Hidden folders are skipped.
     """
     seen: set[tuple[int, int]] = set()
     for parent, folders, names in os.walk(folder, followlinks=True):
@@ -358,12 +355,12 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def _name(paths: Sequence[Path]) -> str:
-    """Name the files in a few words, since every diagnostic message repeats them."""
+    """Name the files briefly, as every diagnostic message repeats the name."""
     if len(paths) == 1:
         return _text(paths[0])
     return f"{_text(paths[0])} … {_text(paths[-1])} ({len(paths)} files)"
 
 
 def _text(path: Path) -> str:
-    """Return the name of a file as a log can have it, in UTF-8."""
+    """Return the name of a file as valid UTF-8 for the log."""
     return path.name.encode(errors="replace").decode()

@@ -1,10 +1,10 @@
 """Sound devices, and the capture process: one microphone's sound on standard output.
 
 PortAudio hangs inside the process when a device vanishes, so this process can be killed at any
-moment. It imports no more than PortAudio needs and computes nothing.
+moment. It imports only what PortAudio needs and computes nothing.
 
-It writes one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and
-the samples that it announces (int16, interleaved if there are several channels).
+It writes one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and its
+samples (int16, interleaved if there are several channels).
 """
 
 import json
@@ -26,20 +26,20 @@ from typing import Any, NamedTuple
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
-_WINDOW_SAMPLES = 30 * SAMPLE_RATE  # longer than a network that is heard again may stall
-_WINDOWS = 10  # five minutes, in which two clocks do not drift apart by so much
+_WINDOW_SAMPLES = 30 * SAMPLE_RATE  # longer than a recoverable stall of the network
+_WINDOWS = 10  # five minutes, too short for a clock drift above the tolerance
 _TOLERANCE_SECONDS = 1.0
 
 
 class ArrivalPace:
-    """Follows when sound arrives, by the time at which its first sample must have been taken.
+    """Tracks arrivals of sound to estimate the capture time of its first sample.
 
-    That is the earliest one that any arrival allows: sound can be late, and cannot be early.
+    The estimate is the earliest time that any arrival allows: sound can be late, but not early.
 
     Parameters
     ----------
     began : float
-        Time at which the source was called, in seconds of CLOCK_MONOTONIC.
+        Time of the connection to the source, in seconds of CLOCK_MONOTONIC.
     """
 
     def __init__(self, began: float) -> None:
@@ -50,19 +50,19 @@ class ArrivalPace:
         self._windows: deque[float] = deque(maxlen=_WINDOWS)
 
     def add(self, count: int, arrival: float) -> None:
-        """Note that so many samples have come until now, in seconds of CLOCK_MONOTONIC."""
+        """Add the arrival of `count` samples, in seconds of CLOCK_MONOTONIC."""
         self.count += count
         self._window = min(self._window, arrival - self.count / SAMPLE_RATE)
 
     def settle(self) -> tuple[int, float]:
-        """Tell live sound from what a server had kept for its listeners, and sends at first.
+        """Separate live sound from the buffered sound that a server sends first.
 
         Returns
         -------
         older : int
-            How many of the samples are from before the source was called.
+            Number of samples from before the connection.
         now : float
-            When the last one was taken, in seconds of CLOCK_MONOTONIC.
+            Capture time of the last sample, in seconds of CLOCK_MONOTONIC.
         """
         start = self._window
         self._windows.append(start)
@@ -70,7 +70,7 @@ class ArrivalPace:
         return min(max(older, 0), self.count), start + self.count / SAMPLE_RATE
 
     def trouble(self) -> str:
-        """Say what is wrong with a source that has settled, if something is."""
+        """Return the fault of a settled source; empty if there is none."""
         if self._window < min(self._windows) - _TOLERANCE_SECONDS:
             return "sends sound faster than it sounds; give the address of a live source"
         if self.count < self._window_end:
@@ -86,15 +86,15 @@ _CARDS = Path("/sys/class/sound")
 
 
 class UsbPlace(NamedTuple):
-    """Of a sound card at USB.
+    """USB location of a sound card.
 
     Attributes
     ----------
     port : str
-        `usb:` and the bus and ports that lead to it, such as "usb:1-1.2"; the same after a reboot,
-        as long as it stays in its socket. Empty for a card that is not at USB.
+        `usb:` with bus and ports, such as "usb:1-1.2"; stable over reboots for the same socket.
+        Empty for a card that is not on USB.
     serial : str
-        `serial:` and its number; empty if it has none.
+        `serial:` with the serial number; empty without one.
     """
 
     port: str = ""
@@ -102,9 +102,9 @@ class UsbPlace(NamedTuple):
 
 
 def usb_place(card: int, cards: Path = _CARDS) -> UsbPlace:
-    """Find where a sound card is plugged in."""
+    """Return the USB location of a sound card."""
     interface = (cards / f"card{card}" / "device").resolve()
-    device = interface.parent  # of the interface that is the sound card
+    device = interface.parent  # parent of the sound card's interface
     try:
         (device / "idVendor").read_text()
     except OSError:
@@ -126,7 +126,7 @@ class Device:
     Attributes
     ----------
     name : str
-        Name without the number of the sound card, which changes from one start to the next.
+        Name without the number of the sound card, which changes between starts.
     default_rate : float
         In Hz.
     """
@@ -141,12 +141,12 @@ class Device:
 
     @property
     def identity(self) -> str:
-        """What tells it from all others, now and when it is plugged in again."""
+        """Unique identity, stable over a reconnection."""
         return self.port if re.search(r" #\d+$", self.name) and self.port else self.name
 
 
 def load_portaudio() -> ModuleType:
-    """Import sounddevice, which looks for PortAudio and starts it.
+    """Import sounddevice, which finds and starts PortAudio.
 
     Raise `SourceError` if PortAudio is missing or cannot start.
     """
@@ -167,7 +167,7 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
     Returns
     -------
     list of Device
-        In the order of PortAudio; several of one name are called `<name> #1`, `<name> #2`.
+        In PortAudio's order; equal names become `<name> #1`, `<name> #2`.
     """
     default = sounddevice.default.device[0]
     devices = [
@@ -186,13 +186,13 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
 
 
 def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Device:
-    """Choose a microphone by its name.
+    """Find a microphone by its name.
 
     Parameters
     ----------
     name : str
-        A name or a part of one, in which capitals make no difference; or a port or serial number,
-        as `UsbPlace` has them; empty for the default microphone.
+        A case-insensitive name or part of one; or a port or serial number in the form of
+        `UsbPlace`; empty for the default microphone.
 
     Raises
     ------
@@ -228,42 +228,42 @@ def _device(info: dict[str, Any], *, is_default: bool) -> Device:
     )
 
 
-# index of the first sample, samples of each channel, flags of PortAudio, time of the first sample
-# by the ADC (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC (s)
+# index of the first sample, samples per channel, PortAudio flags, ADC time of the first sample
+# (s, on a clock of the driver's choice), current CLOCK_MONOTONIC (s)
 BLOCK = struct.Struct("<QIIdd")
 
 _PREFERRED_RATE = 16_000
 BLOCK_SECONDS = 0.6  # each wake-up costs more than the samples it brings
-LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
-LONG_LATENCY_SECONDS = 8.0  # for devices that give their sound in long pieces
-_MOST_CHANNELS = 8  # to choose one of; a sound server offers any number, and mixes them itself
-_QUEUE_BLOCKS = 300  # three minutes, beyond what the pipe holds
-_LEAST_QUEUE_BLOCKS = 60  # where each has many channels
+LATENCY_SECONDS = 1.0  # PortAudio's buffer while this process does not run
+LONG_LATENCY_SECONDS = 8.0  # for devices that deliver sound in long pieces
+_MOST_CHANNELS = 8  # for selection; a sound server offers any number, and mixes them itself
+_QUEUE_BLOCKS = 300  # three minutes, in addition to the pipe
+_LEAST_QUEUE_BLOCKS = 60  # for blocks with many channels
 
 
 @dataclass(frozen=True)
 class CaptureFormat:
-    """Where the blocks come from, how many samples a second there are, and how steadily."""
+    """Origin, sample rate and timing of the blocks."""
 
     device: str
-    identity: str  # of the device: what it is asked for by when it is plugged in again
+    identity: str  # of the device, to find it after a reconnection
     rate: int
-    stale_seconds: float = 3.0  # without a block, after which none will come
-    lost_reason: str = ""  # why samples are in no block; empty: the recorder was too slow
-    channels: int | None = None  # of the blocks; None: one, and samples have no axis of channels
+    stale_seconds: float = 3.0  # without a block until the device counts as lost
+    lost_reason: str = ""  # why samples are missing; empty: the recorder was too slow
+    channels: int | None = None  # of the blocks; None: one, without a channel axis
 
 
 def main() -> None:
     """Capture from the device named by the first argument, until killed or without a parent.
 
-    Without an argument, list the devices. The second one is the number of channels of an array, or
-    0, the third one the channel to hear, or 0, the fourth one the latency in seconds. A fifth one:
-    take no other device whose name contains this one.
+    Without arguments, list the devices. Further arguments: the number of channels of an array, or
+    0; the selected channel, or 0; the latency in seconds; a fifth argument of any value requires an
+    exact name.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
     output = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)  # the sound libraries print as they like
+    os.dup2(2, 1)  # the sound libraries print to standard output
     try:
         sounddevice = load_portaudio()
         devices = list_devices(sounddevice)
@@ -278,7 +278,7 @@ def main() -> None:
         output.write(json.dumps(answer).encode() + b"\n")
     except BrokenPipeError:
         pass
-    # A stream of a device that is gone never closes.
+    # A stream of a disconnected device never closes.
     os._exit(0)
 
 
@@ -305,7 +305,7 @@ def _capture(  # noqa: PLR0913, PLR0917
             time.monotonic(),
         )
         index += count
-        if not blocks.full():  # what is dropped here shows in the next index
+        if not blocks.full():  # dropped blocks show in the next index
             blocks.put_nowait((head, bytes(samples)))
 
     _check_channels(device, places, channel)
@@ -334,7 +334,7 @@ def _capture(  # noqa: PLR0913, PLR0917
 def _open(
     sounddevice: ModuleType, device: Device, counts: list[int], latency: float, callback: Any
 ) -> tuple[Any, int, int]:
-    """Open the device at 16 kHz, or at its own rate, with the first number of channels it takes."""
+    """Open the device at 16 kHz, or at its own rate, with the first supported channel count."""
     reason = ""
     for rate in (_PREFERRED_RATE, int(device.default_rate)):
         for channels in dict.fromkeys(counts):

@@ -1,10 +1,11 @@
 """Audio files as one stream of samples at 16 kHz: mono, or the channels of an array.
 
-One channel of several is their mean or the first one, or others where that would hide sound. It is
-chosen twice. Every ten seconds, by all of them: so steady noise is known from sound. And in every
-piece of 0.4 s, where another channel holds sound and those in use do not: so a channel that dies,
-or a talker near another microphone, costs less than a second of a live sound. A channel that
-sounds again within a minute is mixed with the others, so talkers in turn make no change every time.
+Several channels become one: their mean, or the first channel, or other channels where the mean or
+first channel would hide sound. The choice is made at two time scales. Every ten seconds all
+channels are compared, long enough to tell steady noise from sound. Every 0.4 s the mixer switches
+if another channel holds sound and the selected channels do not, so a dead channel, or a talker near
+another microphone, costs less than a second of live sound. A channel that sounds again within a
+minute is mixed with the selected ones, so alternating talkers do not cause a switch every time.
 """
 
 import math
@@ -23,30 +24,30 @@ from hearthlog.schemas.arrays import Bool, Float32, Float64
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _BLOCK_SECONDS = 10
-_PIECES = 25  # of a block: as the blocks of a floor
-_FIRST_PIECES = 2  # before which noise cannot be told from sound
-_SAMPLES = 2000  # of a piece that are looked at
+_PIECES = 25  # per block, like the blocks of a floor
+_FIRST_PIECES = 2  # fewer cannot separate noise from sound
+_SAMPLES = 2000  # analysed per piece
 _REMEMBERED = 150  # pieces: a minute
-_STEADY_DB = 0.42  # noise is below it, as in the floor of a room
+_STEADY_DB = 0.42  # noise varies less, as in the room's noise floor
 _FAINTER = 8.0  # times in power: 9 dB; one of two channels, or two that differ, lose 6 dB at most
-_COVERS = 6.0  # times at most, before what is usual is heard again
-_CANCELLED = 4.0  # times fainter than of unlike channels
+_COVERS = 6.0  # times at most, for a return to the default channels
+_CANCELLED = 4.0  # times fainter than a mix of uncorrelated channels
 _STANDS_OUT = 2.0  # times the quietest tenth of ten seconds
-_MODULATED_DB = 1.5  # within a piece, in parts of 16 ms: noise is below it, speech and music above
+_MODULATED_DB = 1.5  # spread of parts of 16 ms of a piece: less is noise, more speech or music
 _AUDIBLE = 1e-8  # power
-_DEAD = 1e-9  # power: of the noise of a converter
+_DEAD = 1e-9  # power of a converter's noise
 _LOST_SHARE = 0.5  # of the pieces of a block
 _TINY = 1e-12
 _INT16_FULL_SCALE = np.float32(32768.0)
 
 
 def missing_channel(there: int, wanted: int) -> str:
-    """Say that there is no such channel.
+    """Return the error text for a channel number that does not exist.
 
     Parameters
     ----------
     wanted : int
-        From 1 on.
+        Counted from 1.
     """
     has = f"{there} channels" if there > 1 else "one channel"
     return f"has {has}, and `channel` asks for number {wanted}: take one from 1 to {there}"
@@ -56,12 +57,12 @@ _Samples = TypeVar("_Samples", Float32, Float64)
 
 
 class ChannelMixer:
-    """Makes one channel of several of a sound that is read in blocks of ten seconds.
+    """Mixes several channels to one, in blocks of ten seconds.
 
     Parameters
     ----------
     channel : int or None
-        The one to hear whatever they hold, from 1 on.
+        Fixed channel, counted from 1, used regardless of content.
     """
 
     def __init__(self, channel: int | None = None, chosen: Callable[[str], object] = str) -> None:
@@ -79,7 +80,7 @@ class ChannelMixer:
         Returns
         -------
         np.ndarray [shape=(n,)], float32
-            Samples that are not finite are NaN.
+            NaN where samples are not finite.
         """
         block = finite_or_nan(block)
         count = block.shape[1]
@@ -101,19 +102,19 @@ class ChannelMixer:
 
 
 class StreamMixer:
-    """Makes one channel of several of a live sound, the same of blocks of any size.
+    """Mixes several channels of live sound to one, independent of the block size.
 
-    What is heard of a piece was chosen before it, so that nothing waits.
+    The channels of a piece are selected before it starts, so mixing adds no delay.
 
     Parameters
     ----------
     takes_first : bool
-        Whether the first channel is heard, and not the mean, where that hides no sound.
+        Default to the first channel rather than the mean.
 
     Attributes
     ----------
     news : str
-        What is heard now, and why, if that is not known yet; to be emptied by who reads it.
+        Unreported change of the selected channels and its reason; the reader clears it.
     """
 
     def __init__(self, *, takes_first: bool) -> None:
@@ -165,7 +166,7 @@ class StreamMixer:
 
 
 class _Choice:
-    """Which of several channels are heard."""
+    """Selection of channels."""
 
     def __init__(
         self, count: int, chosen: Callable[[str], object], *, takes_first: bool = False
@@ -173,17 +174,17 @@ class _Choice:
         self._count = count
         self._usual = [0] if takes_first else [*range(count)]
         self._heard = self._usual
-        self._instead: list[int] | None = None  # in this piece, for samples that are no numbers
+        self._instead: list[int] | None = None  # in this piece, because of NaN
         self._chosen = chosen
         self._usable = np.ones(count, bool)
         self._powers = np.empty((0, count))  # of the last pieces
-        self._usual_covers = True  # all sound since the last block
+        self._usual_covers = True  # for all sound since the last block
         self._piece = 0  # number
-        self._left = np.full(count, -np.inf)  # number of the piece in which it was heard last
-        self._sounded = np.zeros(count)  # in which it held as much as another one
+        self._left = np.full(count, -np.inf)  # number of the last piece in which it was selected
+        self._sounded = np.zeros(count)  # last piece within 9 dB of the loudest channel
 
     def mix(self, samples: Float32) -> Float32:
-        """Mix samples as it was chosen.
+        """Mix samples of the selected channels.
 
         Parameters
         ----------
@@ -196,13 +197,13 @@ class _Choice:
             return np.ascontiguousarray(samples[..., channels[0]])
         if channels == self._usual:
             return samples.mean(axis=-1)
-        if self._is_mean():  # one of them is no number
+        if self._is_mean():  # one of them has NaN
             return samples[..., channels].mean(axis=-1)
-        # Of unlike channels as loud as noise of each of them.
+        # Uncorrelated channels add up to the noise level of one channel.
         return samples[..., channels].sum(axis=-1) / samples.dtype.type(math.sqrt(len(channels)))
 
     def look_at_piece(self, piece: Float32) -> None:
-        """Follow the sound where those that are heard hold none of it.
+        """Switch channels if the selected ones hold no sound and another does.
 
         Parameters
         ----------
@@ -227,7 +228,7 @@ class _Choice:
         self._instead = self._without(is_lost, powers) if is_lost[self._heard].any() else None
 
     def look_at_block(self, block: Float32, *, is_whole: bool = True) -> None:
-        """Choose by ten seconds, of which noise is known.
+        """Select channels from ten seconds, long enough to recognise steady noise.
 
         Parameters
         ----------
@@ -250,7 +251,7 @@ class _Choice:
         steady = levels.std(axis=0) < _STEADY_DB
         floors = np.quantile(powers, 0.1, axis=0)
         sounding = ~steady & (total > _AUDIBLE)
-        # Steady noise in one channel, above the quiet of one that holds sound, hides that.
+        # Steady noise in one channel, above the floor of a channel with sound, hides that sound.
         quietest = floors[sounding].min() if sounding.any() else np.inf
         noisy = steady & (total > _FAINTER * quietest)
         usable = ~noisy & ~(lost & ~lost.all())
@@ -267,7 +268,7 @@ class _Choice:
             self._hear(self._usual, "")
             return
         power = self._mixed(pieces, self._heard).var(axis=1).mean()
-        # Steady noise of a socket in which nothing is plugged is louder than a quiet room.
+        # The steady noise of an unplugged socket is louder than a quiet room.
         hides = not usable[self._heard].all()
         if (self._is_mean() or sounding[best] or power < _DEAD) and (
             hides or self._hides(best, total[best], power)
@@ -277,18 +278,18 @@ class _Choice:
             self._leave_silent()
 
     def _is_mean(self) -> bool:
-        """Whether the mean of all channels is heard, as usual."""
+        """Whether the mean of all channels is selected, as by default."""
         return self._heard == self._usual and len(self._usual) > 1
 
     def _hides(self, best: int, most: float, power: float) -> bool:
-        """Whether the best channel is hidden in a mix of this power."""
+        """Whether a mix of this power hides the best channel."""
         count = len(self._heard)
         if self._heard != self._usual and best in self._heard:
             return power * max(_FAINTER, _CANCELLED * count) < most
         return power * _FAINTER < most
 
     def _go_to(self, best: int, *, hides: bool) -> None:
-        """Hear the best channel, with the others if it was left a short time ago."""
+        """Select the best channel; keep the others if it was left less than a minute ago."""
         others = [i for i in self._heard if self._usable[i] and i != best]
         is_back = best not in self._heard and self._piece - self._left[best] < _REMEMBERED
         if is_back and others:
@@ -302,7 +303,7 @@ class _Choice:
             self._hear([best], f"{before} {why}")
 
     def _leave_silent(self) -> None:
-        """Leave those out of several channels that held no sound for a minute."""
+        """Drop selected channels that held no sound for a minute."""
         there = [i for i in self._heard if self._piece - self._sounded[i] < _REMEMBERED]
         if there and there != self._heard:
             silent = _names(i for i in self._heard if i not in there)
@@ -321,7 +322,7 @@ class _Choice:
         self._chosen(f"{_names(channels)} of {self._count} {is_heard}: {why}")
 
     def _without(self, is_lost: Bool, powers: Float64) -> list[int] | None:
-        """Return whom to hear of a piece in which some of those that are heard are no numbers."""
+        """Return channels for a piece in which some selected channels have NaN."""
         most = powers[self._heard].max()
         held = [i for i in self._heard if not is_lost[i]]
         for others in (held, [int(np.where(is_lost, -1.0, powers).argmax())]):
@@ -331,13 +332,13 @@ class _Choice:
 
 
 def _names(channels: Iterable[int]) -> str:
-    """Name channels, from 1 on."""
+    """Format channel numbers, counted from 1."""
     *more, last = (str(i + 1) for i in channels)
     return f"channels {', '.join(more)} and {last}" if more else f"channel {last}"
 
 
 def _level_spread(rows: Float64) -> Float64:
-    """Return by how many decibels the parts of a piece differ, in each channel."""
+    """Return the standard deviation of the level within a piece, in dB per channel."""
     count = len(rows) // _PIECES * _PIECES
     if not count:
         return np.zeros(rows.shape[1])
@@ -346,7 +347,7 @@ def _level_spread(rows: Float64) -> Float64:
 
 
 def _without_holes(rows: Float64) -> Float64:
-    """Replace samples that are no numbers by the mean of the others in their channel."""
+    """Replace NaN by the mean of the other samples of the channel."""
     is_hole = np.isnan(rows)
     count = np.maximum((~is_hole).sum(axis=0), 1)
     return np.where(is_hole, np.where(is_hole, 0.0, rows).sum(axis=0) / count, rows)
@@ -376,20 +377,20 @@ def read_audio(  # noqa: PLR0913
 ) -> Iterator[Float32]:
     """Read an audio file of any rate and channel count, block by block.
 
-    Channels are averaged, unless they cancel or hide each other; then the best one is heard. Other
-    rates are resampled. Samples that are not finite are NaN.
+    Channels are averaged, unless they cancel or hide each other; then the best channel is used.
+    Other rates are resampled. Samples that are not finite are NaN.
 
     Parameters
     ----------
     start, end : float
-        The part to read, in seconds, as far as the file goes.
+        Part to read, in seconds, limited to the length of the file.
     channels : int or None
-        Those of an array, as `check_channels` takes them, which are kept apart.
+        Number of channels of an array, as in `check_channels`; they stay separate.
     channel : int or None
-        The one to read, from 1 on.
+        Channel to read, counted from 1.
     chosen : callable
-        Told in a sentence which channels are heard and why, whenever others are; in an empty one,
-        when all are heard again.
+        Called with a sentence (which channels and why) when the selected channels change, and with
+        an empty text on return to the default.
 
     Yields
     ------
@@ -399,7 +400,7 @@ def read_audio(  # noqa: PLR0913
     Raises
     ------
     SourceError
-        If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
+        If the file is missing, is not audio, is empty, or has a sample rate below 1 kHz or above
         768 kHz.
     """
     mix = finite_or_nan if channels is not None else ChannelMixer(channel, chosen)
@@ -413,24 +414,24 @@ def read_audio(  # noqa: PLR0913
 
 
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
-    """Convert samples of any rate and channel count, to the same bits as those of an audio file.
+    """Convert samples of any rate and channel count; bit-equal to reading an audio file.
 
     Parameters
     ----------
     sound : np.ndarray [shape=(n,) or (n, channels)]
-        Integers of the full range of their type, signed, or floats in full scale, -1 to 1.
+        Signed integers of the full range of their type, or floats in full scale, -1 to 1.
     rate : int
         Samples per second, 1000 to 768,000.
 
     Returns
     -------
     np.ndarray [shape=(m,)], float32
-        As `read_audio` gives it, in one piece.
+        Same as `read_audio`, in one piece.
 
     Raises
     ------
     SourceError
-        If the array has another shape or type, or the rate lies beyond its limits.
+        If the shape, the type or the rate is not supported.
     """
     sound = np.asarray(sound)
     if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
@@ -447,19 +448,19 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
 
 
 def check_channels(path: Path, channels: int | None, channel: int | None = None) -> None:
-    """Check that an audio file has the channels of an array, or the one that is to be heard.
+    """Check that an audio file has the channels of an array, or a selected channel.
 
     Parameters
     ----------
     channels : int or None
-        Of the array; None allows any.
+        Channels of the array; None allows any number.
     channel : int or None
-        The one to hear, from 1 on; None allows any.
+        Selected channel, counted from 1; None allows any.
 
     Raises
     ------
     SourceError
-        If it has more or fewer; as `open_audio`.
+        If the channels do not match; also as `open_audio`.
     """
     with open_audio(path) as audio:
         if channel is not None and channel > audio.channels:
@@ -487,15 +488,15 @@ def _resampled(
 
 
 class _Holes:
-    """Where samples are NaN, before and after they are resampled."""
+    """Positions of NaN samples, before and after resampling."""
 
     def __init__(self, ratio: float) -> None:
         self._ratio = ratio
         self._before = self._after = 0  # samples so far
-        self._edges: NDArray[np.float64] = np.empty((0, 2))  # of holes, in samples after
+        self._edges: NDArray[np.float64] = np.empty((0, 2))  # of holes, in resampled samples
 
     def fill(self, block: Float32) -> Float32:
-        """Note the samples that are NaN, and return the block with 0 in their place."""
+        """Record the NaN samples, and return the block with 0 in their place."""
         is_hole = np.isnan(block)
         if is_hole.any():
             rows = is_hole.reshape(len(block), -1).any(axis=1)
@@ -507,7 +508,7 @@ class _Holes:
         return block
 
     def mark(self, block: Float32) -> Float32:
-        """Set the samples after to NaN that the holes touch."""
+        """Set resampled samples that touch a hole to NaN."""
         if len(self._edges):
             places = np.stack([np.floor(self._edges[:, 0]), np.ceil(self._edges[:, 1])], axis=1)
             inside = np.clip(places - self._after, 0, len(block)).astype(np.intp)

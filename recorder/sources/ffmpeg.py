@@ -1,8 +1,8 @@
-"""ffmpeg: sound of the network, and of audio files that libsndfile cannot read.
+"""Sound by ffmpeg: from network addresses, and from files that libsndfile cannot read.
 
-The module is also the capture process of a microphone in the network. It writes the blocks of
-`recorder.sources.capture`, with arrival times only; the last line of standard error says why it
-ends. The address comes on standard input, for arguments can be read by all users of the machine.
+The module is also the capture process of a network microphone. It writes the blocks of
+`recorder.sources.capture`, with arrival times only; the last line of standard error is the reason
+for its end. The address comes on standard input, as all users of the machine can read arguments.
 """
 
 import ctypes
@@ -33,28 +33,28 @@ from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, ArrivalPace
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _ANSWER_SECONDS = 10
-_MOST_BYTES = 256_000_000  # of memory, whatever a server sends
+_MOST_BYTES = 256_000_000  # memory limit, for any input from a server
 _PROTOCOLS = {"rtsp": "tcp", "http": "http,https,tls,tcp", "https": "http,https,tls,tcp"}
-# No playlists: those lead to other addresses, and to files.
+# No playlists: these refer to other addresses and to files.
 _FORMATS = "rtsp,sdp,wav,w64,aiff,au,mp3,aac,flac,ogg,matroska,mov,mpegts"
-# Of files. No playlists either, nor what makes one file of several.
+# For files. No playlists either, nor formats that combine several files.
 _FILE_FORMATS = (
     "w64,wav,aiff,au,caf,voc,mp3,aac,ac3,eac3,flac,ogg,matroska,mov,mpeg,mpegts,asf,amr,amrnb,"
     "amrwb,avi,flv,wv,tta,ape,dsf"
 )
-_FILE_SECONDS = 30.0  # after which a file without more sound is given up
+_FILE_SECONDS = 30.0  # without more sound, until a file is given up
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 AU_HEADER = struct.Struct(
     ">4s5I"
-)  # magic, where the samples begin, their bytes, kind, rate, channels
+)  # magic, offset of the samples, their bytes, kind, rate, channels
 _AU_FLOAT = 6
 _PIPE_BYTES = 1 << 16
-_KEPT_BYTES = 4000  # of what it writes to standard error
+_KEPT_BYTES = 4000  # of standard error
 _SAMPLE_BYTES = 4
 
-# The first that is found in what ffmpeg says: what it means, and what to do.
+# Patterns in ffmpeg's messages, first match first: meaning and remedy.
 _MEANINGS = {
-    "401 Unauthorized": "",  # depends on whether it was told a password
+    "401 Unauthorized": "",  # depends on whether the address has a password
     "403 Forbidden": "may not be heard (403 Forbidden)",
     "404 Not Found": "is not there (404 Not Found); check the part after the host",
     "Failed to resolve hostname": "has a host that nobody knows; check its name",
@@ -72,9 +72,9 @@ _MEANINGS = {
 
 
 def check_ffmpeg() -> None:
-    """Check that there is an ffmpeg.
+    """Check that ffmpeg is installed.
 
-    Raise `SourceError` if there is none; it says how to get it.
+    Raise `SourceError` with an installation hint if not.
     """
     if shutil.which("ffmpeg") is None:
         raise SourceError(
@@ -84,15 +84,15 @@ def check_ffmpeg() -> None:
 
 
 def has_ffmpeg() -> bool:
-    """Whether there is an ffmpeg."""
+    """Whether ffmpeg is installed."""
     return shutil.which("ffmpeg") is not None
 
 
 class FileDecoder:
-    """The first sound of a file, decoded by ffmpeg, which may open this file only.
+    """The first audio stream of a file, decoded by ffmpeg, which may open only this file.
 
-    Raise `SourceError` if ffmpeg finds no sound in it; its text is the reason alone, empty if
-    ffmpeg does not know the format.
+    Raise `SourceError` if ffmpeg finds no sound; its text is only the reason, empty for an unknown
+    format.
     """
 
     def __init__(self, path: Path) -> None:
@@ -110,7 +110,7 @@ class FileDecoder:
             raise SourceError("" if reason == _NO_SOUND else reason)
 
     def _read_header(self) -> str:
-        """Read up to the first sample; return why there is none."""
+        """Read up to the first sample; return the reason if there is none."""
         head = self._read(AU_HEADER.size)
         if len(head) == AU_HEADER.size:
             _, place, _, kind, self.rate, self.channels = AU_HEADER.unpack(head)
@@ -122,14 +122,14 @@ class FileDecoder:
     def read(self, frames: int) -> bytes:
         """Return the next samples as big-endian float32, fewer at the end.
 
-        Raise `SourceError` if ffmpeg does not go on.
+        Raise `SourceError` if ffmpeg stalls.
         """
         size = _SAMPLE_BYTES * self.channels
         data = self._read(frames * size)
         return data[: len(data) // size * size]
 
     def fault(self) -> str:
-        """Say why the sound ended before the file did; empty if it did not."""
+        """Return why the sound ended before the file did; empty if it did not."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         self._keep_messages()
@@ -140,9 +140,9 @@ class FileDecoder:
         return next(found, _NO_SOUND)
 
     def close(self) -> None:
-        """End ffmpeg."""
+        """Kill ffmpeg."""
         if self._process.returncode is None:
-            with suppress(ProcessLookupError, PermissionError):  # of a group that has ended
+            with suppress(ProcessLookupError, PermissionError):  # the process group has ended
                 os.killpg(self._process.pid, signal.SIGKILL)
         for pipe in (self._process.stdout, self._process.stderr):
             if pipe is not None:
@@ -161,7 +161,7 @@ class FileDecoder:
         self.close()
 
     def _read(self, size: int) -> bytes:
-        """Return so many bytes, or what is left."""
+        """Return `size` bytes, or the rest."""
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         sound, messages = self._process.stdout.fileno(), self._process.stderr.fileno()
@@ -185,7 +185,7 @@ class FileDecoder:
         return b"".join(parts)
 
     def _keep_messages(self) -> bool:
-        """Keep what ffmpeg writes to standard error, up to a limit; return whether it may go on."""
+        """Keep a limited part of ffmpeg's standard error; return whether more may come."""
         assert self._process.stderr is not None
         os.set_blocking(self._process.stderr.fileno(), False)
         with suppress(BlockingIOError):
@@ -229,14 +229,14 @@ def _start_decoding(path: Path) -> subprocess.Popen[bytes]:
 
 
 def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
-    """Start to read the first sound of an address: an AU file of int16 at 16 kHz, all channels.
+    """Start to read the first audio stream of an address: AU, int16, 16 kHz, all channels.
 
-    ffmpeg ends with the thread that starts it, also if that is killed.
+    ffmpeg ends with the thread that starts it, even if that is killed.
 
     Returns
     -------
     subprocess.Popen
-        Sound comes on standard output, reasons why none comes on standard error.
+        Sound is on standard output, error messages are on standard error.
     """
     process = subprocess.Popen(  # noqa: S603
         [
@@ -253,8 +253,8 @@ def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
         start_new_session=True,  # Ctrl-C is for the recorder
         preexec_fn=_confine,  # noqa: PLW1509  it has one thread
     )
-    # A list of one: arguments could be read by all users of the machine, and the address has a
-    # password.
+    # A playlist of one entry: all users of the machine can read arguments, and the address may
+    # have a password.
     assert process.stdin is not None
     process.stdin.write(_list_of_one(address).encode())
     process.stdin.close()
@@ -262,12 +262,12 @@ def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
 
 
 def explain(address: str, said: str) -> str:
-    """Say why ffmpeg found no sound.
+    """Return why ffmpeg found no sound.
 
     Parameters
     ----------
     said : str
-        What it wrote to standard error, which may have the address in it.
+        Its standard error, which may contain the address.
     """
     said = said.replace(address, "")
     found = next((meaning for text, meaning in _MEANINGS.items() if re.search(text, said)), None)
@@ -300,9 +300,9 @@ def _confine() -> None:
     ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
 
 
-_STALE_SECONDS = 20.0  # of silence: this process ends by itself before
-_PATIENCE_SECONDS = 15.0  # longer than ffmpeg's: a server may send something, but no sound
-_SETTLE_SECONDS = 3.0  # in which a server has sent what it kept for its listeners
+_STALE_SECONDS = 20.0  # without blocks; this process ends by itself earlier
+_PATIENCE_SECONDS = 15.0  # longer than ffmpeg's timeout: a server may send data without sound
+_SETTLE_SECONDS = 3.0  # until a server has sent its buffered sound
 _READ_BYTES = 1 << 18  # 8 s of sound
 _INT16_BYTES = 2
 _SAID_BYTES = 4000
@@ -323,7 +323,7 @@ def main() -> None:
 
 
 class _Sound:
-    """What ffmpeg gives, every 0.6 s: each wake-up costs more than the samples it brings."""
+    """Output of ffmpeg, read every 0.6 s: a wake-up costs more than the samples."""
 
     def __init__(self, address: str, channel: int | None) -> None:
         self.began = self.arrival = time.monotonic()
@@ -344,13 +344,13 @@ class _Sound:
 
     @property
     def channels(self) -> int:
-        """How many the samples have, once some were read."""
+        """Number of channels of the samples, after the first read."""
         return self._there if self._channel is None else 1
 
     def read(self) -> bytes:
-        """Wait for samples and return them; raise DeviceError if no more will come.
+        """Wait for samples and return them; raise DeviceError if there will be no more.
 
-        Until the next call, `arrival` is when they came, in seconds of CLOCK_MONOTONIC.
+        `arrival` is their arrival in seconds of CLOCK_MONOTONIC, until the next call.
         """
         while True:
             time.sleep(BLOCK_SECONDS)
@@ -370,7 +370,7 @@ class _Sound:
                 raise DeviceError(f"{name} has sent no sound for {_PATIENCE_SECONDS:.0f} s")
 
     def _take(self) -> bytes:
-        """Return the samples that have come, as int16."""
+        """Return the complete samples received so far, as int16."""
         if not self._there:
             if len(self._held) < AU_HEADER.size:
                 return b""
@@ -428,7 +428,7 @@ def _capture(sound: _Sound, address: str, output: Any) -> None:
 
 
 def _first_live(sound: _Sound, pace: ArrivalPace) -> tuple[bytes, float]:
-    """Return the first samples that are not older than the call, and when the last was taken."""
+    """Return the first samples captured after the call, and the capture time of the last one."""
     held = b""
     settled = math.inf
     while sound.arrival < settled:

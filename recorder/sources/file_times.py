@@ -1,4 +1,4 @@
-"""When audio files begin: as their names say, or their metadata, or as a guess."""
+"""Start times of audio files: from their names, their metadata, or a guess."""
 
 import re
 import struct
@@ -15,8 +15,8 @@ from hearthlog.schemas.frames import NANOSECONDS, millisecond_text, read_time
 
 NAME, METADATA, GUESS = "its name", "its metadata", "a guess"
 
-# Date and time as recorders, telephones and other programs write them. BirdNET-Pi puts its name
-# between them, macOS and WhatsApp "at", Song Meter a dollar sign.
+# Date and time formats of recorders, telephones and other programs. BirdNET-Pi puts its name
+# between date and time, macOS and WhatsApp "at", Song Meter a dollar sign.
 _IN_NAME = re.compile(
     r"""(?<!\d)
     (?P<year>\d{4})(?P<dash>[-_.]?)(?P<month>\d\d)(?P=dash)(?P<day>\d\d)
@@ -32,21 +32,21 @@ _IN_NAME = re.compile(
     """,
     re.VERBOSE | re.ASCII,
 )
-_HALF = re.compile(  # of the day, as other languages and programs have it
+_HALF = re.compile(  # AM or PM in other languages and programs
     r"[ _\u00a0\u202f-]{0,2}(?:[AaPp]\.? ?[Mm](?![A-Za-z])|nachm|vorm|[μπ]\.?μ"
     r"|上午|下午|午前|午後|오전|오후)",
 )
-_ZONE_NAME = re.compile(  # which says no offset: IST is that of three countries
+_ZONE_NAME = re.compile(  # has no unique offset: three countries use IST
     r"[ _-]{0,2}\(?(?:[CEW]ES?T|MES?Z|[ACEMP][SD]T|[BIJK]ST|A[CEW][SD]T|NZ[SD]T)(?![A-Za-z])"
 )
 _DASH_DIGITS = re.compile(r"-\d{4}")
-_HEXADECIMAL = re.compile(r"[0-9A-F]{8}")  # of old AudioMoths: seconds since 1970
+_HEXADECIMAL = re.compile(r"[0-9A-F]{8}")  # old AudioMoths: seconds since 1970
 _AUDIOMOTH = re.compile(
     r"Recorded at (\d\d:\d\d:\d\d(?:\.\d{3})?) (\d\d)/(\d\d)/(\d{4}) "
     r"\(UTC(?:([+-])(\d{1,2})(?::(\d\d))?)?\)"
 )
 _GUANO = re.compile(r"^Timestamp: *(\S{19,40})", re.MULTILINE)
-_FIRST_YEAR = 1990  # a clock that was not set says 1970 or 1980
+_FIRST_YEAR = 1990  # an unset clock shows 1970 or 1980
 _UNSET = (2000, 1, 1)  # or this day
 _FIRST_AUDIOMOTH = 1_388_534_400  # 2014
 _DAY = 86_400
@@ -72,14 +72,14 @@ _DIRECTIVES = {
 
 
 class FileTime(NamedTuple):
-    """When an audio file begins.
+    """Start of an audio file.
 
     Attributes
     ----------
     step : int
-        To which this is known, in nanoseconds.
+        Resolution of the start, in nanoseconds.
     remark : str
-        Why the start may be wrong; empty if nothing speaks for that.
+        Why the start may be wrong; empty if there is no doubt.
     """
 
     start: int
@@ -89,34 +89,34 @@ class FileTime(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """A time that a text says."""
+    """A parsed time."""
 
-    time: datetime  # without a zone where the text has none
+    time: datetime  # naive if the text has no zone
     step: int  # ns
 
 
 def file_time(
     path: Path, zone: tzinfo, pattern: str = "", *, has_zone: bool | None = None
 ) -> FileTime:
-    """Find out when an audio file begins.
+    """Determine the start of an audio file.
 
-    By the name of the file, else by its metadata (AudioMoth's comment, GUANO, Broadcast Wave), else
-    its modification time less its length: recorders close a file at its end.
+    The sources are, in this order: the name of the file, its metadata (AudioMoth's comment, GUANO,
+    Broadcast Wave), its modification time minus its length, as recorders close a file at its end.
 
     Parameters
     ----------
     zone : tzinfo
-        Of the times that say none.
+        Zone of times without one.
     pattern : str
-        How the name says it, as of `strptime`; empty for the ways that are known.
+        Format of the name, as for `strptime`; empty for the built-in formats.
     has_zone : bool or None
-        Whether a dash and four digits behind a time are a zone, where nothing else says so; None:
-        that is not known, and they are a number.
+        Whether a dash and four digits after a time are a zone, unless the name decides it; None
+        (unknown): they are a number.
 
     Raises
     ------
     SourceError
-        If the file cannot be read, or its name does not fit the pattern.
+        If the file is unreadable, or its name does not match the pattern.
     """
     if not path.exists():
         raise SourceError(f"{path}: no such file")
@@ -141,20 +141,20 @@ def file_time(
 def arrange(
     paths: Sequence[Path], zone: tzinfo, pattern: str = "", start: int | None = None
 ) -> tuple[list[Path], list[FileTime | None]]:
-    """Put audio files into the order of time.
+    """Sort audio files by time.
 
     Parameters
     ----------
     zone : tzinfo
-        Of the times that say none.
+        Zone of times without one.
     start : int or None
-        When the first of them begins, in nanoseconds of UTC, whatever it says itself; all others
-        keep their distance from it.
+        Start of the first file in nanoseconds of UTC, overriding its own; the others keep their
+        distance from it.
 
     Returns
     -------
     list of (FileTime or None)
-        When each begins; None: where the one before it ends.
+        Start of each file; None: it follows the previous file without a gap.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def arrange(
     for path in paths:
         found = file_time(path, zone, pattern, has_zone=has_zone)
         if found.origin == GUESS and placed:
-            placed[-1][1].append(path)  # it follows the one that was named before it
+            placed[-1][1].append(path)  # it follows the previous path
         else:
             placed.append((found, [path]))
     placed.sort(key=lambda one: one[0].start)
@@ -182,7 +182,7 @@ def arrange(
 
 
 def check_pattern(pattern: str) -> None:
-    """Check that a pattern says a date and a time of day.
+    """Check that a pattern has a date and a time of day.
 
     Raise `ConfigurationError` if it does not.
     """
@@ -203,7 +203,7 @@ def check_pattern(pattern: str) -> None:
 
 
 def _by_pattern(path: Path, pattern: str) -> _Moment:
-    """Read the time in a name by a pattern, which a part of the name fits."""
+    """Parse the time in a name by a pattern, which may match a part of the name."""
     places = re.split("(%.)", pattern)
     text = "".join(
         _DIRECTIVES[part[1]] if part.startswith("%") else re.escape(part) for part in places
@@ -228,7 +228,7 @@ def _by_pattern(path: Path, pattern: str) -> _Moment:
 
 
 def _dash_digits(path: Path) -> str:
-    """Return a dash and four digits behind the time in a name, a zone or the number of a part."""
+    """Return a dash and four digits after the time in a name: a zone or a part number."""
     for found in _IN_NAME.finditer(path.name):
         is_iso = found["between"] == "T" or found["colon"] == ":"
         if not is_iso and _DASH_DIGITS.fullmatch(found["zone"] or ""):
@@ -237,7 +237,7 @@ def _dash_digits(path: Path) -> str:
 
 
 def _have_zone(paths: Sequence[Path]) -> bool:
-    """Return whether the digits behind the times are of one zone, or of it and its summer time."""
+    """Return whether the digits after the times are one zone, or one zone and its summer time."""
     numbers = {_dash_digits(path) for path in paths}
     if len(numbers) == 1:
         return numbers != {""}
@@ -249,7 +249,7 @@ def _have_zone(paths: Sequence[Path]) -> bool:
 
 
 def _doubt(path: Path, has_zone: bool | None) -> str:  # noqa: FBT001
-    """Say why the time in a name may be read wrongly; empty if nothing speaks for that."""
+    """Return why the time in a name may be misread; empty if there is no doubt."""
     if has_zone is not True and _offset(_dash_digits(path)) is not None:
         return (
             "the digits behind the time in its name are taken for a number "
@@ -272,7 +272,7 @@ def _doubt(path: Path, has_zone: bool | None) -> str:  # noqa: FBT001
 
 
 def _in_name(path: Path, refused: list[str], *, has_zone: bool) -> list[_Moment]:
-    """Read the different times in a name; what looks like one, and is none, is refused."""
+    """Parse the distinct times in a name; append rejected candidates to `refused`."""
     moments: list[_Moment] = []
     for found in _IN_NAME.finditer(path.name):
         with_seconds = found["second"] or found["second_h"]
@@ -295,7 +295,7 @@ def _in_name(path: Path, refused: list[str], *, has_zone: bool) -> list[_Moment]
 
 
 def _moment(found: re.Match[str], zone: str | None) -> _Moment | None:
-    """Return the time that was found; None if no calendar and no clock has it."""
+    """Return the matched time; None if it is not a valid date and time."""
     hour = int(found["hour"])
     if half := found["half"]:
         if not 1 <= hour <= 12:
@@ -321,7 +321,7 @@ def _moment(found: re.Match[str], zone: str | None) -> _Moment | None:
 
 
 def _offset(text: str | None) -> tzinfo | None:
-    """Read a zone; None if it is none, such as the number of a part."""
+    """Parse a zone; None if the text is no zone, such as a part number."""
     if not text:
         return None
     found = re.search(r"([+-])(\d\d?):?(\d\d)?$", text)
@@ -334,7 +334,7 @@ def _offset(text: str | None) -> tzinfo | None:
 
 
 def _by_name(path: Path, moments: list[_Moment], zone: tzinfo) -> FileTime:
-    """Choose the first time of a name; the metadata may say in which zone it is."""
+    """Take the first time of a name, in the zone that the metadata has for it, if any."""
     moment, *others = moments
     remark = ""
     if moment.time.tzinfo is None:
@@ -369,7 +369,7 @@ def _is_end(path: Path, moment: _Moment, others: list[_Moment]) -> bool:
 
 
 def _implausible(path: Path, moment: datetime) -> str:
-    """Say why no recording can be of a time; empty if one can."""
+    """Return why a time cannot be that of a recording; empty if it can."""
     if moment.year < _FIRST_YEAR or moment.timetuple()[:3] == _UNSET:
         return "is of a clock that was not set"
     written = path.stat().st_mtime if path.exists() else 0.0  # this clock may be wrong, too
@@ -381,7 +381,7 @@ def _implausible(path: Path, moment: datetime) -> str:
 
 
 def _placed(path: Path, moment: _Moment, zone: tzinfo, origin: str) -> FileTime:
-    """Return the time of a file, in a zone if it says none."""
+    """Return the start of a file, in `zone` if its time has none."""
     remark = ""
     local = moment.time
     if local.tzinfo is None:
@@ -394,13 +394,13 @@ def _placed(path: Path, moment: _Moment, zone: tzinfo, origin: str) -> FileTime:
 
 
 def _exists(local: datetime) -> bool:
-    """Whether the clocks of its zone show a time."""
+    """Whether a local time exists in its zone."""
     there = local.astimezone(UTC).astimezone(local.tzinfo)
     return there.replace(tzinfo=None) == local.replace(tzinfo=None)
 
 
 def _of_twice(path: Path, both: list[datetime]) -> tuple[datetime, str]:
-    """Choose one of two times that a clock shows alike, when it is put back."""
+    """Choose one of two equal local times when the clock is put back."""
     ends = path.stat().st_mtime - audio_seconds(path)
     near = [each for each in both if abs(each.timestamp() - ends) < 300]
     if near:
@@ -409,7 +409,7 @@ def _of_twice(path: Path, both: list[datetime]) -> tuple[datetime, str]:
 
 
 def _in_metadata(path: Path) -> Iterator[_Moment]:
-    """Yield the times that a file says in it, the most trusted first."""
+    """Yield the times in a file's metadata, the most trusted first."""
     for text in text_fields(path):
         if found := _AUDIOMOTH.search(text):
             clock, day, month, year, sign, hours, minutes = found.groups()
@@ -430,7 +430,7 @@ def _in_metadata(path: Path) -> Iterator[_Moment]:
 
 
 def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the chunks of a WAV file that say when it begins."""
+    """Yield the chunks of a WAV file that hold its start."""
     with suppress(OSError, struct.error), path.open("rb") as file:
         head = file.read(12)
         if head[:4] in {b"RIFF", b"RF64", b"BW64"} and head[8:] == b"WAVE":
@@ -447,7 +447,7 @@ def _wav_chunks(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 def doubts(paths: Sequence[Path], times: Sequence[FileTime | None]) -> list[str]:
-    """Say in lines which starts may be wrong, and what to do."""
+    """Return a warning line for each group of uncertain starts, with the remedy."""
     lines: dict[str, list[tuple[Path, str]]] = {}
     follows = 0
     for path, found in zip(paths, times, strict=True):

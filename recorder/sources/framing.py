@@ -24,7 +24,7 @@ class FrameCutter:
     rate : float
         Samples per second of the sound.
     channels : int or None
-        Of an array; None for samples without an axis of channels.
+        Channels of an array; None for samples without a channel axis.
     """
 
     def __init__(self, rate: float = SAMPLE_RATE, channels: int | None = None) -> None:
@@ -35,7 +35,7 @@ class FrameCutter:
             self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, channels or 1, dtype="float32")
 
     def push(self, samples: Float32, *, last: bool = False) -> Float32:
-        """Add samples and return the frames that they complete.
+        """Add samples and return the completed frames.
 
         Parameters
         ----------
@@ -57,22 +57,22 @@ class FrameCutter:
 
 _WINDOW_SECONDS = 2.0
 _WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow the temperature
-_PRIOR_PPM = 50.0  # expected error of a sound card's crystal, before it has been measured
-_STEEPEST = 0.1  # seconds of steering a second: frames stay in order, whatever arrives
+_PRIOR_PPM = 50.0  # expected error of a sound card's crystal before a measurement
+_STEEPEST = 0.1  # seconds of steering per second: keeps frames in order for any input
 _PRIOR_NOISE = 100e-6  # seconds: expected lateness of the earliest observation of a window
-_LATE = _PRIOR_NOISE  # what is later pulls the line no further: the machine was busy
-_ROUNDS = 10  # of weighing the windows anew
+_LATE = _PRIOR_NOISE  # later observations pull the line no further: the machine was busy
+_ROUNDS = 10  # of reweighting
 
 
 class SampleClock:
-    """Maps the index of a sample to the time at which it was taken.
+    """Maps a sample index to the capture time of the sample.
 
-    Observations are late, never early, by the delays of the sound card and the scheduler. So each
-    window of two seconds counts by its earliest observation, and a line is fitted through these.
-    A busy machine can be late all through a window: what lies above the line counts linearly (as in
-    Huber's loss), what lies below it by its square. Behind a sound server the delays are a hundred
-    times as long, and no line can be fitted: there the earliest observation of all windows counts.
-    The time is steered towards each new line, never set to it: time does not jump.
+    Observations are late, never early, by the delays of the sound card and the scheduler. So the
+    earliest observation of each window of two seconds counts, and a line is fitted through these. A
+    busy machine can be late during a complete window: residuals above the line count linearly (as
+    in Huber's loss), residuals below by their square. Behind a sound server the delays are a
+    hundred times longer and no line can be fitted: then the earliest observation of all windows
+    counts. The time is steered towards each new line, never set to it: time does not jump.
 
     Parameters
     ----------
@@ -96,23 +96,23 @@ class SampleClock:
 
     @property
     def started(self) -> bool:
-        """Whether there has been an observation."""
+        """Whether there is an observation."""
         return self._origin is not None
 
     @property
     def ppm(self) -> float:
-        """How much faster than nominal the samples come, in parts per million."""
+        """Deviation of the sample rate from nominal, in parts per million; positive is faster."""
         return -self._fitted_slope * 1e6
 
     def observe(self, index: int, time: float, *, is_exact: bool = True) -> None:
-        """Add an observation: a time by which a sample had been taken.
+        """Add an observation: an upper bound on the capture time of a sample.
 
         Parameters
         ----------
         time : float
             Seconds of CLOCK_MONOTONIC.
         is_exact : bool
-            Whether it is a time of the sound card, and not that of an arrival.
+            Whether the time comes from the sound card rather than from an arrival.
         """
         self._is_exact = is_exact
         nominal = index / self._rate
@@ -127,12 +127,12 @@ class SampleClock:
             self._earliest, self._earliest_steered = (nominal, late), steered
 
     def time(self, index: Float64 | float) -> Float64:
-        """Compute the times at which samples were taken.
+        """Compute the capture times of samples.
 
         Parameters
         ----------
         index : float or np.ndarray [shape=(n,)], float64
-            Numbers of the samples, or places between them. There must have been an observation.
+            Sample indices, possibly fractional. At least one observation is required.
 
         Returns
         -------
@@ -155,7 +155,7 @@ class SampleClock:
         self._slope = min(max(slope, -_STEEPEST), _STEEPEST)
 
     def _fit(self, nominal: float) -> tuple[float, float]:
-        """Return how fast the observations grow late, and how late they are at a nominal time."""
+        """Return the slope of the lateness, and the lateness at a nominal time."""
         at, late = np.array(self._windows).T
         if not self._is_exact:
             return 0.0, float(late.min())
@@ -170,28 +170,28 @@ class SampleClock:
         return slope, float(mean + slope * (nominal - center))
 
 
-_ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on an unknown clock
-STEP_SECONDS = 0.25  # of the time of day: less is a clock that is steered
+_ADC_CLOCK_SECONDS = 60.0  # an ADC time further from the arrival is on an unknown clock
+STEP_SECONDS = 0.25  # of the time of day: less is a steered clock
 _LOSS_SECONDS = 0.010
-_STEADY_SECONDS = 0.002  # an ADC that has been this exact for so many blocks
-_STEADY_BLOCKS = 50  # is believed when it says that samples are missing
+_STEADY_SECONDS = 0.002  # an ADC clock this exact for so many blocks
+_STEADY_BLOCKS = 50  # is trusted when it shows missing samples
 _INT16_FULL_SCALE = np.float32(32768.0)
 
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """Samples that the capture process sent in one piece.
+    """One block of samples from the capture process.
 
     Attributes
     ----------
     samples : np.ndarray [shape=(n,) or (n, c)], int16
-        With an axis of channels, if it is an array of microphones.
+        With a channel axis for an array of microphones.
     overflowed : bool
-        The sound card lost samples before the last one of this block, or a little earlier.
+        The sound card lost samples before the last sample of this block, or a little earlier.
     adc_time : float
-        When the first sample was taken, in seconds of a clock of the driver's choice.
+        Capture time of the first sample, in seconds of a clock of the driver's choice.
     arrival : float
-        When the block arrived, in seconds of CLOCK_MONOTONIC.
+        Arrival of the block, in seconds of CLOCK_MONOTONIC.
     """
 
     index: int
@@ -202,11 +202,11 @@ class SampleBlock:
 
     @property
     def has_adc_time(self) -> bool:
-        """Whether its ADC time can be trusted: those on other clocks jump about by 0.1 s."""
+        """Whether the ADC time can be trusted: times on other clocks jump about by 0.1 s."""
         return abs(self.adc_time - self.arrival) < _ADC_CLOCK_SECONDS
 
     def taken_at(self, rate: float) -> float:
-        """Return the time at or before which the first sample was taken.
+        """Return an upper bound on the capture time of the first sample.
 
         Parameters
         ----------
@@ -224,8 +224,7 @@ class SampleBlock:
 class Framer:
     """Cuts the sound of one microphone into frames, over all runs of its capture process.
 
-    All samples of a frame follow each other: after a loss the next frame begins with the first
-    sample that was captured again.
+    Samples of a frame are contiguous: after a loss the next frame begins with the first new sample.
     """
 
     def __init__(self) -> None:
@@ -241,15 +240,15 @@ class Framer:
         self._expected = 0  # index of the next block, if nothing is lost
         self._steady = 0  # blocks in a row that came when expected
         self._was_steady = False
-        self._lost = 0  # samples that the sound card lost, which its driver did not count
+        self._lost = 0  # samples lost by the sound card and not counted by its driver
         self._lost_reason = ""
         self._origin = 0  # index of the first sample since the last loss
-        self._framed = 0  # samples at 16 kHz that became frames since then
+        self._framed = 0  # samples at 16 kHz in frames since then
         self._cutter = FrameCutter()
 
     @property
     def ppm(self) -> float:
-        """How much faster than nominal the microphone's clock runs, in parts per million."""
+        """Deviation of the microphone's clock, in parts per million; positive is faster."""
         return self._clock.ppm
 
     @property
@@ -265,20 +264,20 @@ class Framer:
         lost_reason: str = "",
         channels: int | None = None,
     ) -> None:
-        """Start anew with another capture process.
+        """Restart with another capture process.
 
         Parameters
         ----------
         rate : int
-            Samples per second that it delivers.
+            Samples per second of the capture process.
         wall_offset : int
             CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
         reason : str
-            Why there was no sound in between.
+            Reason of the gap in between.
         lost_reason : str
-            Why blocks may not follow each other; by default the recorder was too slow.
+            Reason of missing blocks; by default the recorder was too slow.
         channels : int or None
-            Of an array; None of a single microphone.
+            Channels of an array; None for a single microphone.
         """
         self._rate = float(rate)
         self._channels = channels
@@ -292,7 +291,7 @@ class Framer:
         self._wall_offset = wall_offset
 
     def step_clock(self, wall_offset: int) -> None:
-        """Follow a change of the time of day; only the samples of the unfinished frame are lost.
+        """Follow a step of the time of day; only the samples of the unfinished frame are lost.
 
         Parameters
         ----------
@@ -304,7 +303,7 @@ class Framer:
         self._wall_offset = wall_offset
 
     def add(self, block: SampleBlock) -> list[Frames | Gap]:
-        """Add a block and return the frames that it completes.
+        """Add a block and return the completed frames.
 
         Returns
         -------
@@ -318,14 +317,14 @@ class Framer:
         missing = self._missing_before(block, taken)
         if missing:
             self._lost += missing
-            # The loss lies somewhere inside this block: the first good sample is the next one's.
+            # The loss is somewhere inside this block: the next block has the first good sample.
             self._restart(self._expected + self._lost, "the sound card lost samples")
             return []
         self._clock.observe(block.index + self._lost, taken, is_exact=block.has_adc_time)
         return self._cut(block.samples.astype(np.float32) / _INT16_FULL_SCALE)
 
     def _missing_before(self, block: SampleBlock, taken: float) -> int:
-        """Count the samples that the sound card lost, by how late this block's ADC time is."""
+        """Return how many samples the sound card lost, from the lateness of the ADC time."""
         if not self._clock.started:
             return 0
         late = taken - float(self._clock.time(block.index + self._lost))
@@ -347,7 +346,7 @@ class Framer:
             return []
         times = self._times(count)
         self._framed += count * FRAME_SAMPLES
-        if self._reason and self._end is not None:  # it began while another one was heard
+        if self._reason and self._end is not None:  # it overlaps the previous source
             heard = int(np.searchsorted(times, self._end))
             times, frames, count = times[heard:], frames[heard:], count - heard
             if count == 0:
@@ -362,7 +361,7 @@ class Framer:
         return [complete] if gap is None else [gap, complete]
 
     def _times(self, count: int) -> Int64:
-        """Return when the next frames start, in nanoseconds of CLOCK_MONOTONIC."""
+        """Return the starts of the next frames, in nanoseconds of CLOCK_MONOTONIC."""
         position = self._framed + np.arange(count) * FRAME_SAMPLES
         index = self._origin + position * np.float64(self._rate / SAMPLE_RATE)
         return np.round(self._clock.time(index) * NANOSECONDS).astype(np.int64)
@@ -377,12 +376,12 @@ class Framer:
 
 
 def clock_set_by(seconds: float) -> str:
-    """Say in the reason of a gap that the clock was set."""
+    """Format the reason of a gap caused by a clock step."""
     return f"{CLOCK_SET} by {seconds:+.3f} s"
 
 
 def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:
-    """Make the event of frames of one microphone, or of an array.
+    """Create the event of frames of one microphone, or of an array.
 
     Parameters
     ----------
@@ -395,27 +394,27 @@ def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:
     return Frames(first, np.ascontiguousarray(frames[:, :, 0]), stamps, frames)
 
 
-# ROS has 32 bits for seconds, and MCAP no times before 1970. A minute for frames that were taken
-# before the clock was looked at, a day for what a log says of the time to come.
+# ROS has 32 bits for seconds, and MCAP no times before 1970. Margins: one minute for frames
+# captured before the clock was read, one day for times in the future that a log may contain.
 _FIRST = 60 * NANOSECONDS
 _LAST = ((1 << 31) - 86_400) * NANOSECONDS
 _LAST_OF_CALENDAR = 253_402_300_799  # seconds: the year 9999 ends
 
 
 class WallClock:
-    """CLOCK_REALTIME; while that cannot be in a log, the time goes on without it.
+    """CLOCK_REALTIME, extrapolated while its time is out of the range of a log.
 
-    Without a right time before it goes on from 1970, as on a machine whose clock was never set.
+    Without an earlier valid time it continues from 1970, as on a machine with an unset clock.
 
     Attributes
     ----------
     trouble : str
-        What is wrong with the clock; empty if nothing is.
+        Fault of the clock; empty if there is none.
     """
 
     def __init__(self) -> None:
         self.trouble = ""
-        self._offset: int | None = None  # the last one that a log can have
+        self._offset: int | None = None  # the last valid one
 
     def offset(self) -> int:
         """Return CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds."""
@@ -432,9 +431,9 @@ class WallClock:
 
 
 def check_times(first: int, last: int) -> None:
-    """Check that a log can have the times of audio files, in nanoseconds of UTC.
+    """Check that the times of audio files, in nanoseconds of UTC, are in the range of a log.
 
-    Raise `SourceError` if it cannot.
+    Raise `SourceError` if they are not.
     """
     if first < 0 or last >= _LAST:
         day = _day(first if first < 0 else last)

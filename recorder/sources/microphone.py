@@ -1,4 +1,4 @@
-"""A microphone that runs for years: its capture process, watched and started again."""
+"""Supervised microphone: its capture process is monitored and restarted."""
 
 import math
 import time
@@ -44,16 +44,15 @@ _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _RETRY_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0)
 _HEALTH_SECONDS = 10.0
 _LOOK_SECONDS = 0.25
-_OVERFLOWS, _OVERFLOW_SECONDS = 5, 60.0  # so many in such a time want a longer buffer
+_OVERFLOWS, _OVERFLOW_SECONDS = 5, 60.0  # so many in this time require a longer buffer
 _SILENT_FRAMES = 200  # ten seconds
-_FALLBACK_SECONDS = 10.0  # of patience with the device, before another one is heard
+_FALLBACK_SECONDS = 10.0  # from the loss of the device to the fallback
 
 
 def check_device(device: str) -> None:
-    """Check what can be known of a device before it is opened.
+    """Check a device as far as possible before opening it.
 
-    Raise `SourceError` if it is an address that cannot be one of sound, or for which ffmpeg or
-    ROS is not there.
+    Raise `SourceError` if it is an invalid address, or needs ffmpeg or ROS and these are missing.
     """
     if is_address(device):
         check_address(device)
@@ -64,37 +63,36 @@ def check_device(device: str) -> None:
 
 
 class MicrophoneSource:
-    """One microphone, as one stream of frames.
+    """One microphone as one stream of frames.
 
-    The device that is heard first is the only one that is ever heard, but for its fallback.
+    After the first successful start only the same device is used again, or the fallback.
 
     Parameters
     ----------
     device : str
-        As `hearthlog devices` lists it, empty for the default one, or an address in the network.
+        As `hearthlog devices` lists it, empty for the default one, or a network address.
     fallback : str, optional
-        Another device, which is heard as long as this one is not there; by default none. It is
-        no array.
+        Another device, used while this one is missing; by default none. It is no array.
     waits : bool, optional
-        Whether a device that is not there at the start is waited for, as it is later. One that is
-        no such array is not waited for without a fallback.
+        Whether to wait at the start for a missing device, as later. A device that lacks the
+        channels of the array is an error without a fallback.
     channels : int or None
-        Of an array; None of a single microphone.
+        Channels of an array; None for a single microphone.
     channel : int or None
-        The one to hear of the device, from 1 on; by default, as of its fallback, the first one, or
-        the best one if that has much less sound.
+        Channel of the device, counted from 1; by default, and for the fallback, the first one, or
+        the best one if the first has much less sound.
 
     Attributes
     ----------
     device : str
-        Name of the device that is heard, or was last; before that, as given. Without the user and
-        the password of an address.
+        Name of the current or last device; before that, as given. Without the user and the password
+        of an address.
 
     Raises
     ------
     SourceError
-        If no microphone can be captured on this machine, or this one not, unless it is waited for;
-        if an address cannot be one of sound.
+        If this machine cannot capture microphones, or cannot capture this one and `waits` is false;
+        if an address is invalid.
     """
 
     def __init__(  # noqa: PLR0913
@@ -110,17 +108,17 @@ class MicrophoneSource:
         self._own = _Device(device, channels, channel)
         self._fallback = _Device(fallback) if fallback else None
         self._device_heard = self._own
-        self._return: ReturnWatch | None = None  # as long as the fallback is heard
+        self._return: ReturnWatch | None = None  # while the fallback is in use
         self._lost_at = -math.inf  # when the device was lost
-        self._unfit = ""  # why a device that is there cannot be heard
+        self._unfit = ""  # why a connected device cannot be used
         self.device = self._own.name
         self._rest = rest
         self._capture: Capture | None = None
-        self._mixer: StreamMixer | None = None  # of several channels that are no array
+        self._mixer: StreamMixer | None = None  # for several channels without an array
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
-        self._overruns = 0  # blocks of which the sound card lost a part
+        self._overruns = 0  # blocks with losses at the sound card
         self._last_block = time.monotonic()  # its arrival
         self._infrasound = InfrasoundFilter()
         self._level = _Level()
@@ -139,7 +137,7 @@ class MicrophoneSource:
         Yields
         ------
         Event
-            In the order of time; health every ten seconds, and when it changes.
+            In the order of time; health every ten seconds, and on change.
         """
         reason = "the microphone was started"
         while not stop.is_set():
@@ -180,7 +178,7 @@ class MicrophoneSource:
     def _capture_run(
         self, capture: Capture, reason: str, stop: Flag
     ) -> Generator[Event, None, str]:
-        """Yield the events of one run of the capture process; return why it ended."""
+        """Yield the events of one run of the capture process; return the reason for its end."""
         form = capture.format
         channels = form.channels if self._mixer is None else None
         self._steps_clock()
@@ -203,14 +201,14 @@ class MicrophoneSource:
             if self._steps_clock():
                 self._framer.step_clock(self._wall_offset)
             self._tell_channel()
-            if blocks:  # its frames' time: now would be ahead of them
+            if blocks:  # stamped with the frames' time, as the current time would be ahead of them
                 yield from self._report(self._framer.last_stamp)
             if ending := self._reason_to_end():
                 return ending
         return "the recorder was stopped"
 
     def _reason_to_end(self) -> str:
-        """Say why a run of the capture process is to end, if it is."""
+        """Return why a run of the capture process must end; empty if it need not."""
         if self._return is not None and self._return.is_there:
             return "its device is there again"
         if self._device_heard.needs_longer_buffer():
@@ -218,14 +216,14 @@ class MicrophoneSource:
         return self._resting()
 
     def _frames_of(self, block: SampleBlock, rate: int) -> Iterator[Event]:
-        """Yield the frames that a block completes, and the gap before them."""
+        """Yield the frames completed by a block, and the gap before them."""
         self._overruns += block.overflowed
         self._device_heard.add(block)
         if not len(block.samples):
             return
         if self._mixer is not None:
             block = replace(block, samples=self._mixer(block.samples, rate))
-        # Before it is resampled: noise of one step becomes more, as noise of a quiet room is.
+        # Before resampling, which turns noise of one step into noise like that of a quiet room.
         first = block.samples if block.samples.ndim == 1 else block.samples[:, 0]
         is_flat = int(first.max()) - int(first.min()) <= DEAD_STEPS
         for event in self._framer.add(block):
@@ -233,7 +231,7 @@ class MicrophoneSource:
             yield event
 
     def _tell_channel(self) -> None:
-        """Report once which of several channels is heard: what is heard of it is all right."""
+        """Report a change of the selected channels once; the sound itself is fine."""
         if self._mixer is not None and self._mixer.news and self._health[0] != ERROR:
             self._health = (WARNING, self._mixer.news)
             self._mixer.news = ""
@@ -289,13 +287,13 @@ class MicrophoneSource:
                 return
             yield from self._report(self._now())
             if cards_change(stop, next(pauses, _RETRY_SECONDS[-1])):
-                pauses = iter(_RETRY_SECONDS)  # what was plugged in may take a moment
+                pauses = iter(_RETRY_SECONDS)  # a new device may need a moment
 
     def _resting(self) -> str:
         return "" if self._rest is None else self._rest.reason()
 
     def _rest_if_due(self, reason: str, stop: Flag) -> Generator[Event, None, str]:
-        """Close the device as long as nobody is to be listened to; return why there is no sound."""
+        """Close the device during a pause; return the reason for the gap."""
         while self._rest is not None and (resting := self._rest.reason()):
             self.close()
             if resting not in reason:
@@ -307,7 +305,7 @@ class MicrophoneSource:
         return reason
 
     def _falls_back(self, stop: Flag) -> bool:
-        """Hear the fallback, if there is one, and it is time; return whether it is heard."""
+        """Switch to the fallback if there is one and it is due; return whether it is in use."""
         if self._fallback is None or time.monotonic() - self._lost_at < _FALLBACK_SECONDS:
             return False
         try:
@@ -342,7 +340,7 @@ class MicrophoneSource:
             self._health = (OK, LISTENING)
 
     def _steps_clock(self) -> bool:
-        """Look at the time of day; return whether it was set."""
+        """Check the time of day; return whether it was set."""
         offset = self._clock.offset()
         if abs(offset - self._wall_offset) <= STEP_SECONDS * NANOSECONDS:
             return False
@@ -354,7 +352,7 @@ class MicrophoneSource:
         return time.monotonic_ns() + self._wall_offset
 
     def _report(self, stamp: int) -> Iterator[SourceHealth]:
-        """Yield the health every ten seconds, and when it has changed."""
+        """Yield the health every ten seconds, and on change."""
         now = time.monotonic()
         if self._health != self._last_health or now - self._reported >= _HEALTH_SECONDS:
             level, summary = self._last_health = self._health
@@ -371,7 +369,7 @@ class MicrophoneSource:
 
 
 class _Level:
-    """The level of the sound since it was last told."""
+    """Sound level since the last report."""
 
     def __init__(self) -> None:
         self._power = self._peak = 0.0
@@ -383,7 +381,7 @@ class _Level:
         self._samples += samples.size
 
     def take(self) -> dict[str, str]:
-        """Return it in decibels of full scale; empty without sound."""
+        """Return the level in decibels of full scale, and reset; empty without sound."""
         if not self._samples:
             return {}
         mean = float(decibels(np.array(self._power / self._samples)))
@@ -394,7 +392,7 @@ class _Level:
 
 
 class _Device:
-    """A device that is to be heard: by its name, and once it was heard, by what it is."""
+    """A wanted device: by its name, and after the first start by its identity."""
 
     def __init__(
         self, device: str, channels: int | None = None, channel: int | None = None
@@ -407,8 +405,8 @@ class _Device:
         self.was_heard = False
         self.latency = LATENCY_SECONDS
         self._may_take_longer = True
-        self._last = self._longest_pause = 0.0  # arrival of a block of this run, between two
-        self._overflows: deque[float] = deque(maxlen=_OVERFLOWS)  # their arrival
+        self._last = self._longest_pause = 0.0  # last arrival in this run, longest interval
+        self._overflows: deque[float] = deque(maxlen=_OVERFLOWS)  # arrival times
 
     def is_heard(self, capture: Capture) -> None:
         heard = capture.format
@@ -424,19 +422,19 @@ class _Device:
             self._overflows.append(block.arrival)
 
     def could_not_be_opened(self) -> None:
-        """Note that the device may refuse the longer buffer: it is asked for once."""
+        """Record that the device may refuse the longer buffer, to request it only once."""
         if self.latency != LATENCY_SECONDS:
             self.latency, self._may_take_longer = LATENCY_SECONDS, False
 
     def was_silent(self) -> None:
-        """Note that no more sound came: without any at all a longer buffer may be needed."""
+        """Record that the sound stopped: without any sound a longer buffer may be needed."""
         if not self._last and self._may_take_longer:
             self.latency = LONG_LATENCY_SECONDS
         elif self._longest_pause < LATENCY_SECONDS:
             self.latency = LATENCY_SECONDS
 
     def needs_longer_buffer(self) -> bool:
-        """Ask for a longer buffer if the sound comes in pieces that are longer than it is."""
+        """Return whether to reopen with a longer buffer, as sound arrives in longer pieces."""
         often = len(self._overflows) == _OVERFLOWS
         often = often and self._overflows[-1] - self._overflows[0] < _OVERFLOW_SECONDS
         if not often or self.latency == LONG_LATENCY_SECONDS or not self._may_take_longer:

@@ -1,4 +1,4 @@
-"""Audio files opened: by libsndfile, or by ffmpeg where libsndfile cannot read them."""
+"""Opening of audio files, by libsndfile or, for formats without its support, by ffmpeg."""
 
 import math
 import mmap
@@ -23,7 +23,7 @@ from hearthlog.recorder.sources.ffmpeg import FileDecoder, has_ffmpeg
 from hearthlog.schemas.arrays import Float32
 
 BLOCK_SECONDS = 10.0
-RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
+RATES = range(1_000, 768_001)  # Hz: covers recordings, and soxr converts in bounded memory
 
 _SUFFIXES = frozenset(
     {
@@ -48,43 +48,44 @@ _SUFFIXES = frozenset(
     | {".eac3", ".ec3", ".flv", ".f4v", ".mpg", ".mpeg", ".vob", ".ts", ".mts", ".m2ts", ".3gpp"}
     | {".ape", ".dsf"}
 )
-_NO_LENGTH = 1 << 62  # libsndfile says more frames where a header has no length
+_NO_LENGTH = 1 << 62  # libsndfile reports more frames if a header has no length
 _MOST_BYTES = 0x7FFF_0000  # a header that claims more has no length
-_LEAST_BYTES = 1600  # less is missing where programs count or pad in their own way
-_LEAST_SECONDS = 0.1  # as far as lengths in headers are right
+_LEAST_BYTES = 1600  # smaller differences come from programs' own counting and padding
+_LEAST_SECONDS = 0.1  # accuracy of lengths in headers
 _CLAIMED = re.compile(r"^ *(?:data|SSND|Data Size|riff) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
 _CLAIMED_RF64 = re.compile(r"frame count (\d+) does not match value from 'ds64' chunk of (\d+)")
-_NOT_MP3 = {b"RIFF", b"RF64", b"riff", b"fLaC", b"OggS", b"FORM", b"caff", b".snd"}  # begin so
+_NOT_MP3 = {b"RIFF", b"RF64", b"riff", b"fLaC", b"OggS", b"FORM", b"caff", b".snd"}  # first bytes
 _OF_MPG123 = re.compile(rb"\[[^]]*mpg123|(?:Note|Warning): |mpg123|\s*$")
 _BROKEN_MP3 = re.compile(rb"error:|Xing stream size off|resync")
-_MP3_SEARCHED = 65_536  # bytes in which the first frame begins
-_MP3_BIT_RATES = (  # in kbit/s: of MPEG 2 and 2.5, and of MPEG 1
+_MP3_SEARCHED = 65_536  # bytes searched for the first frame
+_MP3_BIT_RATES = (  # kbit/s: MPEG 2 and 2.5, then MPEG 1
     (8, 16, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128, 144, 160),
     (32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320),
 )
 _OGG_PAGE = 65_307  # bytes, at most
 _OGG_END = 4  # flag of the last page
 _INT16_STEP = np.float32(1 / 32768)  # full scale is 1
-_MOST_SAMPLES = 1 << 25  # of all channels in a block
+_MOST_SAMPLES = 1 << 25  # of all channels of a block
 _MOST_CHUNKS = 10_000
 _MOST_FAILED_SYNCS = 10_000
 _STDERR = 2
-_MOST_COMPLAINTS = 10  # that are kept
+_MOST_COMPLAINTS = 10  # kept
 _REDIRECTED = RLock()
 
 
 class OpenAudio(NamedTuple):
-    """An audio file that can be read.
+    """An open audio file.
 
     Attributes
     ----------
     frames : int or None
-        Samples of each channel, as the header says; None if it does not.
+        Samples per channel according to the header; None if the header has no length.
     blocks : callable
-        `blocks(first, last)` yields the samples from one number to another, as float32 of shape
-        (n, channels), as far as they can be read. To be called once.
+        `blocks(first, last)` yields the readable samples of a range as float32 of shape (n,
+        channels). Call it once.
     fault : callable
-        Once the blocks were read, says why they end before the sound does; empty if they do not.
+        After the blocks were read, returns why they end before the sound does; empty if they do
+        not.
     """
 
     rate: int
@@ -98,8 +99,8 @@ class OpenAudio(NamedTuple):
 def open_audio(path: Path) -> Iterator[OpenAudio]:
     """Open an audio file.
 
-    Raise `SourceError` if the file is missing, is not audio, holds none, or has a sample rate
-    below 1 kHz or above 768 kHz.
+    Raise `SourceError` if the file is missing, is not audio, is empty, or has a sample rate below 1
+    kHz or above 768 kHz.
     """
     with _readable(path), _open(path) as audio:
         yield audio
@@ -107,7 +108,7 @@ def open_audio(path: Path) -> Iterator[OpenAudio]:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Refuse a file where the system fails, such as for want of memory."""
+    """Convert OS errors, such as out of memory, to `SourceError`."""
     try:
         yield
     except OSError as error:
@@ -122,7 +123,7 @@ def _open(path: Path) -> Iterator[OpenAudio]:
         sound = _opened(path, complaints)
     except soundfile.LibsndfileError as error:
         sound, reason = None, error.error_string.rstrip(".") or "it is damaged"
-        if "regular file" in reason:  # so it says of an MP3 file without a frame
+        if "regular file" in reason:  # libsndfile's message for an MP3 file without a frame
             reason = "Format not recognised"
     if sound is None:
         with _decoder(path, reason) as decoder:
@@ -140,11 +141,10 @@ def _open(path: Path) -> Iterator[OpenAudio]:
 
 
 def audio_seconds(path: Path) -> float:
-    """Return the length of an audio file in seconds, as its header says.
+    """Return the length of an audio file in seconds, from its header.
 
-    Where it says none, all of the file is decoded.
-
-    Raise `SourceError` as `open_audio`.
+    Without a length in the header, the complete file is decoded. Raise `SourceError` as
+    `open_audio`.
     """
     with open_audio(path) as audio:
         if audio.frames is not None:
@@ -155,21 +155,21 @@ def audio_seconds(path: Path) -> float:
 
 @lru_cache(256)
 def _decoded_seconds(path: Path, _time: int, _size: int) -> float:
-    """Return the length of a file that has to be decoded for that, once as it is."""
+    """Return the length of a file by decoding it; cached per version of the file."""
     with open_audio(path) as audio:
         return float(sum(len(block) for block in audio.blocks(0, math.inf)) / audio.rate)
 
 
 def is_audio(name: str) -> bool:
-    """Whether a file is named as audio that can be read."""
+    """Whether a file name has the suffix of a supported audio format."""
     suffix = os.path.splitext(name)[1].lower()  # noqa: PTH122
     return suffix in _SUFFIXES and not name.startswith(".")
 
 
 def text_fields(path: Path) -> list[str]:
-    """Return the texts that libsndfile finds in an audio file, such as a comment.
+    """Return the text metadata that libsndfile finds in an audio file, such as a comment.
 
-    Raise `SourceError` if there is no such file, or nothing can be read of it.
+    Raise `SourceError` if the file is missing or unreadable.
     """
     _check_file(path)
     with _readable(path), suppress(soundfile.LibsndfileError), _opened(path, []) as sound:
@@ -178,7 +178,7 @@ def text_fields(path: Path) -> list[str]:
 
 
 class _Unseekable(soundfile.SoundFile):  # type: ignore[misc]  # soundfile has no types
-    """A file without a length, in which libsndfile cannot seek, though it says so."""
+    """A file without a length: libsndfile cannot seek in it, but claims that it can."""
 
     def seekable(self) -> bool:
         return False
@@ -215,12 +215,12 @@ def _opened(path: Path, complaints: list[bytes]) -> soundfile.SoundFile:
 
 
 class _View(mmap.mmap):
-    """The bytes of a file, some of which are read as if they were others."""
+    """Bytes of a file, some of them replaced on reading."""
 
-    change = 0, b""  # where, and what is read there
+    change = 0, b""  # position, and the bytes read there
 
     def read(self, n: int | None = None) -> bytes:
-        """Read on, as of a file."""
+        """Read the next bytes, as from a file."""
         begin, data = self.tell(), super().read(n)
         place, content = self.change
         if begin >= place + len(content) or place >= begin + len(data):
@@ -232,15 +232,15 @@ class _View(mmap.mmap):
         return bytes(changed)
 
     def seek(self, pos: int, whence: int = os.SEEK_SET) -> None:
-        """Go to a place, or the end if that lies beyond it, as libsndfile expects."""
+        """Seek, limited to the end of the file, as libsndfile expects."""
         base = (0, self.tell(), len(self))[whence]
         super().seek(min(max(base + pos, 0), len(self)))
 
 
 def _mended_wav(path: Path) -> _View | None:
-    """Return a WAV file whose header claims no sound, with one that claims all of the rest.
+    """Return a WAV file with an empty data size as a view in which the size covers the rest.
 
-    A recorder that was switched off leaves it so. Nothing is written to the file.
+    A recorder that was switched off leaves such a file. The file itself is not written.
     """
     with path.open("rb") as file:
         view = _View(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -285,12 +285,12 @@ def _by_libsndfile(
             if not len(block):
                 return
             place += len(block)
-            skipped = max(first - (place - len(block)), 0)  # where nothing can be sought
+            skipped = max(first - (place - len(block)), 0)  # without seeking
             if skipped < len(block):
                 yield block[skipped:]
 
     def fault() -> str:
-        if place >= end:  # no more was wanted
+        if place >= end:  # no more was requested
             return ""
         if hidden:
             return f"does not say how long it is; install ffmpeg, which reads {hidden:.0f} s more"
@@ -304,7 +304,7 @@ def _by_libsndfile(
 
 
 def _sought(sound: soundfile.SoundFile, place: int) -> tuple[int, bool]:
-    """Seek in a file; return the place, and whether libsndfile cannot go there."""
+    """Seek in a file; return the position, and whether libsndfile failed."""
     try:
         return sound.seek(place), False
     except soundfile.LibsndfileError:
@@ -312,40 +312,40 @@ def _sought(sound: soundfile.SoundFile, place: int) -> tuple[int, bool]:
 
 
 def _block_frames(rate: int, channels: int) -> int:
-    """Return the samples of each channel that are read at once, however many channels there are."""
+    """Return the samples per channel of one block, bounded for any number of channels."""
     return max(min(int(rate * BLOCK_SECONDS), _MOST_SAMPLES // channels), 1)
 
 
 def _read(
     path: Path, sound: soundfile.SoundFile, count: int, complaints: list[bytes]
 ) -> tuple[Float32, bool]:
-    """Read so many samples, or fewer; return whether libsndfile cannot go on."""
+    """Read up to `count` samples; return them, and whether libsndfile cannot continue."""
     if sound.format == "WAV" and sound.subtype == "PCM_16" and sound.seekable():
         place = sound.tell()
-        try:  # libsndfile takes four times as long to convert them, to the same bits
+        try:  # bit-equal to libsndfile's own conversion, which takes four times as long
             samples = sound.read(count, "int16", always_2d=True)
             return np.multiply(samples, _INT16_STEP, dtype=np.float32), False
-        except soundfile.LibsndfileError:  # below, what is there before the fault is read
+        except soundfile.LibsndfileError:  # samples before the fault are read below
             _sought(sound, place)
     block = np.full((count, sound.channels), np.nan, np.float32)
     try:
         with _without_mpg123(path, complaints):
             return sound.read(count, out=block), False
     except soundfile.LibsndfileError:
-        # It does not say how many it has read before.
+        # libsndfile does not report how many samples it read before the error.
         filled = np.flatnonzero(~np.isnan(block).all(axis=1))
         return block[: int(filled[-1]) + 1 if len(filled) else 0], True
 
 
 def _cut(path: Path, sound: soundfile.SoundFile, seconds: float) -> str:
-    """Say that a file ends before its sound does, if it does."""
+    """Return the fault of a file that ends before its sound does, or an empty text."""
     if _claims_more(sound.extra_info) or _is_cut(path):
         return f"is cut short: its sound ends at {seconds:.2f} s"
     return ""
 
 
 def _damage(seconds: float, begin: float = 0.0) -> str:
-    """Say up to where a file can be read, of which the part from some time on was wanted."""
+    """Return the fault of a file requested from `begin` and readable up to `seconds`."""
     if not seconds and begin:
         return f"is damaged or cut short before {begin:.2f} s"
     if not seconds:
@@ -354,9 +354,10 @@ def _damage(seconds: float, begin: float = 0.0) -> str:
 
 
 def _hidden_seconds(path: Path, sound: soundfile.SoundFile) -> float:
-    """Return how much of an MP3 file libsndfile leaves out, where it guesses the length wrongly.
+    """Return the seconds of an MP3 file that libsndfile omits because of a wrong length estimate.
 
-    Without a table at its beginning it goes by the first bit rate, which may change.
+    Without a table at its beginning, libsndfile estimates from the first bit rate, which may
+    change.
     """
     if sound.format != "MP3":
         return 0.0
@@ -368,7 +369,7 @@ def _hidden_seconds(path: Path, sound: soundfile.SoundFile) -> float:
 
 @lru_cache(256)
 def _mp3_samples(path: Path, _time: int, _size: int) -> int:
-    """Count the samples of an MP3 file by its frames; 0 if a table at its beginning says them."""
+    """Count the samples of an MP3 file by its frames; 0 if it begins with a table of them."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
         place = 0
         if view[:3] == b"ID3":
@@ -389,7 +390,7 @@ def _mp3_samples(path: Path, _time: int, _size: int) -> int:
 
 
 def _mp3_frame(head: bytes) -> tuple[int, int]:
-    """Return the bytes and the samples of a frame of layer III by its header; 0 if it is none."""
+    """Return the bytes and the samples of a layer III frame from its header; 0 if it is none."""
     version, rate, speed = head[1] >> 3 & 3, head[2] >> 2 & 3, head[2] >> 4
     if head[0] != 0xFF or head[1] >> 5 != 7 or head[1] >> 1 & 3 != 1 or version == 1 or rate == 3:
         return 0, 0
@@ -403,7 +404,7 @@ def _mp3_frame(head: bytes) -> tuple[int, int]:
 
 
 def _claims_more(log: str) -> bool:
-    """Whether the header of a file claims more sound than there is, by libsndfile's log of it."""
+    """Whether a file's header claims more sound than there is, according to libsndfile's log."""
     for claimed, found in _CLAIMED.findall(log):
         if int(claimed) - int(found) >= _LEAST_BYTES and int(claimed) < _MOST_BYTES:
             return True
@@ -411,7 +412,7 @@ def _claims_more(log: str) -> bool:
 
 
 def _is_cut(path: Path) -> bool:
-    """Whether an Ogg file has no last page, or a CAF file less sound than its header claims."""
+    """Whether an Ogg file lacks its last page, or a CAF file is shorter than its header claims."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
         if view[:4] == b"OggS":
             place = view.rfind(b"OggS", len(view) - min(len(view), _OGG_PAGE))
@@ -432,7 +433,7 @@ def _is_cut(path: Path) -> bool:
 
 @contextmanager
 def _without_mpg123(path: Path, complaints: list[bytes]) -> Iterator[None]:
-    """Keep from standard error what libmpg123 writes there; it knows no other way."""
+    """Redirect libmpg123's messages from standard error; it has no other channel for them."""
     with path.open("rb") as file:
         if file.read(4) in _NOT_MP3:
             yield
@@ -449,7 +450,7 @@ def _without_mpg123(path: Path, complaints: list[bytes]) -> Iterator[None]:
             for line in kept:
                 if _OF_MPG123.match(line):
                     complaints[:] = [*complaints, line][-_MOST_COMPLAINTS:]
-                else:  # of another thread
+                else:  # from another thread
                     os.write(_STDERR, line)
             os.close(original)
 

@@ -1,4 +1,4 @@
-"""Capture processes of microphones, and the watch for a device that returns."""
+"""Capture processes of microphones, and detection of a device's return."""
 
 import fcntl
 import json
@@ -26,15 +26,15 @@ _NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.ffmpeg")
 _TOPIC_CAPTURE = module_command("hearthlog.recorder.sources.topic_capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
-_PIPE_BYTES = 1 << 20  # 32 s of sound: how far the recorder may be behind
+_PIPE_BYTES = 1 << 20  # 32 s of sound: the recorder's maximum delay
 _START_SECONDS = 10.0
-_NETWORK_START_SECONDS = 30.0  # it ends by itself before
+_NETWORK_START_SECONDS = 30.0  # the process ends by itself earlier
 _LOOK_SECONDS = 0.25
 _INPUT_OVERFLOW = 2  # paInputOverflow
 
 
 def query_devices() -> list[Device]:
-    """List the microphones, as `list_devices` does, in a process of its own.
+    """List the microphones, as `list_devices` does, in a child process.
 
     Raise `SourceError` if PortAudio is missing, cannot start, hangs or crashes.
     """
@@ -57,9 +57,9 @@ def query_devices() -> list[Device]:
 
 
 def check_ros() -> None:
-    """Check that there is a ROS 2 for this Python.
+    """Check that ROS 2 is installed for this Python.
 
-    Raise `SourceError` if there is none; it says how to get it.
+    Raise `SourceError` with an installation hint if not.
     """
     if find_spec("rclpy") is None:
         raise SourceError(
@@ -70,7 +70,7 @@ def check_ros() -> None:
 
 
 class _Process:
-    """One run of a capture process, up to its first answer."""
+    """One run of a capture process, started and with a known format."""
 
     _hangs: str
     _crashes: str
@@ -94,17 +94,17 @@ class _Process:
         Parameters
         ----------
         timeout : float
-            Seconds to wait for the first one.
+            Seconds to wait for the first block.
 
         Returns
         -------
         list of SampleBlock or None
-            In the order of their samples, empty if none has come; None if the process has ended.
+            In the order of their samples, may be empty; None if the process has ended.
 
         Raises
         ------
         DeviceError
-            If it has ended, and said why.
+            If the process has ended with a reason.
         """
         if not self._wait(timeout):
             return []
@@ -124,7 +124,7 @@ class _Process:
         return blocks
 
     def kill(self) -> None:
-        """End the process, even if it hangs."""
+        """Kill the process, even if it hangs."""
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdout, self._process.stderr):
@@ -132,7 +132,7 @@ class _Process:
                 pipe.close()
 
     def _ended(self) -> None:
-        """Raise DeviceError if it has said why it ended."""
+        """Raise DeviceError if the process gave a reason for its end."""
 
     def _read_format(self, seconds: float, stop: Flag) -> CaptureFormat:
         deadline = time.monotonic() + seconds
@@ -162,23 +162,23 @@ class _Process:
 
 
 class CaptureProcess(_Process):
-    """One run of the capture process of a microphone at this machine.
+    """One run of the capture process of a local microphone.
 
     Parameters
     ----------
     device : str
         As `hearthlog devices` lists it, or empty for the default one.
     channels : int or None
-        Of an array; None of a single microphone.
+        Channels of an array; None for a single microphone.
     channel : int or None
-        The one to hear, from 1 on; by default the blocks have all of up to eight.
+        Selected channel, counted from 1; by default the blocks have all of up to eight.
     latency : float
-        Seconds that PortAudio holds while nobody reads.
+        Length of PortAudio's buffer in seconds.
 
     Raises
     ------
     DeviceError
-        If the device is not there, cannot be opened or has too few channels, in the words of the
+        If the device is missing, cannot be opened or has too few channels, with the message of the
         capture process; or if PortAudio hangs.
     SourceError
         If PortAudio is missing, cannot start, or crashes.
@@ -207,17 +207,17 @@ class CaptureProcess(_Process):
 
 
 class NetworkProcess(_Process):
-    """One run of the capture process of a microphone in the network.
+    """One run of the capture process of a network microphone.
 
     Parameters
     ----------
     channel : int or None
-        The one to hear, from 1 on; by default the blocks have all, of a topic the first one.
+        Selected channel, counted from 1; by default the blocks have all, for a topic the first one.
 
     Raises
     ------
     DeviceError
-        If it is not heard, in the words of the capture process; or if it was stopped.
+        If there is no sound, with the message of the capture process; or if it was stopped.
     """
 
     _hangs = _crashes = "the capture process does not answer"
@@ -262,7 +262,7 @@ _CARDS_SECONDS = 0.25
 
 
 def cards_change(stop: Flag, seconds: float) -> bool:
-    """Wait, but no longer than until a sound card comes or goes; return whether one does."""
+    """Wait until a sound card comes or goes, or for a timeout; return whether one did."""
     cards, end = _sound_cards(), time.monotonic() + seconds
     while time.monotonic() < end and not stop.wait(min(_CARDS_SECONDS, seconds)):
         if _sound_cards() != cards:
@@ -271,7 +271,7 @@ def cards_change(stop: Flag, seconds: float) -> bool:
 
 
 def _sound_cards() -> int:
-    """Return what changes with the sound cards that Linux has; 0 elsewhere."""
+    """Return a value that changes with Linux's sound cards; 0 on other systems."""
     try:
         return _CARDS.stat().st_mtime_ns
     except OSError:
@@ -282,7 +282,7 @@ _RETRY_SECONDS = 10.0
 
 
 class ReturnWatch:
-    """Opens a device as soon as it is there, in a thread: that may take as long as it likes."""
+    """Opens a device as soon as it returns, in a thread, as opening may block."""
 
     def __init__(self, open_device: Callable[[Flag], Capture]) -> None:
         self._open = open_device
@@ -293,17 +293,17 @@ class ReturnWatch:
 
     @property
     def is_there(self) -> bool:
-        """Whether there is a capture to take."""
+        """Whether a capture is available."""
         return self._capture is not None
 
     def take(self) -> Capture | None:
-        """Return the capture once there is one, and have no more to do with it."""
+        """Return the available capture, or None, and release it to the caller."""
         with self._lock:
             capture, self._capture = self._capture, None
         return capture
 
     def close(self) -> None:
-        """Give up, and end what was opened and not taken."""
+        """Stop, and kill a capture that was not taken."""
         with self._lock:
             self._stop.set()
             if self._capture is not None:

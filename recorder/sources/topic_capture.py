@@ -1,7 +1,7 @@
-"""The capture process of a topic of ROS 2: the sound that a node publishes goes to standard output.
+"""Capture process of a ROS 2 topic: the published sound goes to standard output.
 
-It writes what the one of a microphone at this machine writes; why it ends is the last line of
-standard error. The address comes on standard input. It wants the rclpy of a ROS 2 that is sourced.
+Its output format is that of a local microphone; the last line of standard error is the reason for
+its end. The address comes on standard input. It requires rclpy from a sourced ROS 2.
 """
 
 import json
@@ -21,19 +21,19 @@ from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, ArrivalPace, CaptureFormat
 from hearthlog.schemas.frames import SAMPLE_RATE
 
-_FIND_SECONDS = 15.0  # until which a topic must have a publisher, and sound
+_FIND_SECONDS = 15.0  # timeout for a publisher and for sound
 _LOOK_SECONDS = 0.2
-_DEPTH = 100  # messages that wait while this process does not run
+_DEPTH = 100  # messages queued while this process does not run
 _RATES = 8_000, 384_000
 _MOST_CHANNELS = 64
-_CLOCK_SECONDS = 2.0  # a stamp further from its arrival is of another clock
-_LOSS_SECONDS = 0.1  # of a stamp later than the sound before it ends
+_CLOCK_SECONDS = 2.0  # a stamp further from its arrival is on another clock
+_LOSS_SECONDS = 0.1  # minimum distance of a stamp from the end of the previous sound
 _STALE_SECONDS = 3.0
 _SAMPLE_BYTES = 2
 
 
 class _Sound(NamedTuple):
-    """The samples of one message."""
+    """Samples of one message."""
 
     data: bytes  # int16, little-endian, interleaved
     rate: int
@@ -46,7 +46,7 @@ def main() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
     output = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)  # ROS prints as it likes
+    os.dup2(2, 1)  # ROS prints to standard output
     try:
         _capture(sys.stdin.read(), int(sys.argv[1]) or 1, output)
     except SourceError as error:
@@ -76,7 +76,7 @@ def _capture(address: str, channel: int, output: Any) -> None:
 
 
 class _Blocks:
-    """Writes the sound of a topic as blocks, in which all samples follow each other."""
+    """Writes the sound of a topic as blocks of contiguous samples."""
 
     def __init__(self, name: str, channel: int, first: _Sound, output: Any) -> None:
         self._name = name
@@ -89,12 +89,12 @@ class _Blocks:
         self._pace = ArrivalPace(time.monotonic())
 
     def format(self, identity: str) -> CaptureFormat:
-        """Describe them."""
+        """Return the format of the blocks."""
         lost = "messages with sound were lost on the way"
         return CaptureFormat(self._name, identity, self._rate, self._stale, lost)
 
     def split(self, sounds: list[_Sound]) -> Iterator[list[_Sound]]:
-        """Yield runs of messages that follow each other; count what is lost between them."""
+        """Yield runs of contiguous messages; count losses between them."""
         run: list[_Sound] = []
         for sound in sounds:
             lost = self._lost_before(sound)
@@ -107,7 +107,7 @@ class _Blocks:
         yield run
 
     def write(self, run: list[_Sound], arrival: float) -> None:
-        """Write messages that follow each other as one block."""
+        """Write contiguous messages as one block."""
         samples = b"".join(self._one_channel(sound) for sound in run)
         count = len(samples) // _SAMPLE_BYTES
         taken = _taken(run[0], arrival)
@@ -124,7 +124,7 @@ class _Blocks:
         return len(sound.data) / (_SAMPLE_BYTES * self._channels * self._rate)
 
     def _lost_before(self, sound: _Sound) -> int:
-        """Return how many samples are missing between a message and the one before it."""
+        """Return the number of samples missing before a message."""
         if self._last is None or self._last.stamp is None or sound.stamp is None:
             return 0
         seconds = sound.stamp - self._last.stamp - self._seconds(self._last)
@@ -143,7 +143,7 @@ class _Blocks:
 
 
 def _taken(sound: _Sound, arrival: float) -> float:
-    """Return when the first sample was taken, in seconds of CLOCK_MONOTONIC; inf: unknown."""
+    """Return the capture time of the first sample, in seconds of CLOCK_MONOTONIC; inf: unknown."""
     if sound.stamp is None:
         return math.inf
     taken = sound.stamp - (time.time() - time.monotonic())
@@ -151,7 +151,7 @@ def _taken(sound: _Sound, arrival: float) -> float:
 
 
 class _TopicStream:
-    """What arrives on a topic, in blocks: each wake-up costs more than the samples it brings."""
+    """Sound of a topic, read in blocks: a wake-up costs more than the samples."""
 
     def __init__(self, address: TopicAddress) -> None:
         self._address = address
@@ -209,7 +209,7 @@ class _TopicStream:
         qos = self._rclpy.qos
         profile = qos.QoSProfile(
             depth=_DEPTH, reliability=publisher.qos_profile.reliability
-        )  # as it is offered: whoever wants more gets nothing
+        )  # as offered: a stricter profile would receive nothing
         read = kinds[kind]
         self._node.create_subscription(
             message, self._address.topic, lambda message: self._take(read, message), profile

@@ -1,1 +1,1 @@
-"""What is computed from the sound of one microphone, and the messages that say it. No I/O."""
+"""Processing of one microphone's sound, and the resulting messages. No I/O."""

@@ -1,9 +1,9 @@
-"""Directions in the channels of an array: SRP-PHAT of what is above the floor of the room.
+"""Directions of arrival at an array: SRP-PHAT of the sound above the noise floor of the room.
 
-The phases of the cross-spectra of all pairs of microphones are steered to each direction and summed
+The phases of the cross-spectra of all microphone pairs are steered to each direction and summed
 (DiBiase, "A high-accuracy, low-latency technique for talker localization in reverberant
-environments using microphone arrays", 2000). A band of a moment counts by how much of it is neither
-the room's floor nor an echo: less than what sounded a moment before.
+environments using microphone arrays", 2000). Each band and time step is weighted by its share that
+is neither noise floor nor echo: an echo is weaker than the sound a moment before.
 """
 
 from collections.abc import Sequence
@@ -26,18 +26,18 @@ MOST_MICROPHONES = 8
 _STEP = np.deg2rad(3.0)
 _LEAST_METRES, _MOST_METRES = 0.02, 1.0  # from the first microphone to the last
 _SAME_PLACE = 0.001  # metres
-_LINE = 0.02  # of its length, which a line may be broad
+_LINE = 0.02  # maximum breadth of a line, relative to its length
 
 
 class DirectionGrid(NamedTuple):
-    """Directions that are tried.
+    """Grid of candidate directions.
 
     Attributes
     ----------
     azimuths : np.ndarray [shape=(a,)], float64
         In radians, counter-clockwise from x, in equal steps.
     before, after : np.ndarray [shape=(a,)], intp
-        Where the neighbours of each are.
+        Indices of the neighbours of each direction.
     step : float
         In radians.
     """
@@ -50,19 +50,19 @@ class DirectionGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class ArrayGeometry:
-    """Where the microphones of an array are.
+    """Microphone positions of an array.
 
     Attributes
     ----------
     positions : np.ndarray [shape=(c, 3)], float64
-        Of the microphone of each channel, in metres: x forward, y to the left, z up.
+        Position of each channel's microphone, in metres: x forward, y to the left, z up.
     """
 
     positions: Float64
 
     @property
     def is_line(self) -> bool:
-        """Whether a sound and its mirror image at the line sound the same."""
+        """Whether the microphones are in a line: a source and its mirror image are ambiguous."""
         flat = self.positions[:, :2] - self.positions[:, :2].mean(axis=0)
         length, breadth = np.linalg.svd(flat, compute_uv=False)
         return bool(breadth < _LINE * length)
@@ -73,10 +73,10 @@ class ArrayGeometry:
         return np.array(list(combinations(range(len(self.positions)), 2)))
 
     def grid(self) -> DirectionGrid:
-        """Return the directions that the array can tell apart.
+        """Return the directions that the array can distinguish.
 
-        Those of a line are the half circle that begins where the last microphone is, as seen from
-        the first, and goes on counter-clockwise.
+        For a line they are a half circle, counter-clockwise, that begins at the direction from the
+        first microphone to the last.
         """
         if not self.is_line:
             count = round(2 * np.pi / _STEP)
@@ -85,17 +85,17 @@ class ArrayGeometry:
         x, y, _ = _farthest(self.positions) - self.positions[0]
         last = round(np.pi / _STEP)
         places = np.arange(last + 1)
-        # What lies beyond an end is the mirror image of what lies before it.
+        # A direction beyond an end is the mirror image of one before the end.
         after = last - np.abs(last - places - 1)
         return DirectionGrid(np.arctan2(y, x) + places * _STEP, np.abs(places - 1), after, _STEP)
 
     def delays(self, azimuths: Float64) -> Float64:
-        """Compute how much later sound from far away meets the second microphone of each pair.
+        """Compute the delay of far-field sound at the second microphone of each pair.
 
         Parameters
         ----------
         azimuths : np.ndarray [shape=(a,)], float64
-            Whence it comes, in the plane of x and y; in radians.
+            Directions of the source, in the plane of x and y; in radians.
 
         Returns
         -------
@@ -109,7 +109,7 @@ class ArrayGeometry:
 
 
 def array_geometry(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
-    """Check the places of the microphones of an array.
+    """Check the microphone positions of an array.
 
     Parameters
     ----------
@@ -119,8 +119,8 @@ def array_geometry(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
     Raises
     ------
     ConfigurationError
-        If there are too few or too many of them, if one is no place or that of another, or if they
-        are nearer together or farther apart than directions can be told by.
+        If the number of microphones is out of range, a position is invalid or used twice, or the
+        distances are too small or too large for direction finding.
     """
     count = len(positions)
     if not 2 <= count <= MOST_MICROPHONES:
@@ -149,7 +149,7 @@ def array_geometry(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
 
 
 def _farthest(positions: Float64) -> Float64:
-    """Return the place that is farthest from the first one."""
+    """Return the position farthest from the first one."""
     distances = np.linalg.norm(positions[:, :2] - positions[0, :2], axis=1)
     place: Float64 = positions[distances.argmax()]
     return place
@@ -158,15 +158,15 @@ def _farthest(positions: Float64) -> Float64:
 _WINDOW, _HOP = 400, 200  # samples
 _HOPS = FRAME_SAMPLES // _HOP  # of a frame
 _LOWEST, _HIGHEST = 200.0, 7000.0  # Hz
-# Where bands begin, in Hz. Narrower ones make noise look unsteady.
+# Lower band edges in Hz. In narrower bands noise looks unsteady.
 _EDGES = [200, 360, 520, 680, 840, 1000, 1200, 1440, 1720, 2080, 2520, 3040, 3680, 4480, 5600]
-_GATE = 10 ** (2.0 / 10)  # times the floor, below which nothing counts
-_ECHO_HOPS = 8  # after which what sounded is forgotten
-_ECHO_DECAY = 0.8  # of its power with each hop: 60 dB in 0.8 s
-_ECHO_SHARE = 0.5  # of its power then, which is taken for echo
+_GATE = 10 ** (2.0 / 10)  # times the floor; weaker sound has no weight
+_ECHO_HOPS = 8  # hops remembered by the echo estimate
+_ECHO_DECAY = 0.8  # power ratio per hop: 60 dB in 0.8 s
+_ECHO_SHARE = 0.5  # share of the decayed power that counts as echo
 _LEAST_WEIGHT = 0.03  # mean over a block
-_LEAST_CONFIDENCE = 0.1  # below it, half of the directions are wrong
-_STEPS = 512  # to a radian and to 1, to which both are rounded: noise does not compress
+_LEAST_CONFIDENCE = 0.1  # below this, half of the directions are wrong
+_STEPS = 512  # rounding steps per radian, and per 1 of confidence: noise does not compress
 _TINY = np.float32(1e-20)
 
 _FREQUENCIES = np.fft.rfftfreq(_WINDOW, 1 / SAMPLE_RATE)
@@ -178,17 +178,17 @@ _WIDTHS = np.diff([*_STARTS, _BINS])
 
 
 class Located(NamedTuple):
-    """Directions of the blocks in which something could be located.
+    """Directions of the blocks in which a source was located.
 
     Attributes
     ----------
     places : np.ndarray [shape=(m,)], int64
-        Where each block begins: frames after the first of those that were given, negative if it
-        began before them.
+        Start of each block in frames relative to the first pushed frame; negative if the block
+        began earlier.
     azimuths : np.ndarray [shape=(m,)], float32
         In radians, -pi to pi, counter-clockwise from x; in steps of 1/512.
     confidences : np.ndarray [shape=(m,)], float32
-        By how much the phases agree on this direction more than on any, 0 to 1.
+        Excess of the phase agreement in this direction over the mean of all directions, 0 to 1.
     """
 
     places: Int64
@@ -202,8 +202,7 @@ _NOWHERE = Located(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, n
 class DirectionFinder:
     """Finds the direction of each block of one stream of frames.
 
-    Blocks depend on the numbers of the frames only, so that the same frames give the same bits in
-    pieces of any size.
+    Blocks are aligned to the frame numbers, so results are bit-equal for pieces of any size.
     """
 
     def __init__(self, geometry: ArrayGeometry) -> None:
@@ -217,9 +216,9 @@ class DirectionFinder:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset: the next frame does not follow the last one."""
         self._floor.restart()
-        self._held: Float32 | None = None  # frames of a block that is not complete
+        self._held: Float32 | None = None  # frames of the incomplete block
         self._tail = np.zeros((_WINDOW - _HOP, self._channels), np.float32)
         self._past = np.zeros((_ECHO_HOPS, len(_STARTS)), np.float32)  # powers of the last hops
 
@@ -249,7 +248,7 @@ class DirectionFinder:
         return _located(begun + sure * BLOCK_FRAMES, azimuths[sure], confidences[sure])
 
     def _steered(self, frames: Float32, first: int) -> Float32:
-        """Return how well the phases of each block agree with each direction, -1 to 1."""
+        """Return the phase agreement of each block with each direction, -1 to 1."""
         spectra = self._spectra(frames)
         power = np.square(spectra.real) + np.square(spectra.imag)
         weights = self._weights(power.mean(axis=1), first)
@@ -273,7 +272,7 @@ class DirectionFinder:
         return np.fft.rfft(windows * _TAPER, axis=-1)[..., _KEPT].astype(np.complex64, copy=False)
 
     def _weights(self, power: Float32, first: int) -> Float32:
-        """Return how much each bin of each hop counts, 0 to 1."""
+        """Return the weight of each bin of each hop, 0 to 1."""
         bands = np.add.reduceat(power, _STARTS, axis=1) + _TINY
         floor = np.repeat(self._floors(bands, first), _HOPS, axis=0)
         known = np.concatenate([self._past, bands])
@@ -286,7 +285,7 @@ class DirectionFinder:
         return np.repeat(of_sound.astype(np.float32), _WIDTHS, axis=1)
 
     def _floors(self, bands: Float32, first: int) -> Float64:
-        """Return the powers of the bands of each frame below which nothing counts."""
+        """Return the gate of each frame and band: powers below it have no weight."""
         frames = bands.reshape(-1, _HOPS, len(_STARTS)).astype(np.float64)
         powers = (frames[:, 0] + frames[:, 1] + frames[:, 2] + frames[:, 3]) / _HOPS
         whole = powers.sum(axis=1, keepdims=True)
@@ -295,7 +294,7 @@ class DirectionFinder:
         return np.concatenate([unknown, _GATE * floors[:, :-1]])
 
     def _peaks(self, steered: Float32) -> tuple[Float64, Float64]:
-        """Return the best direction of each block, and by how much it is better than any."""
+        """Return the best direction of each block, and its excess over the mean."""
         grid, rows = self._grid, np.arange(len(steered))
         best = steered.argmax(axis=1)
         peak = steered[rows, best]
@@ -317,7 +316,7 @@ _FRAMES = 200  # ten seconds of sound
 
 
 class ChannelWatch:
-    """Watches the channels of an array."""
+    """Detects dead and identical channels of an array."""
 
     def __init__(self, channels: int) -> None:
         self._pairs = np.array(list(combinations(range(channels), 2)))
@@ -340,7 +339,7 @@ class ChannelWatch:
         self._same = _in_a_row(self._same, same)
 
     def problem(self) -> str:
-        """Return what is wrong and what to do; empty if nothing is."""
+        """Return the fault and its remedy; empty if there is none."""
         if (self._dead >= _FRAMES).any():
             channel = int(self._dead.argmax()) + 1
             return f"channel {channel} of the array gives no sound: no direction can be trusted"
@@ -354,7 +353,7 @@ class ChannelWatch:
 
 
 def _in_a_row(before: Int64, flags: Bool) -> Int64:
-    """Return for how many of the last rows each column was true."""
+    """Return the length of the final run of true rows in each column."""
     if not len(flags):
         return before
     since = np.where(flags.all(axis=0), len(flags), flags[::-1].argmin(axis=0))

@@ -25,7 +25,7 @@ _LEVELS = {OK: _INFO, WARNING: _WARN}
 
 
 def info_line(info: Any) -> bytes:
-    """Say in a line of `/rosout` what is recorded."""
+    """Format device and model as a line of `/rosout`."""
     labels = "no model, no labels"
     if info.model:
         labels = f"{len(info.labels)} labels by {info.model} ({info.model_sha256[:12]})"
@@ -36,25 +36,25 @@ def info_line(info: Any) -> bytes:
 
 
 def segment_line(microphone: str, segment: Segment, label: str) -> bytes:
-    """Say in a line of `/rosout` which sound was labelled, and for how long."""
+    """Format a segment, with its label and duration, as a line of `/rosout`."""
     duration = _seconds(segment.end - segment.start)
     text = f"{label} for {duration} ({100 * segment.confidence:.0f} %)"
     return _line(segment.decided_at, microphone, _INFO, text)
 
 
 def gap_line(microphone: str, gap: Gap) -> bytes:
-    """Say in a line of `/rosout`, at the end of a gap, that there was one."""
+    """Format a gap as a line of `/rosout`, stamped at its end."""
     text = f"gap of {_seconds(gap.end - gap.start)}: {gap.reason}"
     return _line(gap.end, microphone, _WARN, text)
 
 
 def health_line(microphone: str, health: SourceHealth) -> bytes:
-    """Say in a line of `/rosout` what state the source is in."""
+    """Format the state of a source as a line of `/rosout`."""
     return _line(health.stamp, microphone, _LEVELS.get(health.level, _ERROR), health.summary)
 
 
 def notice_line(microphone: str, stamp: int, notice: Notice) -> bytes:
-    """Repeat a notice in a line of `/rosout`.
+    """Format a notice as a line of `/rosout`.
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ def _seconds(duration: int) -> str:
     return f"{duration / NANOSECONDS:.2f} s"  # the shortest is a frame of 0.05 s
 
 
-LOGGED_EVERY = 20  # frames between two messages of statistics, each of a second of its own
+LOGGED_EVERY = 20  # frames between messages of statistics, which do not overlap
 
 
 class EncodedMessage(NamedTuple):
-    """One message on its way into the log."""
+    """A message to be written to the log."""
 
     log_time: int  # in nanoseconds of UTC
     topic: str
@@ -97,19 +97,19 @@ class EncodedMessage(NamedTuple):
 def encoded_messages(
     topic_name: str, log_times: Int64, rows: Sequence[bytes]
 ) -> list[EncodedMessage]:
-    """Return the messages of one topic, by their log times and their CDR."""
+    """Return the messages of one topic from their log times and CDR rows."""
     fields = zip(log_times.tolist(), [topic_name] * len(rows), rows, strict=True)
     # `EncodedMessage` itself takes three times as long, 150,000 times in an hour.
     return list(map(tuple.__new__, repeat(EncodedMessage), fields))
 
 
 def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
-    """Make the `AudioStreamInfo` of a microphone, with a stamp of zero.
+    """Create the `AudioStreamInfo` of a microphone, with a stamp of zero.
 
     Parameters
     ----------
     model : Model or None
-        The model that labels the sound; None for no labels.
+        Labelling model; None for no labels.
     """
     return message(
         message_types.STREAM_INFO,
@@ -127,7 +127,7 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
 
 
 def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessage]:
-    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words."""
+    """Return the first messages of every file: its `AudioStreamInfo`, and the same as text."""
     stamp, microphone = nanoseconds(info.header.stamp), info.header.frame_id
     said = [notice_line(microphone, stamp, Notice(OK, line)) for line in lines]
     return [
@@ -137,12 +137,12 @@ def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessag
 
 
 def diagnostics(subject: str, health: SourceHealth, microphone: str = "") -> EncodedMessage:
-    """Encode the health of one thing.
+    """Encode the health of a subject.
 
     Parameters
     ----------
     subject : str
-        A microphone or recorder by its name, and behind a space what of it, if not all of it.
+        Name of a microphone or recorder; after a space the part of it, if not all of it.
     """
     status = message(
         "diagnostic_msgs/msg/DiagnosticStatus",

@@ -56,20 +56,20 @@ _REMEMBERED_WINDOWS = 4  # of embeddings: two seconds
 
 
 class Pipeline:
-    """Everything that is computed from one microphone's sound.
+    """All processing of one microphone's sound.
 
     Parameters
     ----------
     private : sequence of str
-        Classes whose features are logged coarsely, as of `PrivacyFilter`. With one, all
-        messages come two seconds later at most, so that log time never runs backwards.
+        Classes whose features are logged coarsely, as in `PrivacyFilter`. With any, all messages
+        are delayed by up to two seconds, so that log time never runs backwards.
     array : ArrayGeometry or None
-        Of an array of microphones; without one there are no directions.
+        Geometry of a microphone array; None for no directions.
 
     Attributes
     ----------
     last_frames : Frames or None
-        Those that were pushed last, without what is below hearing and stands out.
+        Frames of the last push, after the infrasound filter.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -107,7 +107,7 @@ class Pipeline:
         )
         self._embedding_filter = EmbeddingPrivacyFilter()
         self._held: list[EncodedMessage] = []
-        self._recent: Float32 | None = None  # features of the last frames, one less than a window
+        self._recent: Float32 | None = None  # features of the last frames, one fewer than a window
         self._floor = None if features.band_powers is None else FloorTracker()
         self._recent_floors: Float64 | None = None  # of the last window
         self._last_floor: Float64 = np.empty(0)  # of the last frame; empty without one
@@ -124,27 +124,27 @@ class Pipeline:
 
     @property
     def embedding(self) -> EmbeddingSource | None:
-        """The network behind the embeddings; None without any."""
+        """The network behind the embeddings; None without embeddings."""
         return self._source
 
     @property
     def classes(self) -> tuple[str, ...] | None:
-        """The classes of the model in use; None without one."""
+        """The classes of the model in use; None without a model."""
         return None if self._live is None else self._live.classes
 
     @property
     def segments_converged(self) -> bool:
-        """Whether sound before the first frame would leave no trace in the segments to come."""
+        """Whether sound before the first frame would no longer change the segments to come."""
         streams = self._streams.values()
         return bool(streams) and all(stream.segments_converged for stream in streams)
 
     @property
     def last_labels(self) -> FrameLabels | None:
-        """Labels of the frames that were pushed last; None if they have none."""
+        """Labels of the frames of the last push; None if they have none."""
         return None if self._live is None else self._live.last
 
     def push(self, event: Event) -> list[EncodedMessage]:
-        """Turn an event of a source into messages."""
+        """Convert an event of a source to messages."""
         if isinstance(event, Frames):
             samples = self._infrasound(event.samples)
             self.last_frames = replace(event, samples=samples)
@@ -169,7 +169,7 @@ class Pipeline:
         stamps: Int64,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> list[EncodedMessage]:
-        """Turn the features of successive frames into messages.
+        """Convert the features of successive frames to messages.
 
         Parameters
         ----------
@@ -185,7 +185,7 @@ class Pipeline:
     def _watch_frames(
         self, frames: Frames, samples: Float32, floors: Floors | None
     ) -> tuple[Directions, list[EncodedMessage]]:
-        """Watch sound, filtered as `samples`; return its directions, and the health within it."""
+        """Check the sound, filtered as `samples`; return its directions and health messages."""
         powers = np.empty(0) if floors is None else floors.powers[:, -1]
         unknown = len(samples) - len(powers)  # frames, before the first that has a floor
         directions, messages, start = NOWHERE, list[EncodedMessage](), 0
@@ -208,7 +208,7 @@ class Pipeline:
         return directions, messages
 
     def _add_floor(self, powers: Float64) -> None:
-        """Watch the floor of the room at successive frames."""
+        """Add the noise floor of successive frames to the sound watch."""
         self._watch.add_floor(powers)
         if len(powers):
             self._last_floor = powers[-1:]
@@ -244,7 +244,8 @@ class Pipeline:
     def _filtered(self, frames: LoggedFrames) -> list[EncodedMessage]:
         """Encode frames that may be logged, and the embeddings that end with them.
 
-        Names go by these embeddings alone: what is left out for somebody may be speaking has none.
+        Streams that label by names get only these embeddings: without an embedding, as for possible
+        speech, there is no name.
         """
         embeddings = self._embedding_filter.release(frames)
         known = frames.stamps[embeddings.last_frames - frames.first]
@@ -257,7 +258,7 @@ class Pipeline:
         return messages
 
     def _located(self, auxiliary: Auxiliary, first: int, stamps: Int64) -> list[EncodedMessage]:
-        """Encode the directions of frames, and remember the last ones, and the last embeddings."""
+        """Encode the directions of frames; keep the last directions and embeddings."""
         directions, embeddings = auxiliary
         latest = self._recent_embeddings.followed_by(embeddings)
         self._recent_embeddings = latest.rows(slice(-_REMEMBERED_WINDOWS, None))
@@ -277,7 +278,7 @@ class Pipeline:
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
 
     def release(self, messages: Sequence[EncodedMessage]) -> list[EncodedMessage]:
-        """Return what may be logged: all, or what is not later than features that are held.
+        """Return the messages that may be logged: all, or those before the features still held.
 
         Parameters
         ----------
@@ -287,7 +288,7 @@ class Pipeline:
         Returns
         -------
         list of EncodedMessage
-            In the order of their log times; of what was held before, too.
+            In the order of their log times, including messages held earlier.
         """
         if self._privacy_filter is None:
             return list(messages)
@@ -297,15 +298,15 @@ class Pipeline:
         return messages
 
     def flush(self) -> list[EncodedMessage]:
-        """Return what is held, before the log ends."""
+        """Return all held messages, before the log ends."""
         return self.release(self._close_filter())
 
     def _close_filter(self) -> list[EncodedMessage]:
-        """Return the features that are held."""
+        """Return the messages of the held features."""
         return [] if self._privacy_filter is None else self._filtered(self._privacy_filter.close())
 
     def finish(self) -> list[EncodedMessage]:
-        """End the open segment where the sound ends."""
+        """End the open segment at the end of the sound."""
         return self.release([*self._close_filter(), *self._close(self._end)])
 
     def change_model(
@@ -316,7 +317,7 @@ class Pipeline:
         stamp: int,
         labelling: str = LIVE,
     ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
-        """Use another model from a frame on; all else goes on.
+        """Switch to another model at a frame; everything else continues.
 
         Parameters
         ----------
@@ -344,15 +345,15 @@ class Pipeline:
         return [*held, *closing], opening
 
     def lacking_embeddings(self, classifier: Classifier) -> str:
-        """Say which embeddings a model does not get here; empty if it gets what it takes."""
+        """Return which embeddings a model needs and does not get; empty if none is missing."""
         return classifier.lacking_embeddings(self._source)
 
     def unknown_private(self) -> list[str]:
-        """Return the private classes that the model in use does not know."""
+        """Return the private classes that the model in use lacks."""
         return [] if self._privacy_filter is None else self._privacy_filter.unknown(self.classes)
 
     def _follow(self, stream: LabelStream, frame: int, unlabelled: int) -> None:
-        """Let a stream begin at a frame, with what is remembered of the frames before."""
+        """Start a stream at a frame with the remembered history of the frames before."""
         recent, floors = self._recent, self._recent_floors
         if recent is None:
             return
@@ -363,7 +364,7 @@ class Pipeline:
         stream.follow(recent, floors, stamps, frame, unlabelled, known)
 
     def notice_messages(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
-        """Turn a notice into messages.
+        """Convert a notice to messages.
 
         Parameters
         ----------
@@ -379,7 +380,7 @@ class Pipeline:
         )
 
     def judged(self, health: SourceHealth) -> SourceHealth:
-        """Return the health of the source, or what is wrong with its sound."""
+        """Return the health of the source, or the fault of its sound."""
         problem = self._watch.problem()
         if not problem and self._directions is not None:
             problem = self._directions.problem()
@@ -414,7 +415,7 @@ class Pipeline:
         ]
 
     def _track_floor(self, features: Float32, first: int) -> Floors | None:
-        """Return the floor of the room at the last of these frames, those that have one."""
+        """Return the noise floor at the last of these frames, as far as it is known."""
         if self._floor is None or self.feature_set.band_powers is None:
             return None
         floors = self._floor(self.feature_set.band_powers(features), first)
@@ -425,14 +426,14 @@ class Pipeline:
         return floors
 
     def _close(self, end: int) -> list[EncodedMessage]:
-        """End the segments at `end`; the next frame begins anew."""
+        """End the segments at `end`; the next frame starts a new stream."""
         messages = [message for stream in self._streams.values() for message in stream.close(end)]
         return sorted(messages, key=attrgetter("log_time"))
 
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
         health = self.judged(health)
-        # A report of a later time than the sound says that there is none: what is still to be said
-        # of the sound is older, and comes first.
+        # A report later than the sound means that the sound has ended: remaining messages of the
+        # sound are older, and come first.
         ended = health.stamp > self._end
         closing = [*self._close_filter(), *self._close(self._end)] if ended else []
         return [*closing, *self._health_messages(health)]

@@ -12,27 +12,27 @@ from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 # Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
-# probabilities hold for people whom they were not learned from.
+# probabilities are calibrated on people who are not in the training data.
 PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.04
-NAMED_LIMIT, NAMED_LIMIT_ELSEWHERE = 0.04, 0.06  # where the names of a network are against it, too
-PRIVATE_LOGIT = -2.0  # of the names of a class
-NAMED_FRAMES = 20  # for which such names count on: a network misses the short words of a sentence
-_BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
+NAMED_LIMIT, NAMED_LIMIT_ELSEWHERE = 0.04, 0.06  # if the network's names do not indicate it either
+PRIVATE_LOGIT = -2.0  # of a class by its names
+NAMED_FRAMES = 20  # hold time of such names: a network misses the short words of a sentence
+_BEHIND_FRAMES = 12  # plus a window of 0.4 s before them: sound of the last second counts
 
 
 class PrivateFrames:
-    """Tells which frames are private, as soon as it is certain.
+    """Determines which frames are private, as soon as it is certain.
 
-    A label is known with the last frame of its window. A frame is private unless all windows within
-    a second of it, before and behind, were labelled, and none of them is likely to be of a class
-    that is. Frames beside a gap have fewer windows, and are private.
+    A label is available with the last frame of its window. A frame is private unless all windows
+    within one second before and after it were labelled, and none of them is likely to be of a
+    private class. Frames next to a gap have fewer windows, and are private.
 
     Parameters
     ----------
     classes : sequence of str
-        Those that are private; if there are none, no frame is.
+        Private classes; without any, no frame is private.
     window_frames : int
-        A second, or the length of the window of a label, if that is longer.
+        Length of a label's window, at least one second.
     """
 
     def __init__(self, classes: Sequence[str], window_frames: int, ahead: int = 0) -> None:
@@ -43,10 +43,10 @@ class PrivateFrames:
 
     def _begin(self) -> None:
         self._likely: Bool = self._unlabelled(_BEHIND_FRAMES)
-        self._unnamed = NAMED_FRAMES + 1  # frames since names were of a private class
+        self._unnamed = NAMED_FRAMES + 1  # frames since the last names of a private class
 
     def push(self, count: int, labels: FrameLabels | None) -> Bool:
-        """Add frames, which follow the ones before.
+        """Add frames, which follow the previous ones.
 
         Parameters
         ----------
@@ -56,7 +56,7 @@ class PrivateFrames:
         Returns
         -------
         np.ndarray [shape=(m,)], bool
-            Of the next m frames that are certain, whether they are private.
+            Whether each of the next m decided frames is private.
         """
         self._likely = np.append(self._likely, self._unlabelled(count))
         if labels is not None and len(labels.novelty):
@@ -65,7 +65,7 @@ class PrivateFrames:
         return self._decide()
 
     def close(self) -> Bool:
-        """Return whether the frames are private that are not certain yet, and begin anew.
+        """Return whether each undecided frame is private, and reset.
 
         Returns
         -------
@@ -84,22 +84,22 @@ class PrivateFrames:
             limit, named_limit = PRIVATE_LIMIT_ELSEWHERE, NAMED_LIMIT_ELSEWHERE
         by_features = labels.by_features[:, columns]
         if labels.by_names is None:
-            return np.any(~(by_features < limit), axis=1)  # as NaN is
-        # A network hears some speech not at all: whatever it says, features may forbid.
+            return np.any(~(by_features < limit), axis=1)  # NaN counts as private
+        # A network misses some speech entirely: the features alone can make a frame private.
         by_names = labels.by_names[:, columns]
         limits = np.where(np.isfinite(by_names), named_limit, limit)
         likely: Bool = np.any(~(by_features < limits), axis=1)
         return likely | self._is_named(np.any(by_names >= PRIVATE_LOGIT, axis=1))
 
     def _is_named(self, named: Bool) -> Bool:
-        """Return which of the next frames are at most `NAMED_FRAMES` behind one that is named."""
+        """Return whether each next frame is at most `NAMED_FRAMES` after a named one."""
         frames = np.arange(1, len(named) + 1)
         latest = np.maximum.accumulate(np.where(named, frames, 1 - self._unnamed))
         self._unnamed = int(len(named) + 1 - latest[-1])
         return np.asarray(frames - latest <= NAMED_FRAMES)
 
     def _unlabelled(self, count: int) -> Bool:
-        """Return whether frames without a label may be private: unless nothing is."""
+        """Return whether frames without a label may be private: true if any class is private."""
         return np.full(count, bool(self._classes))
 
     def _decide(self) -> Bool:
@@ -113,7 +113,7 @@ class PrivateFrames:
         return private
 
 
-TOGETHER = NANOSECONDS // FRAME_NANOSECONDS  # frames that are averaged
+TOGETHER = NANOSECONDS // FRAME_NANOSECONDS  # frames averaged together
 _NEVER = 2**63 - 1  # nanoseconds of UTC
 
 
@@ -124,7 +124,7 @@ class _Frames(NamedTuple):
 
 
 class LoggedFrames(NamedTuple):
-    """Features of successive frames, as they are logged.
+    """Features of successive frames, as logged.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class LoggedFrames(NamedTuple):
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
     private : np.ndarray [shape=(n,)], bool
-        Which of them somebody may be talking in.
+        Whether a frame may contain speech.
     """
 
     features: Float32
@@ -142,9 +142,9 @@ class LoggedFrames(NamedTuple):
 
 
 class PrivacyFilter:
-    """Holds features back until it is certain which are private, and makes those coarse.
+    """Buffers features until it is decided which are private, and averages the private ones.
 
-    Seconds begin at frames whose numbers 20 divides, so they are the same in blocks of any size.
+    Seconds begin at frame numbers divisible by 20, so results do not depend on the block size.
     """
 
     def __init__(
@@ -153,27 +153,27 @@ class PrivacyFilter:
         self._classes = frozenset(classes)
         self._guard = PrivateFrames(classes, window_frames, ahead)
         self._held = _Frames(np.empty((0, width), np.float32), 0, np.empty(0, np.int64))
-        self._private: Bool = np.empty(0, bool)  # of the first frames that are held
+        self._private: Bool = np.empty(0, bool)  # for the first held frames
 
     @property
     def start(self) -> int:
-        """Start of the first frame that is held, in nanoseconds of UTC; without one, never."""
+        """Start of the first held frame, in nanoseconds of UTC; `_NEVER` without a held frame."""
         return int(self._held.stamps[0]) if len(self._held.stamps) else _NEVER
 
     def unknown(self, classes: Sequence[str] | None) -> list[str]:
-        """Return the private classes that a model does not know.
+        """Return the private classes that a model lacks.
 
         Parameters
         ----------
         classes : sequence of str or None
-            Those that it tells apart; None without a model.
+            Classes of the model; None without a model.
         """
         return sorted(self._classes.difference(classes or ()))
 
     def push(
         self, features: Float32, first: int, stamps: Int64, labels: FrameLabels | None
     ) -> LoggedFrames:
-        """Add frames, which follow the ones before.
+        """Add frames, which follow the previous ones.
 
         Parameters
         ----------
@@ -181,12 +181,13 @@ class PrivacyFilter:
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         labels : FrameLabels or None
-            Of the last of these frames; of a model that does not know what is private, all is.
+            Labels of the last of these frames; if the model lacks a private class, everything is
+            private.
 
         Returns
         -------
         LoggedFrames
-            Those of the seconds that are certain; perhaps none.
+            Frames of the decided seconds; may be empty.
         """
         held = self._held
         self._held = _Frames(
@@ -201,7 +202,7 @@ class PrivacyFilter:
         return self._release(max(len(self._private) - begun, 0))
 
     def close(self) -> LoggedFrames:
-        """Return what is held, as the frames to come do not follow those before."""
+        """Return all held frames; the next frames do not follow them."""
         self._private = np.append(self._private, self._guard.close())
         return self._release(len(self._private))
 
@@ -218,7 +219,7 @@ class PrivacyFilter:
 
 
 class EmbeddingPrivacyFilter:
-    """Holds embeddings back until it is certain whether their windows are private, and drops those.
+    """Buffers embeddings until it is decided whether their windows are private; drops private ones.
 
     Frames that were not released are private.
     """
@@ -227,7 +228,7 @@ class EmbeddingPrivacyFilter:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset: the next frame does not follow the last one."""
         self._held = NO_EMBEDDINGS
         self._private: Bool = np.ones(WINDOW_FRAMES - 1, bool)  # of the last frames released
 
@@ -236,7 +237,7 @@ class EmbeddingPrivacyFilter:
         self._held = self._held.followed_by(embeddings)
 
     def release(self, frames: LoggedFrames) -> Embeddings:
-        """Return the embeddings that may be logged, of those that end with some frames."""
+        """Return the embeddings that end with these frames and may be logged."""
         private = np.append(self._private, frames.private)
         self._private = private[1 - WINDOW_FRAMES :]
         ended = self._held.known_at(frames.first, len(frames.stamps))

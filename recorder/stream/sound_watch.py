@@ -1,4 +1,4 @@
-"""Sound in which little can be recognised: clipped, stuck, below hearing, humming, faint, loud."""
+"""Sound quality checks: clipped, stuck, below hearing, humming, faint or loud."""
 
 from collections import deque
 
@@ -9,9 +9,9 @@ from hearthlog.schemas.arrays import Bool, Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 
 _FULL_SCALE = 0.999
-_CLIPPED_SAMPLES = 4  # of a frame; the highest sample of a recording may be full scale
-_CLIPPED_ENERGY = 0.99 * _CLIPPED_SAMPLES * _FULL_SCALE**2  # in which rounding may lie
-_LOOKED_AT = 16  # samples of a frame: mostly enough to see that it moves
+_CLIPPED_SAMPLES = 4  # per frame; the highest sample of a recording may be full scale
+_CLIPPED_ENERGY = 0.99 * _CLIPPED_SAMPLES * _FULL_SCALE**2  # with a margin for rounding
+_LOOKED_AT = 16  # samples of a frame: usually enough to detect a change
 _CLIPPED_FRAMES = round(1.0 / FRAME_SECONDS)  # of the last minute
 _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
@@ -20,7 +20,7 @@ _STUCK_FRAMES = round(10.0 / FRAME_SECONDS)
 _INFRASOUND_FRAMES = round(20.0 / FRAME_SECONDS)
 _INFRASOUND_SHARE = 0.8  # of them
 _INFRASOUND_POWER = 1e-5  # -50 dBFS
-DEAD_STEPS = 2  # of 16 bits, between which the noise of a converter alone lies
+DEAD_STEPS = 2  # of 16 bits: range of a converter's own noise
 _DEAD_RANGE = DEAD_STEPS / 32768
 _DAY_MINUTES = 1440
 _FALL = 1000.0  # 30 dB
@@ -41,18 +41,18 @@ LOUD = "the room is as loud as most sounds: turn the microphone down, or put it 
 
 
 def problem_of_file(problem: str) -> str:
-    """Say what is wrong with the sound of an audio file."""
+    """Rephrase a microphone's fault for an audio file."""
     what = problem.partition(":")[0].replace("the microphone", "the file")
     return f"{what}: check with what it was recorded, and how"
 
 
 class SoundWatch:
-    """Watches the sound of one microphone."""
+    """Checks the sound of one microphone."""
 
     def __init__(self) -> None:
         self._clipped: Bool = np.empty(0, bool)  # frames of the last minute
-        self._loud = 0  # frames since the floor of the room was not loud
-        self._stuck = 0  # frames since the sound was not one value
+        self._loud = 0  # successive frames with a loud noise floor
+        self._stuck = 0  # successive frames of one value
         self._infrasound = _Infrasound()
         self._level = _DailyLevel()
         self._hum = _MainsHum()
@@ -65,25 +65,25 @@ class SoundWatch:
         samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
             In full scale, -1 to 1.
         filtered : np.ndarray [shape=(n, FRAME_SAMPLES)], float32, optional
-            The same by `InfrasoundFilter`.
+            The same samples after `InfrasoundFilter`.
         """
         filtered = samples if filtered is None else filtered
         self._infrasound.add(samples, filtered)
         self._clipped = np.concatenate([self._clipped, _are_clipped(samples)])[-_MINUTE:]
-        # Zeros are another matter: in a file they are silence, and a microphone's are reported.
+        # Zeros are no fault: in a file they are silence, and a microphone's are reported elsewhere.
         moving = (samples[:, :_LOOKED_AT] != samples[:, :1]).any(axis=1) | (samples[:, 0] == 0.0)
         still = np.flatnonzero(~moving)
         moving[still] = np.ptp(samples[still], axis=1) > 0
         moving = np.flatnonzero(moving & ~_is_offset_only(samples, filtered))
         last = int(moving[-1]) if len(moving) else -1
         self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
-        with np.errstate(over="ignore"):  # floats of a file may be of any size
+        with np.errstate(over="ignore"):  # floats in a file may have any size
             powers = np.square(samples).mean(axis=1)
         self._level.add(np.minimum(powers, np.float32(1.0)))
         self._hum.add(samples)
 
     def add_floor(self, powers: Float64) -> None:
-        """Add the floor of the room at successive frames.
+        """Add the noise floor at successive frames.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class SoundWatch:
         self._loud = len(powers) - 1 - int(low[-1]) if len(low) else self._loud + len(powers)
 
     def problem(self) -> str:
-        """Return what is wrong and what to do; empty if nothing is."""
+        """Return the fault and its remedy; empty if there is none."""
         if self._stuck >= _STUCK_FRAMES:
             return STUCK
         if self._clipped.sum() >= _CLIPPED_FRAMES:
@@ -109,12 +109,12 @@ class SoundWatch:
 
 
 class ClipWatch:
-    """Watches a sound of seconds, which is too short for a `SoundWatch`."""
+    """Checks a sound of a few seconds, which is too short for a `SoundWatch`."""
 
     def __init__(self) -> None:
         self._frames = self._clipped = self._still = self._zero = 0
         self._held: Float32 = np.empty((0, FRAME_SAMPLES), np.float32)  # less than a second
-        self._seconds: list[int] = []  # the mains that each hums with
+        self._seconds: list[int] = []  # mains frequency of each second's hum, or 0
 
     def add_samples(self, samples: Float32) -> None:
         """Add successive frames.
@@ -136,7 +136,7 @@ class ClipWatch:
         self._seconds += map(_hum_of, seconds.reshape(-1, SAMPLE_RATE))
 
     def problem(self) -> str:
-        """Return what is wrong and what to do; empty if nothing is."""
+        """Return the fault and its remedy; empty if there is none."""
         if 2 * self._still > self._frames - self._zero:
             return STUCK
         if self._clipped >= _CLIPPED_FRAMES or 2 * self._clipped > self._frames:
@@ -148,7 +148,7 @@ class ClipWatch:
 
 
 def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
-    """Find the frames in which there is no more than an offset: a dead microphone."""
+    """Return the frames that hold only an offset: a dead microphone."""
     if filtered is samples:
         return np.zeros(len(samples), bool)
     is_offset_only = np.ptp(samples[:, :_LOOKED_AT], axis=1) <= _DEAD_RANGE
@@ -167,7 +167,7 @@ def _are_clipped(samples: Float32) -> Bool:
 
 
 class _Infrasound:
-    """Remembers what the filter took out of the last frames."""
+    """Recent output that the infrasound filter removed."""
 
     def __init__(self) -> None:
         self._means = self._powers = np.zeros(_INFRASOUND_FRAMES, np.float32)
@@ -192,7 +192,7 @@ class _Infrasound:
 
 
 class _DailyLevel:
-    """Follows the loudest minute of each day of sound."""
+    """Tracks the loudest minute of each day of sound."""
 
     def __init__(self) -> None:
         self.has_fallen = False
@@ -215,7 +215,7 @@ class _DailyLevel:
 
 
 class _MainsHum:
-    """Listens to a second of every minute for the mains."""
+    """Checks one second of every minute for mains hum."""
 
     def __init__(self) -> None:
         self.frequency = 0  # Hz; 0 for no hum
@@ -240,12 +240,12 @@ class _MainsHum:
 
 
 def _hum_of(second: Float32) -> int:
-    """Return the frequency of the mains if most of a second's power is there, else 0."""
+    """Return the mains frequency if it holds most of a second's power, else 0."""
     assert len(second) == SAMPLE_RATE == _SECOND * FRAME_SAMPLES
     if decibels(np.square(second, dtype=np.float64).mean()) < _HUM_DBFS:
         return 0
     power = np.square(np.abs(np.fft.rfft(second * np.hanning(len(second)))))
-    power[:20] = 0.0  # what no microphone hears, in bins of 1 Hz
+    power[:20] = 0.0  # below the range of microphones, in bins of 1 Hz
     around = np.arange(-2, 3)
     for frequency in _MAINS:
         bins = (frequency * _HARMONICS[:, np.newaxis] + around).reshape(-1)

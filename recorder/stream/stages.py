@@ -31,9 +31,9 @@ from hearthlog.schemas.messages.topics import (
 
 
 class RollingStatistics:
-    """Statistics of one stream of frames over its last frames.
+    """Statistics of one stream over its last frames.
 
-    Every window is summed anew from its own frames, since running sums would drift over months.
+    Every window is summed from its own frames, as running sums would drift over months.
     """
 
     def __init__(self, window_frames: int, width: int) -> None:
@@ -45,19 +45,19 @@ class RollingStatistics:
         self._recent: Float32 = np.empty((0, self._width), np.float32)
 
     def __call__(self, features: Float32, places: Indices | None = None) -> tuple[Float32, Float32]:
-        """Compute the statistics at some of successive frames.
+        """Compute the statistics at some of the successive frames.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
         places : np.ndarray [shape=(m,)], intp, optional
-            Of the frames, from 0 on, ascending; all by default.
+            Indices of the frames, ascending from 0; all by default.
 
         Returns
         -------
         mean, std : np.ndarray [shape=(m, d)], float32
-            Over the last window, or over all frames since the start or the last restart where
-            these are fewer; the standard deviation divides by their number.
+            Over the last window, or over all frames since the start or the last restart if these
+            are fewer; the standard deviation divides by the number of frames.
         """
         frames = np.concatenate([self._recent, features])
         places = np.arange(len(features)) if places is None else places
@@ -74,7 +74,7 @@ class RollingStatistics:
 
 
 class FeatureMessages:
-    """Encodes the features of one stream of frames, and their statistics."""
+    """Encodes the features and statistics of one stream of frames."""
 
     def __init__(
         self, microphone: str, statistics: RollingStatistics, statistics_every: int
@@ -84,7 +84,7 @@ class FeatureMessages:
         self._every = statistics_every
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset: the next frame does not follow the last one."""
         self._statistics.restart()
 
     def __call__(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
@@ -121,11 +121,11 @@ class FeatureMessages:
         return encoded_messages(name, stamps, rows)
 
 
-_GATE, _GATE_FRAMES = 2.0, 8  # dB above the floor, and the window, as of the models
+_GATE, _GATE_FRAMES = 2.0, 8  # dB above the floor, and the window, as in the models
 
 
 class MicrophoneEmbeddings:
-    """Embeds what a microphone hears above the floor of the room."""
+    """Computes embeddings of sound above the noise floor."""
 
     def __init__(self, embedder: Embedder, features: FeatureSet) -> None:
         self._feature_set = features
@@ -133,7 +133,7 @@ class MicrophoneEmbeddings:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset: the next frame does not follow the last one."""
         self._stream.restart()
         self._features = np.empty((0, self._feature_set.width), np.float32)
 
@@ -147,20 +147,20 @@ class MicrophoneEmbeddings:
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         features : np.ndarray [shape=(n, d)], float32
         floors : Floors or None
-            At the last of these frames; None if the feature set has no bands.
+            Floors at the last of these frames; None if the feature set has no bands.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         """
         recent = np.concatenate([self._features, features])
         sound = np.zeros(len(frames), bool)
-        count = min(len(recent) - _GATE_FRAMES + 1, len(frames))  # that end a whole window
+        count = min(len(recent) - _GATE_FRAMES + 1, len(frames))  # frames that complete a window
         if count > 0:
             sound[-count:] = self._is_sound(recent[-count - _GATE_FRAMES + 1 :], floors)
         self._features = recent[1 - _GATE_FRAMES :].copy()
         return self._stream.push(frames, sound, first, stamps)
 
     def _is_sound(self, features: Float32, floors: Floors | None) -> Bool:
-        """Return which windows are above the floor, or where there is none, above -60 dBFS."""
+        """Return which windows are above the floor, or without a floor, above -60 dBFS."""
         count = len(features) - _GATE_FRAMES + 1
         powers_of = self._feature_set.band_powers
         if floors is None or powers_of is None:
@@ -183,7 +183,7 @@ def embedding_messages(
     Parameters
     ----------
     known : np.ndarray [shape=(m,)], int64
-        Starts of the last frames of their windows, in nanoseconds of UTC.
+        Log times: starts of the last frames of the windows, in nanoseconds of UTC.
     """
     if not len(known):
         return []
@@ -200,7 +200,7 @@ def embedding_messages(
 
 
 class ArrayDirections:
-    """Finds whence the sound of an array comes, and watches its channels."""
+    """Finds the directions of an array's sound, and checks its channels."""
 
     def __init__(self, geometry: ArrayGeometry) -> None:
         self._finder = DirectionFinder(geometry)
@@ -208,12 +208,12 @@ class ArrayDirections:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset: the next frame does not follow the last one."""
         self._finder.restart()
-        self._stamps = np.empty(0, np.int64)  # of the frames of a block that is not complete
+        self._stamps = np.empty(0, np.int64)  # of the frames of the incomplete block
 
     def problem(self) -> str:
-        """Return what is wrong with the channels and what to do; empty if nothing is."""
+        """Return the fault of the channels and its remedy; empty if there is none."""
         return self._watch.problem()
 
     def __call__(self, frames: Frames) -> Directions:
@@ -222,8 +222,8 @@ class ArrayDirections:
         Parameters
         ----------
         frames : Frames
-            The next ones. Without channels, as of a microphone that is heard in place of the array,
-            they have no direction.
+            The next frames. Frames without channels, as from a fallback microphone, have no
+            direction.
         """
         if frames.channels is None:
             self.restart()
@@ -244,7 +244,7 @@ def direction_messages(
     Parameters
     ----------
     known : np.ndarray [shape=(m,)], int64
-        Starts of the last frames of their blocks, in nanoseconds of UTC.
+        Log times: starts of the last frames of the blocks, in nanoseconds of UTC.
     """
     columns: dict[str, Column] = {
         "header.stamp": directions.stamps,
@@ -259,16 +259,16 @@ def direction_messages(
 
 
 class LabelStream:
-    """What one model says of a stream of frames.
+    """Labels and segments of one model for one stream of frames.
 
     Attributes
     ----------
     classes : tuple of str
-        Names behind the columns of the probabilities.
+        Names of the columns of the probabilities.
     segments_converged : bool
-        Whether sound before the first frame would leave no trace in the segments to come.
+        Whether sound before the first frame would no longer change the segments to come.
     last : FrameLabels or None
-        Labels of the frames that were pushed last; None if they have none.
+        Labels of the frames of the last push; None if they have none.
     """
 
     def __init__(
@@ -288,7 +288,7 @@ class LabelStream:
 
     @property
     def delay(self) -> int:
-        """Frames from one to that at which its label is known."""
+        """Delay of a label in frames."""
         return self._labeller.timing.delay
 
     def follow(  # noqa: PLR0913, PLR0917
@@ -300,16 +300,16 @@ class LabelStream:
         unlabelled: int,
         auxiliary: Auxiliary,
     ) -> None:
-        """Take the place of another stream before a frame; as `Labeller.follow`.
+        """Replace another stream before a frame; as `Labeller.follow`.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
-            Of the last frames before it.
+            Features of the last frames before it.
         floors : np.ndarray [shape=(m, b)], float64, or None
         stamps : np.ndarray [shape=(n,)], int64
         auxiliary : Auxiliary
-            Of the last second before it, or more.
+            Auxiliary inputs of at least the last second before it.
         """
         self._labeller.follow(features, floors, stamps, frame, unlabelled, auxiliary)
 
@@ -321,7 +321,7 @@ class LabelStream:
         stamps: Int64,
         auxiliary: Auxiliary,
     ) -> list[EncodedMessage]:
-        """Turn successive frames into messages.
+        """Convert successive frames to messages.
 
         Parameters
         ----------
@@ -342,7 +342,7 @@ class LabelStream:
         ]
 
     def close(self, end: int) -> list[EncodedMessage]:
-        """End the segments of a sound; the next frame begins anew.
+        """End the segments of a sound; the next frame starts a new stream.
 
         Parameters
         ----------
