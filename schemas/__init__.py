@@ -1,1 +1,1 @@
-"""The contract of hearthlog: messages, topics, file names, reading and writing logs."""
+"""Log format of hearthlog: messages, topics, file names, reading and writing."""

@@ -1,4 +1,4 @@
-"""Arrays: names of their types, pieces of buffers, and files with a digest of their content."""
+"""Array types, copies between buffers and rows, and array files with a digest."""
 
 import hashlib
 import json
@@ -20,21 +20,21 @@ Int64 = NDArray[np.int64]
 
 
 def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
-    """Copy pieces of `size` bytes, at any offsets, out of a buffer.
+    """Copy pieces of `size` bytes at any offsets from a buffer.
 
     Parameters
     ----------
     buffer : np.ndarray [shape=(b,)], uint8
         At least `size` bytes.
     offsets : np.ndarray [shape=(n,)], int64
-        Bytes of the buffer at which the pieces begin, 0 to b - `size`; pieces may overlap.
+        Offsets of the pieces in the buffer, 0 to b - `size`; pieces may overlap.
     size : int
-        Bytes of each piece.
+        Size of each piece in bytes.
 
     Returns
     -------
     np.ndarray [shape=(n,)], of dtype V`size`
-        The pieces, in the order of their offsets in `offsets`.
+        Pieces in the order of `offsets`.
     """
     return _pieces(buffer, size)[offsets]
 
@@ -49,29 +49,28 @@ def scatter(rows: NDArray[np.void], buffer: Bytes, offsets: Int64) -> None:
     buffer : np.ndarray [shape=(b,)], uint8
         At least `size` bytes, which the rows overwrite.
     offsets : np.ndarray [shape=(n,)], int64
-        Bytes of the buffer at which the rows begin, 0 to b - `size`; they must not
-        overlap there.
+        Offsets of the rows in the buffer, 0 to b - `size`; the rows must not overlap.
     """
     _pieces(buffer, rows.dtype.itemsize)[offsets] = rows
 
 
 def _pieces(buffer: Bytes, size: int) -> NDArray[np.void]:
-    """View a buffer as pieces that overlap: one for every offset at which one may begin."""
+    """View a buffer as overlapping pieces, one for each possible offset."""
     return np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,))
 
 
 _DIGEST = "sha256"
-_ALIGNMENT = 8  # bytes, of the arrays of a safetensors file
+_ALIGNMENT = 8  # bytes, in safetensors files
 
 
 def write_sealed(arrays: Mapping[str, NDArray[Any]], key: str, text: str) -> bytes:
-    """Return the safetensors file of arrays, with a text and a digest of both."""
-    from safetensors.numpy import save  # noqa: PLC0415  arrays are imported by everything
+    """Return a safetensors file of arrays, with a text and a digest of both."""
+    from safetensors.numpy import save  # noqa: PLC0415  everything imports this module
 
     data = save(dict(arrays), {key: text})
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
-    # Put in here, as safetensors writes several metadata in an order of chance.
+    # Inserted here, as safetensors writes several metadata entries in random order.
     header["__metadata__"][_DIGEST] = _digest(arrays, text)
     own = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
     own += b" " * (-len(own) % _ALIGNMENT)
@@ -79,23 +78,23 @@ def write_sealed(arrays: Mapping[str, NDArray[Any]], key: str, text: str) -> byt
 
 
 def read_sealed(path: Path, data: bytes, key: str) -> tuple[dict[str, NDArray[Any]], str, str]:
-    """Read the bytes of a file; one of before there were digests has none to differ from.
+    """Parse the bytes of an array file; files without digest, from old versions, pass.
 
     Returns
     -------
     text : str
-        Empty if there is none.
+        Empty if the file has none.
     damage : str
-        What is wrong if the digest differs, and what to do; else empty.
+        Error text with advice if the digest differs; otherwise empty.
 
     Raises
     ------
     safetensors.SafetensorError
-        If they are no such file.
+        If the data are no safetensors file.
     KeyError
-        If an array has a type that numpy has not.
+        If numpy does not support the type of an array.
     """
-    from safetensors.numpy import load  # noqa: PLC0415  as above
+    from safetensors.numpy import load  # noqa: PLC0415  everything imports this module
 
     arrays = load(data)
     length = int.from_bytes(data[:8], "little")
@@ -109,8 +108,8 @@ def read_sealed(path: Path, data: bytes, key: str) -> tuple[dict[str, NDArray[An
 def damage(
     path: Path, expected: str, found: str, cure: str = "copy it back from a backup, or make it anew"
 ) -> str:
-    """Return the line about a file whose digest is not what it was written with."""
-    expected = ascii(expected[:12])[1:-1]  # it may be anything
+    """Return the error line for a file with a wrong digest."""
+    expected = ascii(expected[:12])[1:-1]  # it may be any text
     return (
         f"{path}: is not as it was written (digest {found[:12]}, not {expected}): the disk or "
         f"somebody has changed it; {cure}"

@@ -1,4 +1,4 @@
-"""The kernel with which numpy's OpenBLAS multiplies, chosen before numpy is imported."""
+"""Matrix kernel of numpy's OpenBLAS, selected before numpy is imported."""
 
 import os
 from pathlib import Path
@@ -6,19 +6,19 @@ from pathlib import Path
 _VARIABLE = "OPENBLAS_CORETYPE"
 _AVX512 = {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
 _CPU = Path("/proc/cpuinfo")
-_READ_BYTES = 1 << 14  # its first processor
+_READ_BYTES = 1 << 14  # covers the first processor in the file
 
 
 def kernel_environment() -> dict[str, str]:
-    """Return variables with which OpenBLAS takes the fastest kernel that this processor can run.
+    """Return environment variables that select the fastest OpenBLAS kernel of this processor.
 
-    On processors that are newer than itself it takes one without AVX-512, which is half as fast.
+    For processors newer than itself, OpenBLAS selects one without AVX-512, at half the speed.
 
     Returns
     -------
     dict of str to str
-        Empty if the choice is left to OpenBLAS: if the user has chosen, if the processor has no
-        AVX-512, or if that is unknown, as on systems other than Linux.
+        Empty if OpenBLAS should choose: if the user has set a kernel, or the processor has no
+        AVX-512 or is unknown, as on systems other than Linux.
     """
     if _VARIABLE in os.environ or not _flags() >= _AVX512:
         return {}
@@ -26,7 +26,7 @@ def kernel_environment() -> dict[str, str]:
 
 
 def _flags() -> set[str]:
-    """Return what the processor can, in the words of Linux."""
+    """Return the processor's feature flags, in the terms of Linux."""
     try:
         with _CPU.open(encoding="ascii", errors="replace") as file:
             lines = file.read(_READ_BYTES).splitlines()

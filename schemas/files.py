@@ -1,4 +1,4 @@
-"""Files, on this machine or in a store of fsspec, read by ranges or entirely within limits."""
+"""Bounded reading of files, local or in a store of fsspec, by ranges or completely."""
 
 import errno
 import io
@@ -19,9 +19,9 @@ from hearthlog.schemas.errors import HearthlogError, LogError
 
 
 def open_regular(path: Path) -> int:
-    """Open a regular file of this machine for reading.
+    """Open a regular local file for reading.
 
-    Raise `OSError` if it cannot be opened, or is no regular file.
+    Raise `OSError` if the file cannot be opened, or is no regular file.
     """
     mode = os.stat(path).st_mode  # noqa: PTH116  goes with what follows
     if stat.S_ISDIR(mode):
@@ -32,7 +32,7 @@ def open_regular(path: Path) -> int:
 
 
 def exposed_secret(path: Path) -> str:
-    """Return a warning if everybody may read a file of secrets; empty otherwise."""
+    """Return a warning if a file of secrets is readable by everyone; otherwise empty."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -44,12 +44,12 @@ def exposed_secret(path: Path) -> str:
 
 
 def may_be_regular(path: Path) -> bool:
-    """Tell whether a path is that of a regular file, or of one whose kind cannot be found out.
+    """Return whether a path is a regular file, or its kind cannot be determined.
 
     Returns
     -------
     bool
-        True, too, if there is no such file or its folder cannot be read: opening it says why.
+        Also True for a missing file or an unreadable folder: opening it raises the exact error.
     """
     try:
         return stat.S_ISREG(path.stat().st_mode)
@@ -58,20 +58,20 @@ def may_be_regular(path: Path) -> bool:
 
 
 def is_denied(path: str | Path) -> bool:
-    """Return whether there is a file or a folder that this user may not read."""
+    """Return whether a file or a folder exists that this user may not read."""
     if os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):  # noqa: PTH112
         return False
     try:
         os.stat(path)  # noqa: PTH116  a name of one of many
     except PermissionError:
         return True
-    except OSError:  # there is none
+    except OSError:  # it does not exist
         return False
     return True
 
 
 def denied_text(path: str | Path) -> str:
-    """Say whose a file or a folder is that this user may not read, and what to do."""
+    """Return the owner of an unreadable file or folder, and advice."""
     owner = ""
     for place in (Path(path), *Path(path).absolute().parents):
         with suppress(OSError, KeyError):
@@ -86,7 +86,7 @@ def denied_text(path: str | Path) -> str:
 
 _TOML_LIMIT = 1 << 20
 _LINE = re.compile(r"at line (\d+)")
-_HINTS = (  # by what the parser says, and the line it stopped at
+_HINTS = (  # by the parser's message, and the line of the error
     (
         re.compile(r"overwrite|twice|redefine|mutate|duplicate", re.IGNORECASE),
         "; a key or table is given twice",
@@ -112,21 +112,21 @@ _HINTS = (  # by what the parser says, and the line it stopped at
 )
 _UTF_16 = {b"\xff\xfe", b"\xfe\xff"}
 _IS_UTF_16 = "no UTF-8: it is UTF-16"
-_DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of their number
+_DEEPEST = 100  # parts of a dotted key: the parser's time grows with the cube of their number
 
 
 def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
-    """Read a regular file of this machine, or a file of a store.
+    """Read a regular local file, or a file of a store.
 
     Parameters
     ----------
     limit : int
-        Bytes, at most.
+        Maximum size in bytes.
 
     Raises
     ------
     HearthlogError
-        Of the type `error`, if there is no such file, it is larger than the limit, cannot be read,
+        Of the type `error`, if the file does not exist, is larger than the limit, cannot be read,
         or is no regular file.
     """
     try:
@@ -143,7 +143,7 @@ def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -
 
 
 def _opened(path: Path) -> IO[bytes]:
-    """Open a file, which in a store is a regular one."""
+    """Open a file; files of a store are regular."""
     return os.fdopen(open_regular(path), "rb") if is_local(path) else path.open("rb")
 
 
@@ -153,13 +153,13 @@ def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, A
     Raises
     ------
     HearthlogError
-        Of the type `error`, if there is no such file, it is larger than 1 MB, cannot be read, is
-        nested too deeply, or is no TOML in UTF-8.
+        Of the type `error`, if the file does not exist, is larger than 1 MB, cannot be read, is
+        nested too deeply, or is not TOML in UTF-8.
     """
     data = read_whole(path, what, _TOML_LIMIT, error)
     content: dict[str, Any] = {}
     try:
-        text = data.decode("utf-8-sig")  # editors of Windows begin a file with a mark
+        text = data.decode("utf-8-sig")  # editors of Windows write a byte order mark
         keys = (line for line in text.split("\n") if not line.lstrip().startswith("#"))
         if "\0" in text:
             raise error(f"{path}: cannot be read as TOML ({_IS_UTF_16}); save it as UTF-8")
@@ -180,7 +180,7 @@ def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, A
 
 
 def _toml_problem(text: str, reason: ValueError) -> str:
-    """Say what the parser refuses, where, and what to write."""
+    """Return the parser's complaint, its position, and the correct syntax."""
     last = f"at line {text.rstrip().count(chr(10)) + 1}, the last one"
     problem = str(reason).replace("at end of document", last)[:200]
     found = _LINE.search(problem)
@@ -203,10 +203,10 @@ def prefetch(
     Parameters
     ----------
     function : callable
-        Called with one item. Should spend its time where the interpreter is not needed: reading,
-        decompressing, numpy.
+        Called with one item. Should mostly release the interpreter lock: reading, decompression,
+        numpy.
     workers : int
-        Threads, 1 or more; one item more than these is worked on, or waits for the consumer.
+        Number of threads, at least 1; at most `workers + 1` items are in progress or unread.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()
@@ -218,18 +218,18 @@ def prefetch(
             yield waiting.popleft().result()
 
 
-_BLOCK = 1 << 17  # bytes: a store hands them out in hardly more time than a few
+_BLOCK = 1 << 17  # bytes: a store needs little more time for them than for a few
 _KEPT = 4  # blocks
-_ASKED = 8  # files of a store at once
+_ASKED = 8  # concurrent files of a store
 
 
 def is_local(path: object) -> bool:
-    """Tell whether a path is one of this machine."""
+    """Return whether a path is local."""
     return isinstance(path, Path)
 
 
 def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterable[Result]:
-    """Apply a function to logs, in their order."""
+    """Apply a function to logs, in order."""
     if all(map(is_local, logs)):
         return map(function, logs)
     return prefetch(function, logs, _ASKED)
@@ -237,9 +237,9 @@ def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterab
 
 @contextmanager
 def store_errors(path: object) -> Iterator[None]:
-    """Turn errors of a store into LogError while its file or folder is used.
+    """Turn errors of a store into `LogError`.
 
-    Raise `LogError` if the block raises any error but HearthlogError and ImportError, which
+    Raise `LogError` if the block raises any error except HearthlogError and ImportError, which
     pass unchanged.
     """
     try:
@@ -250,7 +250,7 @@ def store_errors(path: object) -> Iterator[None]:
         raise LogError(f"{path}: no such log, folder or bucket") from error
     except PermissionError as error:
         raise LogError(f"{path}: not allowed ({_line(error)}); check the credentials") from error
-    except Exception as error:  # each store has errors of its own, and fsspec passes them on
+    except Exception as error:  # fsspec passes on the error types of each store
         raise LogError(f"{path}: the store cannot be used ({_line(error)})") from error
 
 
@@ -259,9 +259,9 @@ def _line(error: Exception) -> str:
 
 
 class LocalFile:
-    """A file of this machine, open for reading.
+    """Local file, open for reading.
 
-    Raise `LogError` if it cannot be opened, or is no regular file.
+    Raise `LogError` if the file cannot be opened, or is no regular file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -273,7 +273,7 @@ class LocalFile:
 
     @property
     def size(self) -> int:
-        """Bytes of the file as it is now."""
+        """Current size of the file in bytes."""
         return os.fstat(self._descriptor).st_size
 
     def close(self) -> None:
@@ -281,21 +281,14 @@ class LocalFile:
         os.close(self._descriptor)
 
     def is_at(self, path: Path) -> bool:
-        """Tell whether a path leads to this open file, and not to another one or none."""
+        """Return whether a path refers to this open file."""
         try:
             return os.path.samestat(os.fstat(self._descriptor), path.stat())
         except FileNotFoundError:
             return False
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes from an offset on.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file.
-        length : int
-            Bytes to read.
+        """Read bytes at an offset.
 
         Raises
         ------
@@ -308,19 +301,17 @@ class LocalFile:
             raise self._unreadable(error) from error
 
     def read_into(self, out: memoryview, offset: int) -> int:
-        """Read bytes from an offset on into a buffer.
+        """Read bytes at an offset into a buffer.
 
         Parameters
         ----------
         out : memoryview
-            Filled from its beginning; its length in bytes says how many to read.
-        offset : int
-            Byte of the file.
+            Filled from its start; its length is the number of bytes to read.
 
         Returns
         -------
         int
-            Bytes that were read: fewer than there is room for at the end of the file.
+            Number of bytes read: less than the buffer length at the end of the file.
 
         Raises
         ------
@@ -337,9 +328,9 @@ class LocalFile:
 
 
 class StoredFile:
-    """A file of a store, as it is when this is made; may be read from several threads.
+    """Snapshot of a file in a store; may be read from several threads.
 
-    Raise `LogError` if the store does not answer, refuses, or has no file of this name.
+    Raise `LogError` if the store does not answer, refuses, or has no such file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -349,31 +340,24 @@ class StoredFile:
         self._block: Callable[[int], bytes] = lru_cache(_KEPT)(self._read_block)
 
     def close(self) -> None:
-        """Forget what was read; nothing else stays open between two reads."""
+        """Drop the cached blocks; no connection stays open between reads."""
         self._block = self._read_block
 
     def is_at(self, path: Path) -> bool:
-        """Tell whether a path leads to this file, unchanged since it was opened."""
+        """Return whether a path refers to this file, unchanged since it was opened."""
         try:
             return path == self._path and _identity(path) == self._identity
         except LogError:
             return False
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes from an offset on, and keep short pieces with their neighbours for later.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file.
-        length : int
-            Bytes to read.
+        """Read bytes at an offset; cache short reads in blocks.
 
         Raises
         ------
         LogError
-            If the store does not answer, refuses, or returns another number of bytes, as it may do
-            after the file has changed.
+            If the store does not answer, refuses, or returns another number of bytes, for example
+            because the file has changed.
         """
         end = min(offset + length, self.size)
         if end - offset >= _BLOCK:
@@ -383,25 +367,23 @@ class StoredFile:
         return read[offset % _BLOCK :][: max(end - offset, 0)]
 
     def read_into(self, out: memoryview, offset: int) -> int:
-        """Read bytes from an offset on into a buffer.
+        """Read bytes at an offset into a buffer.
 
         Parameters
         ----------
         out : memoryview
-            Filled from its beginning; its length in bytes says how many to read.
-        offset : int
-            Byte of the file.
+            Filled from its start; its length is the number of bytes to read.
 
         Returns
         -------
         int
-            Bytes that were read: fewer than there is room for at the end of the file.
+            Number of bytes read: less than the buffer length at the end of the file.
 
         Raises
         ------
         LogError
-            If the store does not answer, refuses, or returns another number of bytes, as it may do
-            after the file has changed.
+            If the store does not answer, refuses, or returns another number of bytes, for example
+            because the file has changed.
         """
         read = self.read(offset, len(out))
         out[: len(read)] = read
@@ -423,7 +405,7 @@ class StoredFile:
 
 
 def _identity(path: Any) -> dict[str, Any]:
-    """Ask a store what it says of a file: its size, and what tells it from another one."""
+    """Return size and version identifiers of a file in a store."""
     with store_errors(path):
         info = path.fs.info(path.path)
         if info["type"] != "file" or info["size"] is None:
@@ -440,13 +422,7 @@ def open_file(path: Path) -> LocalFile | StoredFile:
 
 
 class Section(io.RawIOBase):
-    """A file from some byte on, as a stream.
-
-    Parameters
-    ----------
-    start : int
-        Byte of the file at which the stream begins.
-    """
+    """Stream over a file from byte `start` to its end."""
 
     def __init__(self, file: LocalFile | StoredFile, start: int) -> None:
         super().__init__()
@@ -454,7 +430,7 @@ class Section(io.RawIOBase):
         self._position = start
 
     def readable(self) -> bool:
-        """Return True: a section can be read."""
+        """Return True: a section is readable."""
         return True
 
     def readinto(self, out: Any) -> int:
@@ -463,12 +439,12 @@ class Section(io.RawIOBase):
         Parameters
         ----------
         out : buffer
-            Filled from its beginning; its length in bytes says how many to read.
+            Filled from its start; its length is the number of bytes to read.
 
         Returns
         -------
         int
-            Bytes that were read; 0 at the end of the file.
+            Number of bytes read; 0 at the end of the file.
 
         Raises
         ------

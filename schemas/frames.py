@@ -1,18 +1,18 @@
-"""The frame, the step in which every log counts time, and times as text.
+"""Frames, the time step of all logs, and times as text.
 
-What is computed from a frame is a feature set's own concern; its length is the same for all logs.
+Feature sets define what is computed from a frame; its length is the same for all logs.
 """
 
 import re
 from datetime import UTC, datetime, timedelta
 
-NANOSECONDS = 1_000_000_000  # of a second
+NANOSECONDS = 1_000_000_000  # per second
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
 
 
 def read_time(text: str) -> int:
-    """Read a time in ISO 8601.
+    """Parse a time in ISO 8601.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ def read_time(text: str) -> int:
     Raises
     ------
     ValueError
-        If the text is no time.
+        If the text is not a time.
     """
-    rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for them
+    rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for these digits
     moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
@@ -39,7 +39,7 @@ def read_time(text: str) -> int:
 
 
 def millisecond_text(nanoseconds: int) -> str:
-    """Write a time in UTC, down to the millisecond.
+    """Format a time in UTC, to the millisecond.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def millisecond_text(nanoseconds: int) -> str:
 
 
 def time_text(nanoseconds: int) -> str:
-    """Write a time in UTC, with all nine decimals of its seconds.
+    """Format a time in UTC, with nine decimals.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def time_text(nanoseconds: int) -> str:
 
 
 def seconds_text(nanoseconds: int) -> str:
-    """Write a duration or a time in seconds, with all nine decimals.
+    """Format a duration or a time in seconds, with nine decimals.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""New files: whole or not there at all, on this machine and in a store.
+"""Creation of files that are complete or absent, locally and in a store.
 
-They are the account's alone, whatever its umask is: what comes from a home is private. Those that
-belong to a log may be read by whoever may read that log. What root makes goes to the account that
-the folder belongs to, and no link that this account may have put there is followed.
+Files are private to the account regardless of its umask, as data of a home are private. Files
+of a log are readable by the readers of the log. Files created by root are handed to the owner of
+the folder, and links that this account may have placed there are not followed.
 """
 
 import errno
@@ -20,19 +20,19 @@ from typing import Any, BinaryIO
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import is_local, store_errors
 
-_AT_ONCE = 8  # files that are synced: one after the other takes a disk milliseconds for each
+_AT_ONCE = 8  # files synced in parallel: one after the other takes milliseconds each
 _READERS = stat.S_IRGRP | stat.S_IROTH
-_LOOKUP: int = getattr(os, "O_PATH", os.O_RDONLY)  # wants no right to read a folder
+_LOOKUP: int = getattr(os, "O_PATH", os.O_RDONLY)  # needs no read permission for the folder
 
 
 def sync_file(path: Path) -> None:
-    """Make what was written to a file survive a power cut."""
+    """Flush the content of a file to disk, to survive a power cut."""
     with path.open("rb") as stream:
         os.fsync(stream.fileno())
 
 
 def sync_folder(folder: Path) -> None:
-    """Make what was created or renamed in a folder survive a power cut."""
+    """Flush the entries of a folder to disk, to survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -41,7 +41,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def readers_of(path: Path) -> int:
-    """Return the rights of others to read a file or a folder; none where it is not known."""
+    """Return the group and other read permissions of a file or a folder; 0 if unknown."""
     try:
         return path.stat().st_mode & _READERS if is_local(path) else 0
     except OSError:
@@ -49,17 +49,17 @@ def readers_of(path: Path) -> int:
 
 
 def private_folder(path: Path, *, readers: int = 0) -> None:
-    """Make a folder, and those around it, for this account alone; those that are there stay.
+    """Create a folder and its parents, private to this account; existing ones are unchanged.
 
-    Raise `OSError` if it cannot be made.
+    Raise `OSError` if the folder cannot be created.
     """
     make_folders(path, 0o700 | readers | readers >> 2)
 
 
 def make_folders(path: Path, mode: int | None = None) -> None:
-    """Make a folder, and those around it; those that are there stay.
+    """Create a folder and its parents; existing ones are unchanged.
 
-    Raise `OSError` if it cannot be made.
+    Raise `OSError` if the folder cannot be created.
     """
     if path.is_dir():
         return
@@ -69,10 +69,10 @@ def make_folders(path: Path, mode: int | None = None) -> None:
 
 
 def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
-    """Create a file of this machine for writing, never one that a link leads to.
+    """Create a local file for writing, without following links.
 
-    Raise `FileExistsError` if something of this name exists, even a link that leads nowhere.
-    Raise `OSError` if it cannot be created.
+    Raise `FileExistsError` if the name exists, even as a dangling link.
+    Raise `OSError` if the file cannot be created.
     """
     descriptor, folder = _open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     _set_owner(descriptor, folder)
@@ -80,13 +80,13 @@ def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
 
 
 def open_lock(path: Path) -> int:
-    """Open a file to lock it, for reading and writing; make it if it is not there.
+    """Open a lock file for reading and writing; create a missing one.
 
-    Raise `OSError` if it cannot be opened, is a link or no regular file.
+    Raise `OSError` if the file cannot be opened, is a link or no regular file.
     """
     descriptor, folder = _open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600)
     opened = os.fstat(descriptor)
-    # Root writes to no file of others that was linked here.
+    # Root writes to no file of others that is linked here.
     is_linked = opened.st_nlink > 1 and opened.st_uid != folder.st_uid and os.geteuid() == 0
     if not stat.S_ISREG(opened.st_mode) or is_linked:
         os.close(descriptor)
@@ -96,22 +96,22 @@ def open_lock(path: Path) -> int:
 
 
 def hand_over(path: Path, mode: int | None = None) -> None:
-    """Set the rights of what was made, which root gives to whom the folder around it belongs to.
+    """Set the permissions of a new file or folder; root also gives it to the owner of its parent.
 
     Parameters
     ----------
     path : Path
-        A file or a folder of this machine; a link is not followed.
+        Local file or folder; a link is not followed.
 
     Raises
     ------
     OSError
-        If it is not there, or is a link.
+        If the path does not exist, or is a link.
     """
     descriptor, folder = _open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         if mode is not None and _is_own(os.fstat(descriptor)):
-            with suppress(OSError):  # a disk without rights
+            with suppress(OSError):  # file system without permissions
                 os.fchmod(descriptor, mode)
         _set_owner(descriptor, folder)
     finally:
@@ -119,14 +119,14 @@ def hand_over(path: Path, mode: int | None = None) -> None:
 
 
 def _open(path: Path, flags: int, mode: int = 0) -> tuple[int, os.stat_result]:
-    """Open what has a name, no link, and return the status of its folder, too."""
-    # The folder is opened once: another one may get its name while this runs.
+    """Open a path that is no link; also return the status of its folder."""
+    # The folder is opened once: another folder may take its name meanwhile.
     folder = os.open(path.parent, _LOOKUP | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         descriptor = os.open(path.name, flags | os.O_NOFOLLOW | os.O_CLOEXEC, mode, dir_fd=folder)
         return descriptor, os.fstat(folder)
     except OSError as error:
-        error.filename = str(path)  # which names the file alone
+        error.filename = str(path)  # instead of the file name only
         raise
     finally:
         os.close(folder)
@@ -135,23 +135,23 @@ def _open(path: Path, flags: int, mode: int = 0) -> tuple[int, os.stat_result]:
 def _set_owner(descriptor: int, folder: os.stat_result) -> None:
     made = os.fstat(descriptor)
     if os.geteuid() == 0 and folder.st_uid != 0 and made.st_uid == 0 and _is_own(made):
-        with suppress(OSError):  # a disk without owners
+        with suppress(OSError):  # file system without owners
             os.fchown(descriptor, folder.st_uid, folder.st_gid)
 
 
 def _is_own(made: os.stat_result) -> bool:
-    """Return whether it has one name; else somebody could have linked it here to be given it."""
+    """Return whether a file has one name; otherwise, it may be a foreign file linked here."""
     return stat.S_ISDIR(made.st_mode) or made.st_nlink == 1
 
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Hold a lock on a folder, which keeps out other processes that lock it.
+    """Hold a lock on a folder against other processes that lock it.
 
     Parameters
     ----------
     folder : Path
-        A folder of this machine. The lock is waited for without limit.
+        Local folder. The wait for the lock is unlimited.
 
     Raises
     ------
@@ -167,13 +167,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 
 def check_new(path: Path) -> None:
-    """Check that a file or folder can be made under this name.
+    """Check that a file or folder can be created at a path.
 
-    Whether a store lets us write is known only when we do.
+    Write permission in a store is only known after a write.
 
-    Raise `LogError` if something of this name exists; on this machine, also if the folder
-    around it does not exist or cannot be written to; in a store, also if it does not answer or
-    refuses.
+    Raise `LogError` if the path exists; locally, also if its parent does not exist or is not
+    writable; in a store, also if it does not answer or refuses.
     """
     if not is_local(path):
         stored: Any = path
@@ -196,14 +195,14 @@ def _exists(path: Path) -> LogError:
 
 @contextmanager
 def new_file(path: Path, *, readers: int = 0) -> Iterator[Path]:
-    """Make a file under a temporary name, and give it its own if the block raises no error.
+    """Create a file under a temporary name, and rename it if the block raises no error.
 
-    For a path in a store the temporary file is one of this machine, and is put there at the end.
-    S3 shows it whole or not at all, and refuses to put it over another one. That is not sure of
-    every store: between a last look and the end of putting, another file of this name may be
-    replaced, and a store that has real folders may keep a part of a file when it is cut off.
+    For a path in a store the temporary file is local, and is uploaded at the end. S3 shows the
+    file complete or not at all, and refuses to overwrite. Other stores may not: a file created
+    between the last check and the end of the upload may be overwritten, and a store with real
+    folders may keep a part of an interrupted upload.
 
-    Raise `LogError` if there is such a file already, or if it cannot be written.
+    Raise `LogError` if the file exists, or cannot be written.
     """
     check_new(path)
     put = (
@@ -215,9 +214,9 @@ def new_file(path: Path, *, readers: int = 0) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path, *, readers: int | None = None) -> Iterator[Path]:
-    """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
+    """Create a file as `new_file` does, but atomically replace an existing one.
 
-    Raise `LogError` if it cannot be written.
+    Raise `LogError` if the file cannot be written.
     """
     rights = readers_of(path) if readers is None else readers
     put = (
@@ -229,21 +228,21 @@ def replaced_file(path: Path, *, readers: int | None = None) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Make a folder under a temporary name, and give it its own if the block raises no error.
+    """Create a folder under a temporary name, and rename it if the block raises no error.
 
-    Raise `LogError` if something of this name exists, or the folder cannot be written.
+    Raise `LogError` if the name exists, or the folder cannot be written.
     """
     check_new(path)
     with _temporary(path) as temporary:
         temporary.mkdir(mode=0o700)
         yield temporary
-        hand_over(temporary, 0o700)  # before the files, which go to whom it belongs to
+        hand_over(temporary, 0o700)  # before its files, which inherit the owner
         for file in temporary.iterdir():
             hand_over(file, 0o600)
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             list(pool.map(sync_file, temporary.iterdir()))
         sync_folder(temporary)
-        path.mkdir()  # the name is ours now; only an empty folder is replaced
+        path.mkdir()  # reserves the name; a rename replaces only an empty folder
         temporary.replace(path)
         sync_folder(path.parent)
 
@@ -263,7 +262,7 @@ def _put_in_place(path: Path, readers: int, *, new: bool) -> Iterator[Path]:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Name a temporary file or folder beside a path, and remove what is left of it."""
+    """Yield a temporary path next to a path, and remove its remains at the end."""
     temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
     try:
         yield temporary
@@ -279,7 +278,7 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 
 def _name(temporary: Path, path: Path) -> None:
-    """Give a file its name, which unlike a rename never takes it from another file."""
+    """Rename a temporary file without ever replacing another file."""
     try:
         path.hardlink_to(temporary)
     except FileExistsError:
@@ -303,7 +302,7 @@ def _put_in_store(path: Any, *, new: bool) -> Iterator[Path]:
 
 def _put(file: Path, path: Any, *, new: bool) -> None:
     if new:
-        check_new(path)  # again: not every store minds `create`
+        check_new(path)  # again: some stores ignore `create`
     try:
         path.fs.put_file(str(file), path.path, mode="create" if new else "overwrite")
     except FileExistsError as error:

@@ -1,1 +1,1 @@
-"""Logs: their files, what is written into them, messages as columns, a log that grows."""
+"""Log files, writers, columnar reading, and following of growing logs."""

@@ -1,4 +1,4 @@
-"""Read topics of logs as columns, in the order of time and within bounded memory."""
+"""Topics of logs as columns, ordered by time and read in bounded memory."""
 
 import warnings
 from collections import Counter, defaultdict
@@ -37,13 +37,13 @@ _HEADS = ("log_times", "publish_times", "sequences")
 
 @dataclass(frozen=True)
 class Columns:
-    """Messages of one topic as arrays, one row each.
+    """Messages of one topic as arrays with one row per message.
 
-    `columns["values"]` is the column of a field, by its path ("header.stamp" for one of a message
-    in the message): numbers as they are; stamps and durations as int64 nanoseconds; strings as
-    `str` objects; arrays as one row each, or as objects where their lengths differ; arrays of
-    messages as lists of dicts. Of our types these are the fields that this version has: what a log
-    of an older one lacks has its default, and what a newer one appended is not there.
+    `columns["values"]` is the column of a field, by its path ("header.stamp" for a field of a
+    nested message): numbers unchanged; stamps and durations as int64 nanoseconds; strings as
+    `str` objects; arrays as one row each, or as objects if their lengths differ; arrays of
+    messages as lists of dicts. Hearthlog types have the fields of this version: fields missing
+    in an older log have their defaults, and fields appended by a newer version are omitted.
 
     Attributes
     ----------
@@ -99,12 +99,12 @@ class Columns:
         return self.take(rows)
 
     def take(self, rows: slice | NDArray[np.intp]) -> "Columns":
-        """Return some of the messages.
+        """Return the messages with the given indices.
 
         Parameters
         ----------
         rows : slice or np.ndarray [shape=(m,)], intp
-            Their indices; log times must still ascend.
+            Indices of messages; log times must remain ascending.
         """
         return replace(
             self,
@@ -124,32 +124,32 @@ def read_columns(  # noqa: PLR0913
     *,
     on_damage: OnDamage | None = None,
 ) -> dict[str, Columns]:
-    """Read topics of some logs as one series each.
+    """Read topics of logs as one series per topic.
 
     Parameters
     ----------
     logs : iterable of Path
     topics : collection of str or callable, optional
-        Names of the topics, or what tells whether one is read; all by default.
+        Names of the topics, or a predicate; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
     on_damage : callable, optional
-        Told of a log, and of a chunk of it that is damaged and left out. By default the error is
-        raised.
+        Called with a log and the error of a damaged chunk, which is skipped. By default the error
+        is raised.
 
     Returns
     -------
     dict of str to Columns
-        By topic; a topic without a message is not there. Where the files of a topic do not agree
-        on its metadata, or on its fields, only what they agree on is kept. What cannot be decoded
-        is left out, with a `HearthlogWarning`, as `decode_readable` does.
+        By topic, without topics that have no messages. If the files of a topic differ in metadata
+        or fields, only the common entries are kept. Undecodable messages are skipped with a
+        `HearthlogWarning`, as in `decode_readable`.
 
     Raises
     ------
     LogError
-        If a log cannot be read or is damaged, or if two logs have different types on one topic.
+        If a log cannot be read or is damaged, or two logs have different types on one topic.
     """
     logs = list(logs)
     whole = start is None and end is None
@@ -171,7 +171,7 @@ def iterate_columns(  # noqa: PLR0913
     *,
     on_damage: OnDamage | None = None,
 ) -> Iterator[list[Columns]]:
-    """Read topics of some logs piece by piece.
+    """Read topics of logs piece by piece.
 
     Parameters
     ----------
@@ -181,9 +181,9 @@ def iterate_columns(  # noqa: PLR0913
     Yields
     ------
     list of Columns
-        The next span of time: one for each topic that speaks in it, or more where its channels
-        differ in type, fields or metadata. Nothing is older than what was yielded before. What
-        cannot be decoded is left out, with a `HearthlogWarning`, as `decode_readable` does.
+        The next span of time: one item for each topic with messages in it, or more if its channels
+        differ in type, fields or metadata. No message is older than those yielded before.
+        Undecodable messages are skipped with a `HearthlogWarning`, as in `decode_readable`.
 
     Raises
     ------
@@ -212,8 +212,8 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
     Raises
     ------
     LogError
-        If they are not of the type that their channel says, or not encoded as CDR, or if the
-        definition of that type cannot be understood.
+        If messages are not of the type of their channel, or not encoded as CDR, or the definition
+        of the type cannot be parsed.
     """
     return _joined([_decode(raw, fields) for raw in messages])
 
@@ -221,28 +221,25 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
 def decode_readable(
     messages: Iterable[RawMessages], fields: Collection[str] | None = None
 ) -> list[Columns]:
-    """Decode messages as `decode` does, and leave out those that cannot be decoded.
+    """Decode messages as `decode` does, but skip undecodable ones.
 
-    Each topic that loses messages is named by a `HearthlogWarning`. In strings that are not UTF-8,
-    U+FFFD stands for what cannot be read.
+    A `HearthlogWarning` names each topic that loses messages. In strings that are not UTF-8,
+    U+FFFD replaces invalid bytes.
 
     Returns
     -------
     list of Columns
-        In the order of their first messages in `messages`; nothing for a channel of which no
-        message is left.
+        In the order of their first messages in `messages`, without channels that have no decodable
+        message.
     """
     decoded = (_decode_readable(raw, fields) for raw in messages)
     return _joined([_with_known_times(columns) for columns in decoded if columns is not None])
 
 
 def unreadable(channel: Channel, schema: Schema | None) -> str:
-    """Say why no message of a channel can be decoded; empty if its definition can be understood.
+    """Return why no message of a channel can be decoded; empty if its definition is valid.
 
-    Parameters
-    ----------
-    schema : Schema or None
-        Of the channel; None if it has none.
+    `schema` is None for a channel without schema.
     """
     if schema is None or channel.message_encoding != "cdr":
         return f"holds no ROS 2 messages ({channel.message_encoding!r})"
@@ -251,7 +248,7 @@ def unreadable(channel: Channel, schema: Schema | None) -> str:
 
 @lru_cache(_DEFINITIONS_KEPT)
 def definition_fault(name: str, encoding: str, text: bytes) -> str:
-    """Say why messages of a type cannot be decoded as it is defined; empty if they can."""
+    """Return why messages with this definition cannot be decoded; empty if they can."""
     try:
         kind = message_type(name, encoding, text)
         fields_of(kind)
@@ -262,7 +259,7 @@ def definition_fault(name: str, encoding: str, text: bytes) -> str:
 
 
 def leave_out(topic: str, why: str) -> None:
-    """Warn that a topic is left out."""
+    """Warn that a topic is skipped."""
     text = f"{why}: left out; --topics chooses others"
     warnings.warn(HearthlogWarning(text, topic, each=True), stacklevel=2)
 
@@ -287,12 +284,12 @@ def _decode_readable(raw: RawMessages, fields: Collection[str] | None) -> Column
 
 
 def faults(raw: RawMessages) -> dict[int, LogError]:
-    """Say what is wrong with each message that is not of its type.
+    """Return the error of each message that does not match its type.
 
     Returns
     -------
     dict of int to LogError
-        By place among these messages, ascending.
+        By index among these messages, ascending.
     """
     assert raw.schema is not None
     kind = message_type(raw.schema.name, raw.schema.encoding, raw.schema.data)
@@ -300,7 +297,7 @@ def faults(raw: RawMessages) -> dict[int, LogError]:
 
 
 def without_unreadable(raw: RawMessages) -> RawMessages:
-    """Leave out messages that are not of their type; warn of the first of them."""
+    """Skip messages that do not match their type; warn of the first of them."""
     errors = faults(raw)
     if not errors:
         return raw
@@ -312,7 +309,7 @@ def without_unreadable(raw: RawMessages) -> RawMessages:
 
 
 def _joined(pieces: Iterable[Columns]) -> list[Columns]:
-    """Join pieces of one topic, type, fields and metadata, in the order of time."""
+    """Join pieces with equal topic, type, fields and metadata, in order of time."""
     parts: dict[Any, list[Columns]] = {}
     for columns in pieces:
         metadata = tuple(sorted(columns.metadata.items()))
@@ -348,8 +345,8 @@ def _decode(
 
 
 def _with_known_times(columns: Columns) -> Columns:
-    """Put the last time that there is in the place of later publish times, with a warning."""
-    late = columns.publish_times < 0  # 2**63 or more, in the file
+    """Replace publish times beyond the int64 range by its maximum, with a warning."""
+    late = columns.publish_times < 0  # 2**63 or more in the file
     if not late.any():
         return columns
     text = "publish times after the year 2262 are not known here: 2262-04-11 stands for them"
@@ -358,17 +355,17 @@ def _with_known_times(columns: Columns) -> Columns:
 
 
 def join(parts: Sequence[Columns]) -> Columns:
-    """Put pieces of one topic one after the other, with the fields that all of them have.
+    """Concatenate pieces of one topic, with the fields that all pieces have.
 
     Parameters
     ----------
     parts : sequence of Columns
-        At least one, in the order of time.
+        At least one, in order of time.
 
     Raises
     ------
     LogError
-        If they are of different types.
+        If the pieces have different types.
     """
     builder = _ColumnBuilder()
     for part in parts:
@@ -377,7 +374,7 @@ def join(parts: Sequence[Columns]) -> Columns:
 
 
 class _ColumnBuilder:
-    """Pieces of one topic, until they are joined."""
+    """Accumulator of pieces of one topic."""
 
     def __init__(self, expected: int = 0) -> None:
         self._expected = expected
@@ -387,7 +384,7 @@ class _ColumnBuilder:
         self._fields: dict[str, _Growing] = {}
 
     def add(self, part: Columns) -> None:
-        """Append a piece; it must be of the type of the others."""
+        """Append a piece of the same type."""
         if self._first is None:
             self._first, self._metadata = part, dict(part.metadata)
             self._fields = {path: _Growing(self._expected) for path in part.fields}
@@ -402,7 +399,7 @@ class _ColumnBuilder:
             growing.append(part.fields[path])
 
     def columns(self) -> Columns:
-        """Return all pieces as one; they are gone then."""
+        """Return all pieces as one, and clear the builder."""
         assert self._first is not None
         heads: Any = {name: growing.joined() for name, growing in self._heads.items()}
         fields = {path: growing.joined() for path, growing in self._fields.items()}
@@ -410,10 +407,10 @@ class _ColumnBuilder:
 
 
 class _Growing:
-    """An array that grows.
+    """Growing array.
 
-    Fresh memory is what takes the time, and numpy asks for large pages where it makes a large
-    array: one of the right size at once is written twice as fast as one that is put together.
+    Fresh memory dominates the time, and numpy requests large pages for large arrays: one
+    allocation of the right size is written twice as fast as a concatenation.
     """
 
     def __init__(self, expected: int) -> None:
@@ -422,7 +419,7 @@ class _Growing:
         self._count = 0
 
     def append(self, values: NDArray[Any]) -> None:
-        """Append rows; where their dtype or shape is another, rows become objects."""
+        """Append rows; if dtype or shape differ, rows become objects."""
         kept = self._values
         if kept is not None and (kept.dtype, kept.shape[1:]) != (values.dtype, values.shape[1:]):
             kept, values = ragged(kept[: self._count]), ragged(values)
@@ -431,7 +428,7 @@ class _Growing:
             rows = end if kept is None and end >= self._expected else max(2 * end, self._expected)
             try:
                 grown = np.empty((rows, *values.shape[1:]), values.dtype)
-            except MemoryError:  # what a file says of itself need not be true
+            except MemoryError:  # a file may state any size
                 grown = np.empty((end, *values.shape[1:]), values.dtype)
             if kept is not None:
                 grown[: self._count] = kept[: self._count]

@@ -21,9 +21,9 @@ from hearthlog.schemas.messages.topics import is_sound
 
 
 class Status(NamedTuple):
-    """What a part of the box said of itself, at a log time (ns of UTC).
+    """Health status of a component of the recorder, at a log time (ns of UTC).
 
-    `level` is that of `diagnostic_msgs/DiagnosticStatus`: 0 is well, higher is worse.
+    `level` is that of `diagnostic_msgs/DiagnosticStatus`: 0 is OK, higher is worse.
     """
 
     name: str
@@ -57,13 +57,13 @@ FIELDS: Mapping[str, Collection[str]] = {
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
     message_types.DIAGNOSTICS: ("status",),
 }
-_UNSURE = 0.5  # of a segment with a lower confidence another label is likelier than its own
+_UNSURE = 0.5  # below this confidence, another label is likelier than that of the segment
 
 IsReadable = Callable[[Channel, Schema | None, str, Collection[str]], bool]
 
 
 class TopicContents(NamedTuple):
-    """Messages of a topic, bytes of their payloads, and their first and last log time (ns)."""
+    """Message count of a topic, bytes of the payloads, and first and last log time (ns)."""
 
     messages: int
     bytes: int
@@ -72,7 +72,7 @@ class TopicContents(NamedTuple):
 
 
 class LoggedGap(NamedTuple):
-    """Audio that was not heard: when (ns of UTC), for how long (s), and why."""
+    """Gap in the audio: start (ns of UTC), duration (s), and reason."""
 
     microphone: str
     start: int
@@ -83,24 +83,24 @@ class LoggedGap(NamedTuple):
 
 @dataclass
 class LogContents:
-    """What the messages of a log say, by microphone; of a layer, by the name of its topic."""
+    """Summary of the messages of a log by microphone; of a layer, by topic name."""
 
     topics: dict[str, TopicContents] = field(default_factory=dict)
     frames: dict[str, Counter[str]] = field(default_factory=dict)  # by label
-    segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number, by label
-    seconds: dict[str, Counter[str]] = field(default_factory=dict)  # of segments, by label
-    # `segments` and `seconds` of sounds whose labels are likelier wrong than right
+    segments: dict[str, Counter[str]] = field(default_factory=dict)  # number by label
+    seconds: dict[str, Counter[str]] = field(default_factory=dict)  # duration of segments by label
+    # `segments` and `seconds` of sounds with labels that are likelier wrong than right
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
     gaps: list[LoggedGap] = field(default_factory=list)
     streams: list[dict[str, Any]] = field(default_factory=list)  # with the keys of `STREAM`
-    health: Status | None = None  # the worst that was said, and of that the last
-    # the last that each part of the box said; not in what a log says of itself
+    health: Status | None = None  # the worst status, and the last of equal ones
+    # last status of each component; not in the contents record
     last: dict[str, Status] = field(default_factory=dict, compare=False)
 
     def add(self, batch: Sequence[RawMessages], readable: IsReadable | None = None) -> None:
-        """Count some messages.
+        """Add messages to the summary.
 
-        Raise `LogError` if a message is not of the type that its channel says.
+        Raise `LogError` if a message does not match the type of its channel.
         """
         for raw in batch:
             self._add_topic(raw)
@@ -108,7 +108,7 @@ class LogContents:
             self._add(columns)
 
     def differing(self, other: "LogContents") -> list[str]:
-        """Name what is counted otherwise elsewhere; the order of gaps makes no difference."""
+        """List the names of counts that differ from another summary, ignoring the order of gaps."""
         mine, theirs = (replace(each, gaps=sorted(each.gaps)) for each in (self, other))
         names = [each.name for each in fields(LogContents) if each.compare]
         return [name for name in names if getattr(mine, name) != getattr(theirs, name)]
@@ -163,19 +163,19 @@ class LogContents:
 
 
 def is_review(microphone: str) -> bool:
-    """Tell whether what stands for a microphone is a layer of marks."""
+    """Return whether a key in place of a microphone is a review layer."""
     return topics.is_review(microphone.partition("/")[2])
 
 
 def is_readable(
     channel: Channel, schema: Schema | None, type_: str, paths: Collection[str]
 ) -> bool:
-    """Tell whether a channel has messages of a type, from which some fields can be read.
+    """Return whether a channel has messages of a type with the required fields.
 
     Parameters
     ----------
     schema : Schema or None
-        Of the channel; None if it has none.
+        None for a channel without schema.
     """
     if schema is None or schema.name != type_ or channel.message_encoding != "cdr":
         return False
@@ -185,12 +185,12 @@ def is_readable(
 def has_contents(
     channel: Channel, schema: Schema | None, readable: IsReadable = is_readable
 ) -> bool:
-    """Tell whether `LogContents` reads the messages of a channel.
+    """Return whether `LogContents` reads the messages of a channel.
 
     Parameters
     ----------
     schema : Schema or None
-        Of the channel; None if it has none.
+        None for a channel without schema.
     """
     return any(readable(channel, schema, *kind) for kind in FIELDS.items())
 
@@ -206,14 +206,14 @@ def _counter(counters: dict[str, Counter[str]], name: str) -> Counter[str]:
 
 
 CONTENTS_METADATA = "hearthlog_contents"
-_VERSION = "1"  # another one is not read
+_VERSION = "1"  # other versions are not read
 _LARGEST = 1 << 16  # bytes of the text
-_ROOM = 1 << 10  # bytes of the rest of the record, at most
+_ROOM = 1 << 10  # maximum bytes of the rest of the record
 _MOST = 1 << 63
 
 
 def as_metadata(contents: LogContents) -> dict[str, str] | None:
-    """Make the record; None if it would be large."""
+    """Build the contents record; None if it would be large."""
     text = json.dumps(
         {
             "topics": contents.topics,
@@ -232,12 +232,12 @@ def as_metadata(contents: LogContents) -> dict[str, str] | None:
 
 
 def stated_contents(file: LogFile) -> LogContents | None:
-    """Read what a finished log says of its messages.
+    """Read the contents record of a finished log.
 
     Returns
     -------
     Contents or None
-        None if it says nothing, or what does not fit its statistics: its messages tell it then.
+        None without a record, or if it contradicts the statistics: the messages must be counted.
 
     Raises
     ------
@@ -247,7 +247,7 @@ def stated_contents(file: LogFile) -> LogContents | None:
     places = [place for place in file.record_locations if place.opcode == Opcode.METADATA]
     if file.statistics is None or not places or places[-1].length > _LARGEST + _ROOM:
         return None
-    record = file.record(places[-1])  # the writer has put it there
+    record = file.record(places[-1])  # position at which the writer puts the record
     if not isinstance(record, Metadata) or record.name != CONTENTS_METADATA:
         return None
     contents = from_metadata(record.metadata)
@@ -255,12 +255,12 @@ def stated_contents(file: LogFile) -> LogContents | None:
 
 
 def from_metadata(record: Mapping[str, str]) -> LogContents | None:
-    """Read the record; None if it is damaged, or of another version.
+    """Parse the contents record; None if it is damaged, or of another version.
 
     Parameters
     ----------
     record : mapping of str to str
-        From any file: what it holds is checked for its form, not for its truth.
+        From an untrusted file: the form is checked, but not the truth.
     """
     text = record.get("contents", "")
     if record.get("version") != _VERSION or record.get("sha256") != _digest(text):
@@ -322,12 +322,12 @@ def _count(value: Any) -> int:
 def _amount(value: Any) -> float:
     if type(value) not in {int, float} or not math.isfinite(value) or abs(value) >= _MOST:
         raise ValueError(value)
-    number: float = value  # a sum of nothing is the integer 0
+    number: float = value  # an empty sum is the integer 0
     return number
 
 
 def _fits(file: LogFile, contents: LogContents) -> bool:
-    """Compare what a file says of its messages with its statistics."""
+    """Compare the contents record of a file with its statistics."""
     statistics = file.statistics
     assert statistics is not None
     counts: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""Log files: `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap` in UTC, and their time spans."""
+"""Log files `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap` (UTC) and their time spans."""
 
 import os
 import re
@@ -49,19 +49,19 @@ from hearthlog.schemas.new_files import readers_of
 
 SUFFIX = ".mcap"
 AUDIO_LAYER, REVIEW_LAYER = "audio", "review"
-RELABEL_LAYER = "relabel-"  # and the name of a model
+RELABEL_LAYER = "relabel-"  # followed by the name of a model
 AUDIO_SUFFIX = f".{AUDIO_LAYER}{SUFFIX}"
 _NAME = re.compile(rf"(.+?)(?:\.({RELABEL_LAYER}.+|{REVIEW_LAYER}|{AUDIO_LAYER}))?", re.DOTALL)
 _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
-CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder: itself a folder of parts
-CATALOG_INDEX = "catalog.index"  # of their spans of time, beside it
-ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
-_LOOKED_AT = 1000  # entries of a folder without logs
-CUT = "_cut"  # ends the name of one that is a span of a log, without its suffix
+CATALOG = "catalog.parquet"  # in the folder of its logs: itself a folder of shards
+CATALOG_INDEX = "catalog.index"  # time spans of the logs in the catalog, next to it
+ENROLLED = "enrolled"  # folder of training sounds among the logs of a home
+_LOOKED_AT = 1000  # maximum number of entries inspected in a folder without logs
+CUT = "_cut"  # ends the name, without suffix, of a file cut from a log
 
 
 def check_node_name(name: str) -> str:
-    """Return the name of a node if a file name can begin with it everywhere.
+    """Return the name of a node if it is valid at the start of a file name on all systems.
 
     Parameters
     ----------
@@ -82,28 +82,28 @@ def check_node_name(name: str) -> str:
 
 
 def is_node_name(name: str) -> bool:
-    """Return whether `check_node_name` takes a name."""
+    """Return whether a name passes `check_node_name`."""
     return re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name) is not None
 
 
 def log_path(root: Path, node: str, start: int) -> Path:
-    """Name the log of a node that begins at a time."""
+    """Return the path of the log of a node that starts at a time."""
     moment = datetime.fromtimestamp(start // NANOSECONDS, UTC)
     return root / f"{moment:%Y/%m/%d}" / f"{node}_{moment:%Y%m%dT%H%M%SZ}{SUFFIX}"
 
 
 def free_log_path(root: Path, node: str, start: int) -> Path:
-    """Name the log of a node that begins at a time, as no other log is named."""
+    """Return an unused path for the log of a node that starts at a time."""
     path = first = log_path(root, node, start)
     for number in count(2):
         if not (path.exists() or active_path(path).exists()):
             break
-        path = first.with_name(f"{stem(first)}_{number}{SUFFIX}")  # '_' is behind '.'
+        path = first.with_name(f"{stem(first)}_{number}{SUFFIX}")  # '_' sorts behind '.'
     return path
 
 
 def log_readers(folder: Path) -> int:
-    """Return the rights of others to read new logs in a folder, as `readers_of` does."""
+    """Return the group and other read permissions of new logs in a folder, as `readers_of` does."""
     if not (is_local(folder) and folder.is_dir()):
         return 0
     years = [each for each in folder.iterdir() if re.fullmatch(r"\d{4}", each.name, re.ASCII)]
@@ -111,21 +111,21 @@ def log_readers(folder: Path) -> int:
 
 
 def active_path(path: Path) -> Path:
-    """Name a log while it is being written."""
+    """Return the path of a log while it is being written."""
     return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
 
 
 class LogName(NamedTuple):
-    """What the name of a file says.
+    """Parts of the file name of a log or a layer.
 
     Attributes
     ----------
     log : str
-        Name of the log without its suffix, of a layer that of the log it speaks of.
+        Name of the log without suffix; for a layer, the name of its log.
     layer : str
         `audio`, `review` or `relabel-<model>`; empty for a log.
     node, time : str
-        `20260301T120000Z`, and what may be behind it; empty if no recorder gave the name.
+        `20260301T120000Z` with an optional ending; empty if the name is not a recorder's.
     """
 
     log: str
@@ -137,7 +137,7 @@ class LogName(NamedTuple):
 def log_name(path: Path) -> LogName:
     """Split the name of a log or a layer into its parts."""
     parts = _NAME.fullmatch(stem(path))
-    if parts is None:  # nothing but a suffix
+    if parts is None:  # only a suffix
         return LogName("", "", "", "")
     log, layer = parts.groups("")
     recorded = _RECORDED.fullmatch(log)
@@ -145,22 +145,22 @@ def log_name(path: Path) -> LogName:
 
 
 def audio_path(log: Path) -> Path:
-    """Name the layer of a log that has its clips of sound."""
+    """Return the path of the layer with the audio clips of a log."""
     return log.with_name(stem(log) + AUDIO_SUFFIX)
 
 
 def review_path(log: Path) -> Path:
-    """Name the review layer of a log."""
+    """Return the path of the review layer of a log."""
     return log.with_name(f"{stem(log)}.{REVIEW_LAYER}{SUFFIX}")
 
 
 def relabel_path(log: Path, model: str) -> Path:
-    """Name the layer of a log that has the labels of a model."""
+    """Return the path of the layer with a model's labels of a log."""
     return log.with_name(f"{stem(log)}.{RELABEL_LAYER}{model}{SUFFIX}")
 
 
 def log_of_layer(layer: Path) -> Path:
-    """Name the finished log to which a layer belongs."""
+    """Return the path of the finished log of a layer."""
     return layer.with_name(log_name(layer).log + SUFFIX)
 
 
@@ -170,45 +170,45 @@ def stem(log: Path) -> str:
 
 
 def is_active(path: Path) -> bool:
-    """Tell by its name whether a log is still being written."""
+    """Return whether a log is still being written, judged by its name."""
     return path.name.endswith(ACTIVE_SUFFIX)
 
 
 def is_layer(path: Path) -> bool:
-    """Tell by its name whether a log is a layer, which belongs to another log."""
+    """Return whether a log is a layer of another log, judged by its name."""
     return bool(log_name(path).layer)
 
 
 def is_log(path: Path) -> bool:
-    """Tell whether a path is a regular file with the name of a log or a layer.
+    """Return whether a path is a regular file with the name of a log or a layer.
 
-    In a store only the name is looked at.
+    In a store only the name is checked.
     """
     named = path.name.endswith((SUFFIX, ACTIVE_SUFFIX))
     return named and (not is_local(path) or may_be_regular(path))
 
 
 def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
-    """List the logs in a folder, or the log itself, with those still being written.
+    """List the logs in a folder, or a single log, including active ones.
 
     Parameters
     ----------
     path : Path
-        A folder, in which logs may lie at any depth, or one log.
+        Folder, searched recursively, or one log.
     enrolled : bool
-        Whether to list the sounds in folders `enrolled` too, which are no time of the home.
+        Whether to include the training sounds in folders `enrolled`.
 
     Returns
     -------
     list of Path
-        Logs and layers, by name. Those in the folder that this user may not read are left out, with
-        a `HearthlogWarning`.
+        Logs and layers, sorted by name. Unreadable logs in the folder are skipped with a
+        `HearthlogWarning`.
 
     Raises
     ------
     LogError
-        If there is no log, if this user may not read it, if the path is that of a pipe, a socket or
-        a device, or if the store of the path cannot be used.
+        If there is no log, this user may not read it, the path is a pipe, a socket or a device, or
+        the store of the path cannot be used.
     """
     every = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)
@@ -222,9 +222,9 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
 
 
 def check_allowed(path: Path) -> None:
-    """Check that this user may read a log, or list a folder; it need not exist.
+    """Check that this user may read a log, or list a folder; a missing path passes.
 
-    Raise `LogError` if this user may not.
+    Raise `LogError` otherwise.
     """
     if is_local(path) and is_denied(path):
         raise LogError(f"{path}: {denied_text(path)}")
@@ -256,14 +256,14 @@ def _find_local(path: Path) -> list[Path]:
 
 
 def _warn_of_compressed(folder: Path, names: Sequence[str]) -> None:
-    """Name logs that are compressed as a whole, and left out."""
+    """Warn of skipped logs that are compressed files."""
     if names:
         text = f"compressed as a whole, and left out: {abridged(sorted(names), 5)}; unpack first"
         warnings.warn(HearthlogWarning(text, folder, each=True), stacklevel=4)
 
 
 def _others_in(folder: Path) -> str:
-    """Name a file that is a log in another form, in a folder without logs."""
+    """Return the name of a log in another format in a folder without logs."""
     entries = (entry for entry in islice(folder.rglob("*"), _LOOKED_AT))
     for other in sorted(entry for entry in entries if entry.suffix in OTHER_SUFFIXES):
         with suppress(OSError), os.fdopen(open_regular(other), "rb") as stream:
@@ -274,12 +274,12 @@ def _others_in(folder: Path) -> str:
 def walk_logs(
     folder: Path, denied: list[str] | None = None, compressed: list[str] | None = None
 ) -> Iterator["os.DirEntry[str]"]:
-    """List the logs in a folder of this machine, in any order.
+    """List the logs in a local folder, unordered.
 
     Parameters
     ----------
     folder : Path
-        Links to other folders in it are not followed; folders that cannot be read are left out.
+        Links to folders are not followed; unreadable folders are skipped.
     """
     waiting = [os.fspath(folder)]
     while waiting:
@@ -293,13 +293,13 @@ def walk_logs(
 
 
 class Inside(NamedTuple):
-    """What a folder of this machine has in it.
+    """Content of a local folder.
 
     Attributes
     ----------
     is_all : bool
-        Whether there is more or less only after a change of this folder. What a link leads to may
-        change elsewhere.
+        Whether any change of the content changes the folder itself. Targets of links may change
+        elsewhere.
     """
 
     folders: list["os.DirEntry[str]"]
@@ -309,7 +309,7 @@ class Inside(NamedTuple):
 
 
 def look_into(folder: str) -> Inside:
-    """List the folders and the logs in one folder of this machine."""
+    """List the subfolders and logs of one local folder."""
     folders: list[os.DirEntry[str]] = []
     named: list[os.DirEntry[str]] = []
     compressed: list[str] = []
@@ -323,18 +323,18 @@ def look_into(folder: str) -> Inside:
                 elif entry.name.endswith(COMPRESSED_SUFFIXES):
                     compressed.append(entry.name)
         is_all = not any(entry.is_symlink() for entry in named)
-    except OSError:  # as Path.rglob does
+    except OSError:  # ignored, as by Path.rglob
         is_all = False
     logs = [entry for entry in named if _may_be_log(entry)]
     return Inside(folders, logs, compressed, is_all)
 
 
 def _may_be_log(entry: "os.DirEntry[str]") -> bool:
-    return entry.is_file() or not os.path.exists(entry)  # noqa: PTH110  no Path for each file
+    return entry.is_file() or not os.path.exists(entry)  # noqa: PTH110  avoids a Path per file
 
 
 def _find_stored(path: Any) -> list[Path]:
-    """List the logs under a name in a store, in which folders are parts of names."""
+    """List the logs under a prefix in a store, in which folders are parts of names."""
     with store_errors(path):
         names = path.fs.find(path.path)
     if names == [path.path]:
@@ -347,11 +347,11 @@ def _find_stored(path: Any) -> list[Path]:
     return [path.with_segments(path.fs.unstrip_protocol(name)) for name in sorted(logs)]
 
 
-_SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
+_SIZE_LIMIT = 1 << 20  # maximum bytes of the records of one kind
 
 
 def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
-    """Find the first and the last log time of a log.
+    """Return the first and the last log time of a log.
 
     Returns
     -------
@@ -361,7 +361,7 @@ def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
     Raises
     ------
     LogError
-        If it cannot be read, is not an MCAP file, or is damaged.
+        If the log cannot be read, is not an MCAP file, or is damaged.
     """
     stated = stated_span(path)
     if stated is not None:
@@ -371,18 +371,18 @@ def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
 
 
 def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
-    """Read the first and the last log time of a log from its statistics alone.
+    """Return the first and the last log time of a log from its statistics only.
 
     Returns
     -------
     tuple or None
-        Holds the two log times in nanoseconds of UTC, or None if the log has no messages. None if
-        the log is unfinished or its index is damaged: then only walking through it tells.
+        A pair of log times in nanoseconds of UTC, or None without messages, in a tuple. None if
+        the log is unfinished or its index is damaged: only a scan finds its span.
 
     Raises
     ------
     LogError
-        If it cannot be read.
+        If the log cannot be read.
     """
     try:
         _, opened = open_log(path)
@@ -399,13 +399,13 @@ def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
 
 
 def topic_counts(path: Path) -> Counter[str]:
-    """Count the messages of each topic by the statistics of a finished log.
+    """Return the number of messages of each topic from the statistics of a finished log.
 
     Returns
     -------
     Counter of str
-        Messages by topic, as the log claims, but no more of a channel than the log has bytes.
-        Nothing is counted if the log has no statistics, they are damaged, or it cannot be read.
+        Messages by topic as stated, limited per channel to the size of the log in bytes. Empty if
+        the log has no statistics, they are damaged, or it cannot be read.
     """
     topics: Counter[str] = Counter()
     with suppress(LogError, McapError, UnicodeDecodeError, struct.error):
@@ -415,13 +415,13 @@ def topic_counts(path: Path) -> Counter[str]:
             counts = {} if statistics is None else statistics.channel_message_counts
             for channel in _summary_group(file, Opcode.CHANNEL):
                 if isinstance(channel, records.Channel):
-                    most = file.size  # a message takes more than a byte
+                    most = file.size  # each message takes more than one byte
                     topics[channel.topic] += min(counts.get(channel.id, 0), most)
     return topics
 
 
 def _is_summary_sound(file: LocalFile | StoredFile) -> bool:
-    """Compare the summary of a finished log with its checksum, if it has one."""
+    """Verify the checksum of the summary of a finished log, if there is one."""
     end = file.size - FOOTER_SIZE
     footer = read_footer(file.read(max(end, 0), FOOTER_SIZE))
     if footer is None or not footer.summary_crc:

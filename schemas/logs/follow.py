@@ -1,4 +1,4 @@
-"""Logs that are being written, followed from file to file."""
+"""Following of logs that are being written, from file to file."""
 
 import os
 import sys
@@ -24,14 +24,14 @@ from hearthlog.schemas.mcap.chunks import (
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 
-_SETTLES = 10  # milliseconds in which a change goes on
+_SETTLES = 10  # milliseconds to collect the events of one change
 
 
 class FolderChanges:
-    """Tells of files that are made, written, renamed or removed in folders.
+    """Watcher of files that are created, written, renamed or removed in folders.
 
-    Where the file system does not tell, as one of the network, or on a system without inotify,
-    `wait` lasts as long as it is asked to.
+    Without inotify, or on a file system without events, such as a network one, `wait` always
+    lasts its full time.
     """
 
     def __init__(self) -> None:
@@ -39,38 +39,38 @@ class FolderChanges:
         self._mask = 0
         self._watches: dict[Path, int] = {}
         if sys.platform == "linux":
-            from inotify_simple import INotify, flags  # noqa: PLC0415  elsewhere there is none
+            from inotify_simple import INotify, flags  # noqa: PLC0415  exists on Linux only
 
-            with suppress(OSError):  # a machine has so many and no more
+            with suppress(OSError):  # the number of instances per machine is limited
                 self._inotify = INotify()
             changes = flags.CREATE | flags.MODIFY | flags.MOVED_TO
             self._mask = changes | flags.DELETE_SELF | flags.MOVE_SELF | flags.ONLYDIR
 
     @property
     def tells(self) -> bool:
-        """Whether the system can tell of changes."""
+        """Whether the system reports changes."""
         return self._inotify is not None
 
     def watch(self, folders: Iterable[Path]) -> None:
-        """Be told of these folders too, and of those that have the names of watched ones since."""
+        """Watch more folders, and folders that have replaced watched ones."""
         if self._inotify is None:
             return
         for folder in set(folders):
-            with suppress(OSError):  # it was removed, or there are too many
-                # Asked each time: no event tells that a disk was mounted over a watched folder.
+            with suppress(OSError):  # the folder was removed, or there are too many
+                # Repeated each time: no event reports a disk mounted over a watched folder.
                 watch = self._inotify.add_watch(folder, self._mask)
                 before = self._watches.get(folder, watch)
                 self._watches[folder] = watch
                 if before != watch:
-                    self._inotify.rm_watch(before)  # if it has moved away
+                    self._inotify.rm_watch(before)  # if it was moved away
 
     def wait(self, seconds: float, stop: Event) -> bool:
-        """Wait until something changes, or for some time; tell whether something did.
+        """Wait for a change or a timeout; return whether there was a change.
 
         Parameters
         ----------
         stop : threading.Event
-            Ends the waiting when it is set, at the latest after `seconds`.
+            Ends the wait when set, at the latest after `seconds`.
         """
         if self._inotify is None:
             stop.wait(seconds)
@@ -78,7 +78,7 @@ class FolderChanges:
         return not stop.is_set() and bool(self._inotify.read(round(1000 * seconds), _SETTLES))
 
     def close(self) -> None:
-        """Be told no more."""
+        """Stop watching."""
         if self._inotify is not None:
             self._inotify.close()
 
@@ -90,12 +90,12 @@ class FolderChanges:
 
 
 _POLL_SECONDS = 0.2
-_LOOK_SECONDS = 1.0  # where the file system tells of news
-_MOST_MISSED = 3  # news of which it did not
-_SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change
-_LONGEST = 2 * 86_400 * NANOSECONDS  # a log lasts a day at most, and its clock may be set
+_LOOK_SECONDS = 1.0  # polling interval if the file system reports changes
+_MOST_MISSED = 3  # number of changes without event before polling speeds up
+_SETTLED = 2_000_000_000  # ns after which another change alters the modification time of a folder
+_LONGEST = 2 * 86_400 * NANOSECONDS  # a log lasts a day at most, but the clock may be set
 _NAME_TIME = len("20260301T120000Z")
-_NO_LOGS = {ENROLLED, "lost+found"}  # the latter, on many disks, only root may read
+_NO_LOGS = {ENROLLED, "lost+found"}  # on many disks, only root may read lost+found
 
 
 def follow(
@@ -105,26 +105,26 @@ def follow(
     fields: Collection[str] | None = None,
     stop: Event | None = None,
 ) -> Iterator[list[Columns]]:
-    """Read the logs of a folder as they are written, across files and restarts of the recorder.
+    """Read the logs of a folder as they are written, across files and recorder restarts.
 
-    What a recorder hands to the operating system is read within a fraction of a second.
+    Latency after a recorder's write is a fraction of a second.
 
     Parameters
     ----------
     folder : Path
-        Logs may lie at any depth. Files that are there but not being written are read first, if
-        `start` asks for them.
+        Searched recursively. With `start`, existing files that are not being written are read
+        first.
     start : int, optional
-        Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
+        Log time, in nanoseconds of UTC, of the first messages to read; by default only messages
         written from now on.
     stop : threading.Event, optional
-        Ends the reading when it is set; by default it never ends.
+        Ends the reading when set; by default it never ends.
 
     Raises
     ------
     LogError
-        If there is no such folder, or no more, if a folder or a log in it cannot be read, if a log
-        is damaged, or if its messages are not of the type that it says.
+        If the folder does not exist or disappears, the folder or a log in it cannot be read, a log
+        is damaged, or its messages do not match their stated type.
     """
     for _, messages in follow_messages(folder, topics, start, stop):
         if messages:
@@ -148,36 +148,36 @@ def follow_messages(  # noqa: PLR0913
     infos: bool = False,
     ticks: bool = False,
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
-    """Read the messages of logs, still encoded, as they are written; as `follow` does.
+    """Read the encoded messages of logs as they are written; as `follow` does.
 
     Parameters
     ----------
     start : int, optional
-        Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
+        Log time, in nanoseconds of UTC, of the first messages to read; by default only messages
         written from now on.
     stop : threading.Event, optional
-        Ends the reading when it is set; by default it never ends.
+        Ends the reading when set; by default it never ends.
     damaged : callable
-        Told the error of a log that is damaged, of which no more is read then; and once, until it
-        is over, of a log or a folder that cannot be read now or is gone, which is tried again and
-        again. By default it is raised.
+        Called with the error of a damaged log, which is not read further; and once per incident
+        with that of a log or a folder that is unreadable or missing, which is retried. By default
+        the error is raised.
     infos : bool
-        Whether the `AudioStreamInfo` messages of the logs that are being written come first, also
-        those that were written before.
+        Whether to start with the `AudioStreamInfo` messages of active logs, including those
+        written before.
     ticks : bool
-        Whether the folder with an empty list comes five times a second while nothing is written,
-        when all that was written has been read: for who judges how long ago that was.
+        Whether to yield the folder with an empty list five times a second while there is no new
+        data, for callers that measure time since the last data.
 
     Yields
     ------
     messages : list of RawMessages
-        What was written to it since the last time, perhaps nothing: so after each log that is not
-        being written, for the caller to have a turn.
+        Messages written to the log since the last time; possibly empty, as after each log that is
+        not being written, to return control to the caller.
 
     Raises
     ------
     LogError
-        If there is no such folder, or what `damaged` raises.
+        If the folder does not exist, or any error that `damaged` raises.
     """
     stop = stop or Event()
     if not folder.is_dir():
@@ -222,7 +222,7 @@ def _close(growing: "Iterable[_Growing]") -> None:
 def _begin(
     growing: "Sequence[_Growing]", start: int | None, damaged: Damaged, *, infos: bool
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
-    """Pass over what is not asked for of logs that were there before."""
+    """Skip messages of existing logs that are not requested."""
     if start is None:
         for log in growing:
             log.file.scan_new()
@@ -247,17 +247,17 @@ def _read_finished(
 
 
 def _may_reach(log: Path, start: int) -> bool:
-    """Tell by its name whether a log may have messages from a time on."""
+    """Return whether a log may have messages after a time, judged by its name."""
     try:
         return read_time(log_name(log).time[:_NAME_TIME]) + _LONGEST >= start
-    except ValueError:  # no recorder gave the name
+    except ValueError:  # not a recorder's name
         return True
 
 
 class _News:
-    """Tells when to look for news: when the file system says so, and once a second.
+    """Schedule of polling: after file system events, and once a second.
 
-    Where news come without a word of it, as on a file system of the network, five times a second.
+    If changes arrive without events, as on network file systems, five times a second.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -268,7 +268,7 @@ class _News:
         self._due = 0.0  # by CLOCK_MONOTONIC
 
     def expect(self, growing: "Iterable[_Growing]", *, has_news: bool) -> None:
-        """Note what is being written, and whether there was anything new."""
+        """Update the active logs, and whether there was new data."""
         if has_news and not self._was_told and not self._changes.wait(0, Event()):
             self._missed += 1
         places = {self._folder}
@@ -278,18 +278,18 @@ class _News:
         self._due = time.monotonic() + _LOOK_SECONDS
 
     def may_be_there(self, stop: Event) -> bool:
-        """Wait for a fifth of a second at most; tell whether to look for news then."""
+        """Wait for at most a fifth of a second; return whether to poll."""
         self._was_told = self._changes.wait(_POLL_SECONDS, stop)
         tells = self._changes.tells and self._missed < _MOST_MISSED
         return self._was_told or not tells or time.monotonic() >= self._due or stop.is_set()
 
     def close(self) -> None:
-        """Be told no more."""
+        """Stop watching."""
         self._changes.close()
 
 
 class _Growing:
-    """A log that is being written."""
+    """Log that is being written."""
 
     def __init__(self, file: LogFile) -> None:
         self.file = file
@@ -299,8 +299,8 @@ class _Growing:
     def read(
         self, topics: TopicChoice | None, start: int | None, damaged: Damaged
     ) -> Iterator[list[RawMessages]]:
-        """Read what was written since the last time."""
-        # Replaced by a recorder that was started again: asked first, so nothing comes in between.
+        """Read the messages written since the last call."""
+        # Replaced by a restarted recorder: checked first, so that no data are missed.
         self._replaced = self._is_replaced()
         try:
             for batch in read_in_batches(self.file, self.file.scan_new(), topics):
@@ -312,7 +312,7 @@ class _Growing:
             damaged(error)
 
     def infos_before(self, start: int | None, damaged: Damaged) -> list[RawMessages]:
-        """Read the descriptions of the streams that were written before a time, or before now."""
+        """Read the stream descriptions written before a time, or before now."""
         messages: list[RawMessages] = []
         try:
             with _open(self.file.path) as file:
@@ -323,18 +323,18 @@ class _Growing:
         return [m for m in (raw.between(None, start) for raw in messages) if len(m)]
 
     def is_open(self) -> bool:
-        """Tell whether more may come; if not, close the log."""
+        """Return whether more data may come; if not, close the log."""
         if self.file.ended or self._replaced or self._is_damaged:
             self.file.close()
             return False
         return True
 
     def _is_replaced(self) -> bool:
-        """Tell whether another file has the name, or none, though its folder is not gone."""
+        """Return whether the name is missing or another file, while its folder exists."""
         try:
             is_there = any(self.file.is_at(name) for name in _names(self.file.path))
             return not is_there and self.file.path.parent.is_dir()
-        except OSError:  # nobody may look at it now
+        except OSError:  # unreadable at the moment
             return False
 
 
@@ -347,17 +347,17 @@ def _read_infos(file: LogFile) -> list[RawMessages]:
 
 
 def _names(path: Path) -> tuple[Path, Path]:
-    """Return the name of a log while it is written, and when it is finished."""
+    """Return the active and the finished name of a log."""
     return path.with_name(stem(path) + ACTIVE_SUFFIX), path.with_name(stem(path) + SUFFIX)
 
 
 def _name(path: Path) -> str:
-    """Return what stays the same of a log when it gets its final name."""
+    """Return the part of a log's name that does not change when it is finished."""
     return os.fspath(path).removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
 
 
 def _open(path: Path) -> LogFile:
-    """Open a log that may get its final name at any moment."""
+    """Open a log that may be renamed to its final name at any moment."""
     active, _ = _names(path)
     return LogFile(active, indexed=False)
 
@@ -367,9 +367,9 @@ def _has_vanished(error: LogError) -> bool:
 
 
 class _Folder:
-    """A folder of logs, looked through again and again.
+    """Folder of logs, scanned repeatedly.
 
-    Only the folders that changed are listed: a recorder leaves ten thousand files a year.
+    Only changed folders are listed: a recorder writes ten thousand files a year.
     """
 
     def __init__(self, root: Path, damaged: Damaged) -> None:
@@ -377,16 +377,16 @@ class _Folder:
         self._damaged = damaged
         self._listed: dict[Path, int] = {root: -1}
         self._listed_logs: set[str] = set()
-        self._unreadable: set[Path] = set()  # folders and logs, as was told
+        self._unreadable: set[Path] = set()  # folders and logs already reported
 
     def new_logs(self) -> list[Path]:
-        """Return the logs that were not there the last time, by name."""
+        """Return the logs that are new since the last call, sorted by name."""
         new: dict[str, Path] = {}
         todo = deque(self._listed)
         while todo:
             folder = todo.popleft()
             if self._unreadable and not self._unreadable.isdisjoint(folder.parents):
-                continue  # nor can this one be: one line says it
+                continue  # unreadable like its folder, which is reported once
             for path, is_folder in self._list_changed(folder):
                 if is_folder:
                     if path not in self._listed and path.name not in _NO_LOGS:
@@ -400,7 +400,7 @@ class _Folder:
         return [new[name] for name in sorted(new)]
 
     def open(self, logs: Iterable[Path]) -> Iterator[_Growing]:
-        """Open logs; one that cannot be opened now is new the next time too."""
+        """Open logs; a log that cannot be opened remains new for the next call."""
         for path in logs:
             try:
                 log = _Growing(_open(path))
@@ -414,7 +414,7 @@ class _Folder:
                 yield log
 
     def _list_changed(self, folder: Path) -> list[tuple[Path, bool]]:
-        """Return what is in a folder that may have changed, and which of it are folders."""
+        """Return the entries of a folder that may have changed, and whether each is a folder."""
         try:
             changed = folder.stat().st_mtime_ns
             if changed == self._listed[folder]:
@@ -444,7 +444,7 @@ class _Folder:
         self._tell(folder, LogError(f"{folder}: {problem}"))
 
     def _tell(self, path: Path, error: LogError) -> None:
-        """Tell it once, until the folder or the log can be read."""
+        """Report an error once, until the folder or the log is readable again."""
         if path not in self._unreadable:
             self._unreadable.add(path)
             self._damaged(error)

@@ -1,4 +1,4 @@
-"""The messages of several logs as one series, in the order of time and within bounded memory."""
+"""Merged reading of several logs, ordered by time and in bounded memory."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -25,15 +25,15 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
 
-_BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
-_READERS = 2  # threads: more than these wait for each other's Python
-_WALKED = 4  # unfinished logs that stay open from the search for their spans on
-_WALKED_ROWS = 1 << 18  # of all their tables: about 20 MB
+_BATCH = 5 << 20  # bytes per batch, compressed plus decompressed
+_READERS = 2  # threads: more would wait for each other's Python code
+_WALKED = 4  # unfinished logs that stay open after the scan for their spans
+_WALKED_ROWS = 1 << 18  # rows of their tables together: about 20 MB
 _FIRST, _LAST = 0, (1 << 63) - 1  # log times
 
 
 class Messages(Protocol):
-    """Messages of one channel or topic, in the order of their log times, encoded or decoded."""
+    """Messages of one channel or topic, in order of log time, encoded or decoded."""
 
     def __len__(self) -> int: ...
 
@@ -53,13 +53,13 @@ Piece = TypeVar("Piece", bound=Messages)
 def time_spans(
     logs: Iterable[Path], span_of: Callable[[Path], tuple[int, int] | None] = time_span
 ) -> list[tuple[int, int, Path]]:
-    """Return the first and the last log time of each log that has messages.
+    """Return the first and the last log time of each log with messages.
 
     Parameters
     ----------
     span_of : callable
-        Told a log; returns its first and last log time in nanoseconds of UTC, or None if it has no
-        messages.
+        Called with a log; returns its first and last log time in nanoseconds of UTC, or None
+        without messages.
 
     Raises
     ------
@@ -69,12 +69,12 @@ def time_spans(
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)
     spans = [(*span, path) for span, path in pairs if span is not None]
-    # Paths of this machine and of a store do not compare; their parts do.
+    # Local paths and paths in a store are not comparable; their parts are.
     return sorted(spans, key=lambda span: (*span[:2], tuple(span[2].parts)))
 
 
 class _Log:
-    """A log that is open, and its chunks that a query asks for, by their start times."""
+    """Open log with its requested chunks, sorted by start time."""
 
     def __init__(self, file: LogFile, query: "_Query") -> None:
         self.file = file
@@ -91,7 +91,7 @@ class _Log:
         return int(self.chunks["start"][self._position])
 
     def next_chunks(self, until: int, size: int) -> NDArray[np.void]:
-        """Hand out chunks that start up to a time, until they are of some size, at least one."""
+        """Return chunks that start up to a time, limited by size, but at least one."""
         first = self._position
         read = int(self._ends[first - 1]) if first else 0
         last = min(
@@ -103,17 +103,17 @@ class _Log:
 
 
 class _Query(NamedTuple):
-    """What to read: topics, and log times from `start` on, before `end`."""
+    """Topics and range of log times, from `start` on, before `end`."""
 
     topics: TopicChoice | None
     start: int
     end: int
     every: int = 1
     on_damage: OnDamage | None = None
-    once: bool = False  # whether chunks that repeat another one are left out
+    once: bool = False  # whether to skip repeated chunks
 
     def chunks(self, file: LogFile) -> NDArray[np.void]:
-        """Return the chunks that may hold a message of the query."""
+        """Return the chunks that may hold requested messages."""
         chunks = self._in_span(not_empty(file.chunks))[:: self.every]
         if self.once:
             chunks = chunks[~repeated_chunks(file, chunks)]
@@ -133,7 +133,7 @@ class _Query(NamedTuple):
         return file.with_channels(chunks, frozenset().union(*file.channel_sets) - others)
 
     def read(self, batch: "_Batch") -> list[RawMessages]:
-        """Read the messages of a batch that the query asks for."""
+        """Read the requested messages of a batch."""
         messages: list[RawMessages] = []
         for file, chunks in batch.parts:
             messages += _between(self._messages(file, chunks), self.start, self.end)
@@ -146,11 +146,11 @@ class _Query(NamedTuple):
 
 
 class _Batch(NamedTuple):
-    """What is read at once."""
+    """Chunks that are read at once."""
 
     parts: list[tuple[LogFile, NDArray[np.void]]]  # chunks by log
     until: int  # no later batch has an earlier message
-    finished: list[LogFile]  # of which nothing more is to be read
+    finished: list[LogFile]  # logs without further chunks
 
 
 def iterate_messages(  # noqa: PLR0913
@@ -162,20 +162,20 @@ def iterate_messages(  # noqa: PLR0913
     on_damage: OnDamage | None = None,
     once: bool = False,
 ) -> Iterator[list[RawMessages]]:
-    """Read the messages of some logs, still encoded.
+    """Read the encoded messages of several logs.
 
     Parameters
     ----------
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     once : bool
-        Leave out chunks that are byte for byte an earlier one of their log.
+        Whether to skip chunks that repeat an earlier one of their log byte for byte.
 
     Yields
     ------
     list of RawMessages
-        Those of the next span of time, one or more for every channel that speaks in it. None
-        is older than any that was yielded before.
+        Messages of the next span of time, one or more items for each channel with messages in it.
+        No message is older than those yielded before.
 
     Raises
     ------
@@ -196,26 +196,26 @@ def iterate_pieces(  # noqa: PLR0913
     every: int = 1,
     on_damage: OnDamage | None = None,
 ) -> Iterator[list[Piece]]:
-    """Apply a function to the messages of each span of time, in the threads that read them.
+    """Apply a function to the messages of each span of time, in the reader threads.
 
     Parameters
     ----------
     topics : collection of str, callable or None
-        Names of the topics, or what tells whether one is read; None for all.
+        Names of the topics, or a predicate; None for all.
     start, end : int or None
         Log times, in nanoseconds of UTC: from `start` on, before `end`. None for no limit.
     every : int
-        Of so many chunks of a log one is read, for a sample; 1 for all.
+        Read one of this many chunks of a log, as a sample; 1 for all.
 
     Yields
     ------
     list of Piece
-        Those of the next span of time; none is older than any that was yielded before.
+        Results of the next span of time; none is older than those yielded before.
 
     Raises
     ------
     LogError
-        If a log cannot be read, is not an MCAP file, or is damaged; also what `function` raises.
+        If a log cannot be read, is not an MCAP file, or is damaged; also any error of `function`.
     """
     query = _query(topics, start, end)._replace(every=every, on_damage=on_damage)
     return _iterate(logs, query, function)
@@ -250,7 +250,7 @@ def _between(pieces: list[Piece], start: int, end: int) -> list[Piece]:
 
 
 class _Queue:
-    """The chunks of several logs by their start times; a log is open while it is needed."""
+    """Chunks of several logs by start time; each log is open only while it is needed."""
 
     def __init__(self, logs: Iterable[Path], query: _Query) -> None:
         self._query = query
@@ -278,11 +278,11 @@ class _Queue:
 
     @property
     def start(self) -> int:
-        """No chunk that is still to come starts earlier."""
+        """Lower limit of the start times of all further chunks."""
         return min((log.start for log in self._open), default=_LAST)
 
     def batches(self) -> Iterator["_Batch"]:
-        """Hand out the chunks, a few megabytes at a time."""
+        """Yield the chunks in batches of a few megabytes."""
         while self._open:
             picked: dict[LogFile, list[NDArray[np.void]]] = {}
             size = 0
@@ -299,13 +299,13 @@ class _Queue:
             yield _Batch(parts, self.start, finished)
 
     def close(self, files: Iterable[LogFile]) -> None:
-        """Close logs whose chunks were all read."""
+        """Close logs without further chunks."""
         for file in list(files):
             file.close()
             self._files.remove(file)
 
     def _open_next(self) -> None:
-        """Open the logs that may have the next chunk, and put aside those that have no more."""
+        """Open the logs that may have the next chunk, and remove exhausted ones."""
         self._finished += [log.file for log in self._open if log.start == _LAST]
         self._open = [log for log in self._open if log.start < _LAST]
         while self._closed and (not self._open or self._closed[-1][0] <= self.start):
@@ -319,7 +319,7 @@ class _Queue:
 
 
 class _WalkedLogs:
-    """A few unfinished logs that were walked through for their spans, so that once is enough."""
+    """Cache of a few unfinished logs that were scanned for their spans, to scan them only once."""
 
     def __init__(self, *, partial: bool) -> None:
         self._partial = partial
@@ -327,7 +327,7 @@ class _WalkedLogs:
         self._rows = 0
 
     def span(self, path: Path) -> tuple[int, int] | None:
-        """Find the first and the last log time of a log, as `time_span` does."""
+        """Return the first and the last log time of a log, as `time_span` does."""
         stated = stated_span(path)
         if stated is not None:
             return stated[0]
@@ -342,7 +342,7 @@ class _WalkedLogs:
         return log.span
 
     def open(self, path: Path) -> LogFile:
-        """Open a log, with what was written to it since it was walked through."""
+        """Open a log, including data written since its scan."""
         log = self._logs.pop(path, None)
         if log is None:
             return LogFile(path, partial=self._partial)
@@ -354,6 +354,6 @@ class _WalkedLogs:
         return log
 
     def close(self) -> None:
-        """Close the logs that were not asked for."""
+        """Close the unused logs."""
         for log in self._logs.values():
             log.close()

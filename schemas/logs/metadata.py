@@ -1,4 +1,4 @@
-"""Metadata records of a log: `hearthlog`, its features and scenarios, and `rosbag2`; digests."""
+"""Metadata records of a log: `hearthlog` with features and scenarios, and `rosbag2`; digests."""
 
 import hashlib
 import json
@@ -24,28 +24,28 @@ from hearthlog.schemas.messages.topics import (
 )
 
 HEARTHLOG_METADATA = "hearthlog"
-THINNED = "thinned"  # what was dropped of a log
-THINNED_OF = "thinned_of"  # digests that it had before, one for each time
+THINNED = "thinned"  # message kinds dropped from a log
+THINNED_OF = "thinned_of"  # digests of the log before each thinning
 _VERSION_KEY = "schema_version"
-_FIRST = "1"  # did not write it
+_FIRST = "1"  # the first version did not write its number
 _KNOWN = {str(number): number for number in range(1, SCHEMA_VERSION + 1)}
-_LARGEST, _MOST = 1 << 20, 64 << 20  # bytes of one record, and of all; ours have less than 1000
+_LARGEST, _MOST = 1 << 20, 64 << 20  # bytes per record and in total; hearthlog's have below 1000
 
 
 def provenance(node: str, **more: str) -> dict[str, str]:
-    """Make the record of a file that this version writes."""
+    """Return the `hearthlog` record of a file written by this version."""
     return {"version": __version__, _VERSION_KEY: str(SCHEMA_VERSION), "node": node, **more}
 
 
 def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
-    """Read the records of a file, each different one once.
+    """Read the distinct `hearthlog` records of a file.
 
-    A record of a newer version gives a `HearthlogWarning`.
+    A record of a newer version causes a `HearthlogWarning`.
 
     Returns
     -------
     list of mapping of str to str
-        One, or those of all logs that were merged; empty if the file is not of hearthlog.
+        One record, or those of all merged logs; empty if the file is not from hearthlog.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
 
 
 def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
-    """Read the records of a file as `read_provenance` does, whatever their version.
+    """Read the records of a file as `read_provenance` does, without the version check.
 
     Raise `LogError` if a record is damaged.
     """
@@ -75,7 +75,7 @@ def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
 
 
 def version_text(record: Mapping[str, str]) -> str:
-    """Return the schema version that a record names, which need not be a number."""
+    """Return the schema version of a record as text, which may not be a number."""
     return record.get(_VERSION_KEY, _FIRST)
 
 
@@ -85,24 +85,24 @@ def schema_version(record: Mapping[str, str]) -> int | None:
     Returns
     -------
     int or None
-        None if this version of hearthlog does not know it.
+        None if this version of hearthlog does not support it.
     """
     return _KNOWN.get(version_text(record))
 
 
 def describes_model(record: Mapping[str, str]) -> bool:
-    """Tell whether a log with such a record has `model.json`, if it has labels."""
+    """Return whether a log with this record has `model.json`, if it has labels."""
     version = schema_version(record)
     return version is not None and version > 1
 
 
 def unknown_version(record: Mapping[str, str]) -> str:
-    """Say that a record has a schema version that this version does not know.
+    """Return the message about an unsupported schema version.
 
     Returns
     -------
     str
-        The rest of a sentence that begins with the file; empty if the version is known.
+        Rest of a sentence that starts with the file; empty for a supported version.
     """
     if schema_version(record) is not None:
         return ""
@@ -113,7 +113,7 @@ def unknown_version(record: Mapping[str, str]) -> str:
 
 
 def check_version(record: Mapping[str, str], path: Path) -> None:
-    """Give a `HearthlogWarning` if a file has a schema version that this version does not know."""
+    """Warn with `HearthlogWarning` if the schema version of a file is not supported."""
     text = unknown_version(record)
     if text:
         warnings.warn(HearthlogWarning(text, path), stacklevel=2)
@@ -128,7 +128,7 @@ _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 @dataclass
 class TopicCount:
-    """One topic of a file and the number of its messages."""
+    """Topic of a file with its number of messages."""
 
     type: str
     channel_metadata: Mapping[str, str]
@@ -136,7 +136,7 @@ class TopicCount:
 
 
 def rosbag2_channel(type_hash: str, quality: Quality) -> dict[str, str]:
-    """Return the metadata that a ROS 2 channel must have."""
+    """Return the metadata required for a ROS 2 channel."""
     seconds = quality.lifespan_seconds
     profile = {
         "history": "keep_last",
@@ -153,7 +153,7 @@ def rosbag2_channel(type_hash: str, quality: Quality) -> dict[str, str]:
 
 
 class FileCounts(NamedTuple):
-    """What rosbag2 wants to know of one file of a bag."""
+    """Counts and span of one file of a bag, for rosbag2."""
 
     name: str  # relative to the folder of the bag
     topics: Mapping[str, TopicCount]
@@ -161,7 +161,7 @@ class FileCounts(NamedTuple):
 
     @property
     def times(self) -> dict[str, object]:
-        """When it begins, how long it lasts, and how many messages it has, in rosbag2's words."""
+        """Start, duration and message count, in the format of rosbag2."""
         start, end = self.span
         return {
             "starting_time": {"nanoseconds_since_epoch": start},
@@ -184,12 +184,12 @@ def rosbag2_metadata(
 
 
 def rosbag2_counts(record: Mapping[str, str]) -> dict[str, int]:
-    """Read how many messages of each topic a file has by its `rosbag2` metadata record.
+    """Read the message count of each topic from the `rosbag2` metadata record of a file.
 
     Returns
     -------
     dict of str to int
-        By topic; empty if the record does not say so, or says two things.
+        By topic; empty if the record has no counts, or contradictory ones.
     """
     text = record.get("serialized_metadata", "")
     try:
@@ -214,20 +214,20 @@ def _from_yaml(text: str) -> tuple[int, dict[str, int]]:
     for match in _COUNTED.finditer(topics):
         if match["name"]:
             name = match["name"]
-        elif name:  # those of files, further on, have none
+        elif name:  # entries of files, further on, have no name
             counts[name], name = int(match["count"]), ""
     return totals[0] if totals else -1, counts
 
 
 def rosbag2_yaml(files: Sequence[FileCounts]) -> str:
-    """Return the `metadata.yaml` of a bag of some files.
+    """Return the `metadata.yaml` of a bag of several files.
 
     Parameters
     ----------
     files : sequence of FileCounts
-        In the order of time, at least one; a topic is of one type and quality in all of them.
+        At least one, in order of time; type and quality of a topic are equal in all of them.
     """
-    information = json.dumps(_information(files), ensure_ascii=False)  # JSON, which is YAML too
+    information = json.dumps(_information(files), ensure_ascii=False)  # JSON is valid YAML
     return f"rosbag2_bagfile_information: {information}\n"
 
 
@@ -274,14 +274,14 @@ _DETAILS = (FEATURE_SET_VERSION, FEATURE_SET_DIGEST, FEATURE_SET_DISTRIBUTION)
 
 
 def feature_entries(name: str, version: int, digest: str, distribution: str) -> dict[str, str]:
-    """Return what the record says of a feature set.
+    """Return the record entries of a feature set.
 
     Parameters
     ----------
     digest : str
-        SHA-256 of the network that computes it; empty for none.
+        SHA-256 of the network of the features; empty for none.
     distribution : str
-        Which brings it, and its version; empty for hearthlog itself.
+        Distribution of the feature set, with version; empty for hearthlog itself.
     """
     entries = {FEATURE_SET: name, FEATURE_SET_VERSION: str(version)}
     return entries | {
@@ -294,7 +294,7 @@ def feature_entries(name: str, version: int, digest: str, distribution: str) -> 
 def other_features(
     first: Mapping[str, str], other: Mapping[str, str], microphone: str
 ) -> dict[str, str]:
-    """Return what the record says of the features of another microphone than the first."""
+    """Return the record entries for features of further microphones."""
     return {
         f"/{microphone}/{key}": other.get(key, "")
         for key in _DETAILS
@@ -303,7 +303,7 @@ def other_features(
 
 
 def features_of_microphone(record: Mapping[str, str], microphone: str) -> dict[str, str]:
-    """Return a record with what it says of the features of one microphone."""
+    """Return a record with the feature entries of one microphone."""
     own = {key: record.get(f"/{microphone}/{key}", record.get(key, "")) for key in _DETAILS}
     others = {key: text for key, text in record.items() if key not in own}
     return others | {key: text for key, text in own.items() if text}
@@ -313,7 +313,7 @@ _SCENARIO_KEY = re.compile(f"{SCENARIO}/([^/]+)/([^/]+)")
 
 
 class RecordedScenario(NamedTuple):
-    """A scenario that ran on what a microphone heard, and the model that labelled for it."""
+    """Scenario that ran for a microphone, and its model."""
 
     microphone: str
     name: str
@@ -322,13 +322,13 @@ class RecordedScenario(NamedTuple):
 
 
 def scenario_entries(scenario: RecordedScenario) -> dict[str, str]:
-    """Return what the record says of a scenario."""
+    """Return the record entries of a scenario."""
     key = f"{SCENARIO}/{scenario.microphone}/{scenario.name}"
     return {key: scenario.model, f"{key}/sha256": scenario.sha256}
 
 
 def recorded_scenarios(record: Mapping[str, str]) -> Iterator[RecordedScenario]:
-    """Yield the scenarios that a record names, in its order."""
+    """Yield the scenarios of a record, in order."""
     for key, model in record.items():
         names = _SCENARIO_KEY.fullmatch(key)
         if names is None:
@@ -344,10 +344,10 @@ _TAIL = 1 << 16  # bytes
 
 
 def log_digest(log: Path) -> str:
-    """Identify a log: the SHA-256 of its size and its last 64 KiB.
+    """Return the SHA-256 of the size and the last 64 KiB of a log, as its identity.
 
-    The end of a log holds its index, or the end of that, and the index's checksum. So a log can be
-    recognised without reading all of it.
+    The end of a log contains its index, or the end of it, and the checksum of the index. It
+    identifies the log without reading all of it.
 
     Returns
     -------
@@ -366,7 +366,7 @@ def log_digest(log: Path) -> str:
 
 
 def earlier_digests(log: Path) -> list[str]:
-    """Return the digests that a log had before it was thinned.
+    """Return the digests of a log before each thinning.
 
     Raise `LogError` if the log cannot be read or is damaged.
     """

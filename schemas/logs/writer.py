@@ -1,4 +1,4 @@
-"""Log writers: MCAP of profile `ros2` with a record of its contents, to a stream or a file."""
+"""Writers of logs, MCAP of profile `ros2` with a contents record, to a stream or a file."""
 
 import errno
 import fcntl
@@ -42,10 +42,10 @@ from hearthlog.schemas.new_files import create_file, make_folders, sync_folder
 
 
 class CountedWriter(ChunkWriter):
-    """A `ChunkWriter` whose last metadata record is `hearthlog_contents`.
+    """`ChunkWriter` whose last metadata record is `hearthlog_contents`.
 
-    The record is left out where there would be nothing to say, where it or a chunk would be large,
-    and where a message cannot be read.
+    The record is omitted if it would be empty, if it or a chunk would be large, or if a message
+    cannot be read.
     """
 
     def __init__(
@@ -57,16 +57,16 @@ class CountedWriter(ChunkWriter):
         super().__init__(stream, chunk_span=chunk_span)
         self._copied = definitions
         self._contents: LogContents | None = LogContents()
-        self._waiting: list[StoredChunk] = []  # one batch of a reader, so that it counts alike
+        self._waiting: list[StoredChunk] = []  # one batch of a reader, for identical counts
         self._size = 0
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write a metadata record; that of another file's contents is left out."""
+        """Write a metadata record; skip the contents record of another file."""
         if name != CONTENTS_METADATA:
             super().add_metadata(name, data)
 
     def finish(self) -> None:
-        """Write the chunk in progress, the record, the index and the footer."""
+        """Write the chunk in progress, the contents record, the index and the footer."""
         self.flush()
         self._count_waiting()
         channels, schemas = self._definitions()
@@ -77,7 +77,7 @@ class CountedWriter(ChunkWriter):
         super().finish()
 
     def copy_large_chunk(self, chunk: StoredChunk, length: int, data: Iterable[bytes]) -> None:
-        """Write a chunk of another file; what it says is not counted."""
+        """Write a chunk of another file; its messages are not counted."""
         self._give_up()
         super().copy_large_chunk(chunk, length, data)
 
@@ -88,7 +88,7 @@ class CountedWriter(ChunkWriter):
         if self._size // BATCH_SIZE != batch:
             self._count_waiting()
         if chunk.size > BATCH_SIZE:
-            self._give_up()  # no recorder's, and too large to be kept
+            self._give_up()  # not from a recorder, and too large to keep
         if self._contents is not None:
             self._waiting.append(chunk)
         return length
@@ -118,7 +118,7 @@ class CountedWriter(ChunkWriter):
 def _messages(
     chunks: list[StoredChunk], channels: dict[int, Channel], schemas: dict[int, Schema]
 ) -> list[RawMessages]:
-    """Find the messages of some chunks, in the order in which a reader does."""
+    """Read the messages of chunks, in the order of a reader."""
     contents = [chunk.content() if chunk.raw is None else chunk.raw for chunk in chunks]
     buffer = np.frombuffer(b"".join(contents), np.uint8)
     bases = np.cumsum([0, *map(len, contents)]).tolist()
@@ -148,7 +148,7 @@ SCHEMA_ENCODING = "ros2msg"
 
 @dataclass(frozen=True)
 class Attachment:
-    """A file carried inside a log."""
+    """File inside a log."""
 
     name: str
     media_type: str
@@ -161,7 +161,7 @@ class TopicBatch(NamedTuple):
     Attributes
     ----------
     log_times : np.ndarray [shape=(n,)], int64
-        Nanoseconds; the publish times are the same.
+        Nanoseconds; also the publish times.
     """
 
     topic: str
@@ -170,7 +170,7 @@ class TopicBatch(NamedTuple):
 
 
 class LogStreamWriter:
-    """Writes a log to a stream."""
+    """Writer of a log to a stream."""
 
     def __init__(self, stream: BinaryIO, topics: Sequence[Topic], chunk_span: int = LATEST) -> None:
         self._channels: dict[str, int] = {}
@@ -201,7 +201,7 @@ class LogStreamWriter:
         Parameters
         ----------
         created : int
-            Time of the file, in nanoseconds of UTC.
+            Creation time of the file, in nanoseconds of UTC.
         """
         item = attachment
         self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
@@ -212,8 +212,8 @@ class LogStreamWriter:
         Parameters
         ----------
         messages : sequence of (int, str, bytes)
-            Log time in nanoseconds of UTC, which is also the publish time; name of one of the
-            writer's topics; CDR.
+            Log time in nanoseconds of UTC, also used as publish time; name of a topic of the
+            writer; CDR.
         """
         if messages:
             times, topics, payloads = zip(*messages, strict=True)
@@ -223,7 +223,7 @@ class LogStreamWriter:
     def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, in the order of their log times.
 
-        The file is the same as if they had been encoded and written one by one.
+        The result equals that of messages encoded and written one by one.
 
         Raise `LogError` if a message cannot be encoded; see `encode_groups`.
         """
@@ -244,7 +244,7 @@ class LogStreamWriter:
         self._writer.flush()
 
     def finish(self, name: str) -> None:
-        """Complete the log."""
+        """Finish the log."""
         self._writer.flush()
         for topic, channel in self._channels.items():
             self._topics[topic].messages = self._writer.message_counts.get(channel, 0)
@@ -254,22 +254,22 @@ class LogStreamWriter:
 
 
 class LogWriter:
-    """One log being written.
+    """Log that is being written.
 
-    What was written is on its way to the disk after `flush`, and survives a power cut after
-    `sync`; only `finish` gives the file its name, and `complete` leaves that to others.
+    `flush` hands data to the operating system, and after `sync` they survive a power cut; only
+    `finish` renames the file to its final name, and `complete` leaves that to the caller.
 
     Parameters
     ----------
     path : Path
-        Name of the finished log. Neither it nor its active name may exist.
+        Path of the finished log. Neither it nor its active name may exist.
     created : int
         Time of the attachments, in nanoseconds of UTC.
 
     Raises
     ------
     LogError
-        If the log exists already, or is being written.
+        If the log exists, or is being written.
     OSError
         If the folder or the file cannot be written.
     """
@@ -284,7 +284,7 @@ class LogWriter:
     ) -> None:
         self.path = path
         self.active_path = active_path(path)
-        self._synced = 0  # bytes
+        self._synced = 0  # bytes on disk
         self._stream = _create(path, self.active_path)
         self._status = os.fstat(self._stream.fileno())
         try:
@@ -299,7 +299,7 @@ class LogWriter:
 
     @property
     def size(self) -> int:
-        """Bytes that were flushed."""
+        """Number of flushed bytes."""
         return self._stream.tell()
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
@@ -322,7 +322,7 @@ class LogWriter:
         self._content.write_columns(batch)
 
     def flush(self) -> None:
-        """End the chunk and hand it to the operating system.
+        """End the chunk and pass it to the operating system.
 
         Raise `OSError` if the file cannot be written.
         """
@@ -330,7 +330,7 @@ class LogWriter:
         self._stream.flush()
 
     def sync(self) -> None:
-        """Wait until what was flushed is on the disk.
+        """Wait until the flushed data are on disk.
 
         Raise `OSError` if the file cannot be written, or has been deleted.
         """
@@ -340,7 +340,7 @@ class LogWriter:
         self._synced = os.fstat(self._stream.fileno()).st_size
 
     def complete(self) -> None:
-        """Complete the log under its active name.
+        """Finish the log under its active name.
 
         Raise `OSError` if the file cannot be written.
         """
@@ -350,7 +350,7 @@ class LogWriter:
         self._stream.close()
 
     def finish(self) -> Path:
-        """Complete the log, give it its name, and return that.
+        """Finish the log, rename it to its final name, and return the path.
 
         Raise `OSError` if the file cannot be written or renamed.
         """
@@ -360,14 +360,14 @@ class LogWriter:
         return self.path
 
     def abandon(self) -> None:
-        """Stop writing and leave the active file as it is, after the disk refused it."""
-        with suppress(OSError):  # it is the reason for being here
+        """Stop writing after a disk error, and leave the active file unchanged."""
+        with suppress(OSError):  # the error that led here
             self._stream.close()
 
     def discard_unsynced(self) -> None:
-        """Cut the abandoned file to what is known to be on the disk, or delete it if nothing is.
+        """Truncate the abandoned file to its synced bytes, or delete it if there are none.
 
-        Raise `OSError` if the disk refuses that too.
+        Raise `OSError` if the disk refuses.
         """
         if not self._has_its_name():
             return
@@ -393,7 +393,7 @@ def _create(path: Path, active: Path) -> BinaryIO:
         raise LogError(
             f"{active}: is being written, or was left by a recorder that was killed"
         ) from error
-    # By this lock a recorder knows another one's file from one that was left behind.
+    # The lock distinguishes the file of a running recorder from an abandoned one.
     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     sync_folder(path.parent)
     return stream

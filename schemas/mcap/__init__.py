@@ -1,1 +1,1 @@
-"""MCAP: records, what a file consists of, messages of many chunks, and the way back."""
+"""MCAP records, file structure, batch reading and writing."""

@@ -1,4 +1,4 @@
-"""The chunks of a file and their time spans, from its index or by a walk over its records."""
+"""Chunks of a file and their time spans, from its index or by a scan of its records."""
 
 import io
 import struct
@@ -25,26 +25,26 @@ from hearthlog.schemas.mcap.records import (
 
 CHUNKS = np.dtype(
     [
-        ("offset", "<i8"),  # of the chunk, or of a run of messages outside of chunks
-        ("length", "<i8"),  # in bytes, heads included
-        ("index_length", "<i8"),  # of the message indexes behind it; -1 behind a run of messages
-        ("size", "<i8"),  # bytes, uncompressed
-        ("start", "<i8"),  # log time of its first message, in nanoseconds
-        ("end", "<i8"),  # and of its last
-        ("channels", "<i8"),  # a place in `LogFile.channel_sets`
-        # Byte of the content at which a part of a large chunk begins, whose other numbers are those
-        # of the part; -1: all of the chunk. Length and that of the indexes are 0 of a part.
+        ("offset", "<i8"),  # offset of the chunk, or of a run of messages outside of chunks
+        ("length", "<i8"),  # bytes, heads included
+        ("index_length", "<i8"),  # bytes of the message indexes behind it; -1 for a run of messages
+        ("size", "<i8"),  # uncompressed bytes
+        ("start", "<i8"),  # log time of the first message, in nanoseconds
+        ("end", "<i8"),  # log time of the last message, in nanoseconds
+        ("channels", "<i8"),  # index into `LogFile.channel_sets`
+        # Start offset in the content for a part of a large chunk, and -1 for a complete chunk. The
+        # other fields of a part describe the part; its length and index_length are 0.
         ("part", "<i8"),
     ]
 )
-LAST_TIME = (1 << 63) - 2  # ns; later log times, as of clocks that ran below zero, are not read
+LAST_TIME = (1 << 63) - 2  # ns; later log times, as of clocks that ran below zero, are skipped
 LATE = "messages are left out whose log times are after the year 2262, as of a clock below zero"
-_EMPTY = 80  # bytes that a chunk without records has at most
-_RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
+_EMPTY = 80  # maximum bytes of a chunk without records
+_RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks read at once
 
 
 class RecordLocation(NamedTuple):
-    """A record in a file; its length includes opcode and length."""
+    """Location of a record in a file; the length includes opcode and length."""
 
     opcode: int
     offset: int
@@ -53,9 +53,9 @@ class RecordLocation(NamedTuple):
 
 @dataclass
 class ChunkRow:
-    """A row of `CHUNKS` in the making, and the channels whose message indexes follow the chunk.
+    """Row of `CHUNKS` under construction, and the channels of the following message indexes.
 
-    Log times after `LAST_TIME` are that time in it, and it is `late` then.
+    Log times after `LAST_TIME` are clipped to it, and set `late`.
     """
 
     offset: int
@@ -68,20 +68,20 @@ class ChunkRow:
     late: bool = False
 
     def numbers(self) -> tuple[int, ...]:
-        """Return the numbers of the row, without its channels."""
+        """Return the values of the row, except its channels."""
         return self.offset, self.length, self.index_length, self.size, self.start, self.end
 
     def continues(self, location: RecordLocation) -> bool:
-        """Tell whether a message record belongs to this run of messages.
+        """Return whether a message record continues this run of messages.
 
-        It does if it begins where the run ends, and the run is not too long yet.
+        The record must start at the end of the run, and the run must be below its size limit.
         """
         is_next = self.offset + self.length == location.offset and not self.late
         is_next &= location.length < _RUN_LIMIT
         return self.index_length < 0 and is_next and self.length < _RUN_LIMIT
 
     def extend(self, message: "ChunkRow") -> None:
-        """Add a message to this run."""
+        """Append a message to this run."""
         self.length += message.length
         self.size += message.size
         self.start = min(self.start, message.start)
@@ -91,7 +91,7 @@ class ChunkRow:
 
 
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
-    """Describe a chunk, or a message outside of chunks, from the beginning of its record.
+    """Return the row of a chunk, or of a message outside of chunks, from the start of its record.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     Raises
     ------
     McapError
-        If it is too short, or a size is 2**63 or more.
+        If the head is too short, or a size is 2**63 or more.
     """
     opcode, offset, length = location
     try:
@@ -117,10 +117,10 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
 
 
 def read_chunk_index(content: bytes) -> ChunkRow:
-    """Describe a chunk from its chunk index.
+    """Return the row of a chunk from its chunk index.
 
-    Raise `McapError` if a place or a size is 2**63 or more. Raise `struct.error` if the content
-    is shorter than it claims, or holds a part of an index offset.
+    Raise `McapError` if an offset or a size is 2**63 or more. Raise `struct.error` if the
+    content is shorter than stated, or ends within an index offset.
     """
     start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
     first = CHUNK_INDEX.size
@@ -136,7 +136,7 @@ def read_chunk_index(content: bytes) -> ChunkRow:
 
 
 def _row(sizes: tuple[int, int, int, int], start: int, end: int) -> ChunkRow:
-    """Make a row of offset, length, length of the indexes and size, and of two log times."""
+    """Return a row from offset, length, length of the indexes and size, and two log times."""
     if max(sum(sizes[:3]), sizes[3]) > LAST_TIME:
         raise McapError("a number is out of range")
     late = max(start, end) > LAST_TIME
@@ -144,7 +144,7 @@ def _row(sizes: tuple[int, int, int, int], start: int, end: int) -> ChunkRow:
 
 
 def not_empty(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    """Leave out chunks that hold nothing, of which a hostile file may have very many.
+    """Remove empty chunks, which a hostile file may have in great numbers.
 
     Parameters
     ----------
@@ -167,31 +167,31 @@ def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
     Returns
     -------
     np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        A sorted copy; chunks of the same time keep their order.
+        Sorted copy; chunks with equal times keep their order.
     """
     return chunks[np.argsort(chunks["start"], kind="stable")]
 
 
-_RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
-_WINDOW = 1 << 14  # bytes that are read at once: an hour has half a million records
+_RECORD_HEAD = HEAD.size + CHUNK.size  # bytes with the length and the time span of a record
+_WINDOW = 1 << 14  # bytes per read: an hour has half a million records
 
 
 def walk_records(
     read: Callable[[int, int], bytes], start: int
 ) -> Iterator[tuple[int, int, int, bytes]]:
-    """Go from record to record, as long as there is the head of one.
+    """Walk from record to record, while there are complete record heads.
 
     Parameters
     ----------
     read : callable
-        Returns bytes of the file from an offset on, fewer than asked for at its end.
+        Called with offset and length, returns bytes of the file; fewer at its end.
 
     Yields
     ------
     opcode, offset, length : int
-        Of the record, which may claim to be longer than the file; with opcode and length.
+        Location of the record, including opcode and length; it may exceed the file.
     head : bytes
-        Its first bytes, opcode and length included, or all of them.
+        First bytes of the record, opcode and length included, or all of them.
     """
     window, first = b"", start
     while True:
@@ -215,7 +215,7 @@ def read_records(
     Parameters
     ----------
     start, end : int
-        Of the section, in bytes.
+        Byte range of the section.
 
     Raises
     ------

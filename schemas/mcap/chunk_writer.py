@@ -1,6 +1,6 @@
-"""Write MCAP from arrays: whole blocks of messages at once, as the writer of `mcap` would.
+"""MCAP writer for arrays, with blocks of messages as input.
 
-The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages one by one.
+The output is byte for byte that of `mcap.writer.Writer` for the same single messages.
 """
 
 import zlib
@@ -37,7 +37,7 @@ from hearthlog.schemas.mcap.records import (
 
 
 class Block(NamedTuple):
-    """Messages of one channel whose payloads have one size.
+    """Messages of one channel with payloads of one size.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Block(NamedTuple):
     sequences : np.ndarray [shape=(n,)], uint32
     payloads : np.ndarray [shape=(n,)], of a dtype of the payloads' size
     rank : np.ndarray [shape=(n,)], int64
-        Where log times are equal, the message of lower rank comes first.
+        Order of messages with equal log times.
     """
 
     channel: int
@@ -62,7 +62,7 @@ class Block(NamedTuple):
         Returns
         -------
         np.ndarray [shape=(n,)], of dtype V`size`
-            One record in each row, with opcode and length; `size` is that of a whole record.
+            One record per row, with opcode and length; `size` is the size of a complete record.
         """
         size = self.payloads.dtype.itemsize
         records = np.empty(len(self.payloads), [("head", MESSAGE_HEAD), ("payload", f"V{size}")])
@@ -78,7 +78,7 @@ class Block(NamedTuple):
 
 
 def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
-    """Group messages by the sizes of their payloads, to write them unchanged to a channel."""
+    """Group messages by payload size, to write them unchanged to a channel."""
     for size in np.unique(messages.sizes).tolist():
         rows = np.flatnonzero(messages.sizes == size)
         heads = messages.heads[rows]
@@ -98,13 +98,13 @@ class MessageRecords(NamedTuple):
     Attributes
     ----------
     data : np.ndarray [shape=(b,)], uint8
-        The records, one behind the other.
+        Concatenated records.
     ends : np.ndarray [shape=(n,)], int64
-        Bytes of the data before which each record ends.
+        End offset of each record in the data.
     sizes : np.ndarray [shape=(n,)], int64
         Bytes of each record.
     channels : np.ndarray [shape=(n,)], int64
-        Number of the channel of each.
+        Channel ID of each record.
     times : np.ndarray [shape=(n,)], int64
         Log time of each in nanoseconds, ascending.
     """
@@ -119,14 +119,14 @@ class MessageRecords(NamedTuple):
 def join_messages(
     channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
 ) -> MessageRecords:
-    """Encode messages as records, in their order.
+    """Encode messages as records, in order.
 
     Parameters
     ----------
     channels : sequence of int
-        Number of the channel of each; one message at least.
+        Channel ID of each message; at least one message.
     times : sequence of int
-        Log time of each, which is also its publish time, in nanoseconds; ascending.
+        Log time and publish time of each message, in nanoseconds; ascending.
     """
     heads = np.empty(len(payloads), MESSAGE_HEAD)
     heads["opcode"] = Opcode.MESSAGE
@@ -135,7 +135,7 @@ def join_messages(
     heads["sequence"] = 0
     heads["log_time"] = heads["publish_time"] = times
     pieces = [b""] * (2 * len(payloads))
-    pieces[::2] = heads.view(f"V{MESSAGE_HEAD.itemsize}").tolist()  # bytes; S would lose zeros
+    pieces[::2] = heads.view(f"V{MESSAGE_HEAD.itemsize}").tolist()  # S would strip trailing zeros
     pieces[1::2] = payloads
     sizes = heads["length"].astype(np.int64) + HEAD.size
     return MessageRecords(
@@ -153,7 +153,7 @@ def merge_blocks(blocks: Sequence[Block]) -> MessageRecords:
     Parameters
     ----------
     blocks : sequence of Block
-        One or more, none of them empty. Messages of the same log time are sorted by their ranks.
+        At least one, none empty. Messages of equal log time are sorted by rank.
     """
     times = np.concatenate([block.log_times for block in blocks])
     order = np.lexsort((np.concatenate([block.rank for block in blocks]), times))
@@ -173,24 +173,24 @@ def merge_blocks(blocks: Sequence[Block]) -> MessageRecords:
 
 
 CHUNK_SIZE = 1 << 20
-_LEAST = 4 << 10  # bytes that a chunk has before the span of time can end it
+_LEAST = 4 << 10  # minimum bytes of a chunk before its time span can end it
 _COMPRESSORS = 2  # threads
-_FEW = 48  # messages: one by one they take less time than as arrays
-GATHERED_SPAN = 60 * NANOSECONDS  # of messages that have chunks of their own
+_FEW = 48  # below this number of messages, arrays are slower than single messages
+GATHERED_SPAN = 60 * NANOSECONDS  # ns, time span of separate chunks
 
 
 class ChunkWriter:
-    """Writes an MCAP file, chunks compressed with Zstandard and indexed.
+    """Writer of an MCAP file with indexed chunks in Zstandard compression.
 
-    The methods that it shares with `mcap.writer.Writer` do the same.
+    Methods named as in `mcap.writer.Writer` have the same effect.
 
     Parameters
     ----------
     chunk_size : int
-        Bytes of records, uncompressed; the message that goes beyond them is the last of its chunk.
+        Uncompressed bytes of records; the message that exceeds this is the last of its chunk.
     chunk_span : int, optional
-        Nanoseconds of log time that `write` puts into a chunk at most, or 4 KiB if these take
-        longer; no limit by default.
+        Maximum log time span in nanoseconds of a chunk made by `write`, unless the chunk is
+        smaller than 4 KiB; no limit by default.
     """
 
     def __init__(
@@ -201,14 +201,14 @@ class ChunkWriter:
         self._chunk_span = chunk_span
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
-        self._chunk_indexes = bytearray()  # as it will be written: there may be very many
+        self._chunk_indexes = bytearray()  # encoded, as there may be very many
         self._chunk_count = 0
         self._file_span = (LATEST, 0)
         self._attachments: list[records.AttachmentIndex] = []
         self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._chunk = ChunkBuilder()  # in progress
-        self._gathered = ChunkBuilder()  # of the channels that have chunks of their own
+        self._gathered = ChunkBuilder()  # chunk in progress of channels with separate chunks
 
     def start(self, profile: str, library: str) -> None:
         """Write the magic bytes and the header.
@@ -239,12 +239,12 @@ class ChunkWriter:
     def copy_attachment(
         self, record: Iterable[bytes | memoryview], index: records.AttachmentIndex
     ) -> None:
-        """Write an attachment as another file holds it.
+        """Write an attachment of another file.
 
         Parameters
         ----------
         index : mcap.records.AttachmentIndex
-            What the index will say of it; offset and length are replaced by those in this file.
+            Index entry of the attachment; its offset and length are replaced.
         """
         offset = self._stream.tell()
         length = 0
@@ -254,9 +254,9 @@ class ChunkWriter:
         self._attachments.append(replace(index, offset=offset, length=length))
 
     def copy_record(self, record: Iterable[bytes]) -> None:
-        """Write a record of a kind that no index lists, as another file holds it, in pieces.
+        """Write a record of another file, of a kind without index, in pieces.
 
-        The chunk in progress is written before it.
+        The chunk in progress is written first.
         """
         self.flush()
         for piece in record:
@@ -268,7 +268,7 @@ class ChunkWriter:
         Returns
         -------
         int
-            Number of the schema, from 1 on.
+            Schema ID, from 1 on.
         """
         schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
         self._schemas.append(schema)
@@ -283,12 +283,12 @@ class ChunkWriter:
         Parameters
         ----------
         schema_id : int
-            Number of its schema; 0 if it has none.
+            Schema ID; 0 for none.
 
         Returns
         -------
         int
-            Number of the channel, from 1 on.
+            Channel ID, from 1 on.
         """
         channel = records.Channel(
             len(self._channels) + 1, topic, message_encoding, metadata, schema_id
@@ -302,8 +302,8 @@ class ChunkWriter:
     ) -> None:
         """Set the schemas and channels of the index.
 
-        They are not written anywhere else: chunks that were copied contain them, or
-        `write_definition` has put them before their first message.
+        They are written only to the index: copied chunks contain them, or `write_definition` has
+        written them before their first message.
         """
         self._schemas = list(schemas)
         self._channels = list(channels)
@@ -342,7 +342,7 @@ class ChunkWriter:
     def add_messages(
         self, channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
     ) -> None:
-        """Append messages, by the number of the channel, log time and payload of each.
+        """Append messages from channel IDs, log times and payloads.
 
         The publish time of a message is its log time; log times ascend.
         """
@@ -358,16 +358,16 @@ class ChunkWriter:
         Parameters
         ----------
         blocks : sequence of Block
-            Empty ones are left out.
+            Empty blocks are skipped.
         """
         blocks = [block for block in blocks if len(block.log_times)]
         if blocks:
             self._append(merge_blocks(blocks))
 
     def flush(self) -> None:
-        """End the chunks in progress, if they have messages, and write them."""
+        """Write the chunks in progress, if they have messages."""
         self._flush_chunk()
-        # Behind the other, which may define its channels.
+        # Written last: the other chunk may define its channels.
         if self._gathered.entries:
             self._put(self._gathered.compress())
             self._gathered = ChunkBuilder()
@@ -378,20 +378,20 @@ class ChunkWriter:
             self._chunk = ChunkBuilder()
 
     def copy_chunk(self, chunk: StoredChunk) -> None:
-        """Write a chunk of another file as it is, and its message index behind it.
+        """Write a chunk of another file unchanged, followed by its message index.
 
-        The chunk in progress is written before it.
+        The chunk in progress is written first.
         """
         self.flush()
         self._put(chunk)
 
     def copy_large_chunk(self, chunk: StoredChunk, length: int, data: Iterable[bytes]) -> None:
-        """Write a chunk of another file as `copy_chunk` does, without having all of it at once.
+        """Write a chunk of another file as `copy_chunk` does, with its data in pieces.
 
         Parameters
         ----------
         length : int
-            Bytes of the data.
+            Size of the data in bytes.
         """
         self.flush()
         self._put_pieces(chunk, length, data)
@@ -408,7 +408,7 @@ class ChunkWriter:
         Parameters
         ----------
         span : int
-            Nanoseconds of log time that the joined chunk may have; a longer one is not joined.
+            Maximum log time span in nanoseconds of the joined chunk; a longer one is not joined.
         """
         own = {number for number in chunk.entries if number in gathered} - set(dropped)
         rest = chunk.entries.keys() - own - set(dropped)
@@ -437,7 +437,7 @@ class ChunkWriter:
             self._gathered.gather(chunk, own)
 
     def finish(self) -> None:
-        """Write the chunk in progress, the index and the footer; the stream stays open."""
+        """Write the chunk in progress, the index and the footer; keep the stream open."""
         self.flush()
         self._write(records.DataEnd(0))
         summary_start = self._stream.tell()
@@ -465,12 +465,12 @@ class ChunkWriter:
 
     @property
     def message_counts(self) -> Mapping[int, int]:
-        """Messages in the chunks that were written, by number of the channel."""
+        """Number of messages in the written chunks, by channel ID."""
         return self._counts
 
     @property
     def span(self) -> tuple[int, int]:
-        """First and last log time in the chunks that were written, in ns; (0, 0) without any."""
+        """First and last log time of the written chunks, in nanoseconds; (0, 0) without chunks."""
         return self._file_span if self._chunk_count else (0, 0)
 
     def _statistics(self) -> records.Statistics:
@@ -488,7 +488,7 @@ class ChunkWriter:
         )
 
     def _put(self, chunk: StoredChunk) -> int:
-        """Write a chunk and its message index; return the bytes of the first."""
+        """Write a chunk and its message index; return the size of the chunk record in bytes."""
         return self._put_pieces(chunk, len(chunk.data), [chunk.data])
 
     def _put_pieces(
@@ -528,7 +528,7 @@ class ChunkWriter:
         return first - offset
 
     def _append(self, messages: MessageRecords) -> None:
-        """Cut message records into chunks."""
+        """Split message records into chunks."""
         data, ends, sizes, channels, times = messages
         full: list[ChunkBuilder] = []
         first = offset = 0

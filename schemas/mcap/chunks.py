@@ -1,4 +1,4 @@
-"""The messages of many chunks at once, still encoded, by the message indexes behind each chunk."""
+"""Batched reading of still encoded messages from chunks, through their message indexes."""
 
 import hashlib
 import warnings
@@ -48,19 +48,19 @@ from hearthlog.schemas.mcap.records import (
 )
 
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"
-_STREAMS = 3  # of a file: where channels lie one behind the other, each has its own
-_AGAIN = 16  # times the bytes of a large chunk that are decompressed once more, for their order
+_STREAMS = 3  # open content streams of a file: interleaved channels need one each
+_AGAIN = 16  # limit of repeated decompression of a large chunk, as a multiple of its size
 _INDEXES = "message indexes that do not belong to their chunks are not used"
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _ENTRY_SIZE = INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
-BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
+BATCH_SIZE = 4 << 20  # bytes, compressed plus decompressed
 
-TopicChoice = Collection[str] | Callable[[str], bool]  # names, or what tells whether one is chosen
+TopicChoice = Collection[str] | Callable[[str], bool]  # topic names, or a predicate
 
-OnDamage = Callable[[Path, LogError], None]  # told a log, and what of it is left out
+OnDamage = Callable[[Path, LogError], None]  # called with a log and its read error
 
-Entries = tuple[Int64, NDArray[np.void]]  # which chunk, and the entry of its index, in each row
+Entries = tuple[Int64, NDArray[np.void]]  # chunk number and index entry of each row
 
 
 def read_chunks(
@@ -68,21 +68,21 @@ def read_chunks(
     chunks: NDArray[np.void],
     topics: TopicChoice | None = None,
 ) -> list[RawMessages]:
-    """Read the messages of some topics, or of all, from some chunks of a log.
+    """Read the messages of the selected topics from chunks of a log.
 
     Parameters
     ----------
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
     topics : collection of str or callable, optional
-        Topics to read, or what tells whether one is read: all of them if None; none if empty, which
-        only adds definitions.
+        Topics to read, or a predicate: None for all; empty for none, which only adds
+        definitions.
 
     Raises
     ------
     LogError
-        If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
-        is of a channel that no sound chunk defines.
+        If the log cannot be read, a chunk is damaged, an index does not match its chunk, or no
+        undamaged chunk defines the channel of a message.
     """
     chunks = in_parts(file, chunks)
     apart = (chunks["part"] >= 0) | (chunks["size"] > LIMIT)
@@ -95,9 +95,9 @@ def read_chunks(
 def read_sound(
     file: LogFile, chunks: NDArray[np.void], topics: TopicChoice | None, on_damage: OnDamage
 ) -> list[RawMessages]:
-    """Read messages as `read_chunks` does, without the chunks that cannot be read.
+    """Read messages as `read_chunks` does, but skip unreadable chunks.
 
-    The log must be `partial`: then channels that nothing defines are left out, too.
+    The log must be `partial`: messages of undefined channels are skipped, too.
     """
     try:
         return read_chunks(file, chunks, topics)
@@ -106,7 +106,7 @@ def read_sound(
             each = (read_sound(file, row, topics, on_damage) for row in _rows(chunks))
             return list(chain.from_iterable(each))
         damage = error
-    without = chunks[chunks["index_length"] > 0]  # perhaps its message indexes alone are wrong
+    without = chunks[chunks["index_length"] > 0]  # perhaps only its message indexes are damaged
     without["index_length"] = 0
     try:
         read = read_chunks(file, without, topics) if len(without) else None
@@ -124,7 +124,7 @@ def _rows(chunks: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
 
 
 def _left_out(chunk: np.void, error: LogError) -> LogError:
-    """Say what is lost with a chunk that cannot be read."""
+    """Return the error that describes what an unreadable chunk loses."""
     text = str(error)
     hint = RECOVER if text.endswith(RECOVER) else ""
     end = int(chunk["offset"] + chunk["length"])
@@ -134,7 +134,7 @@ def _left_out(chunk: np.void, error: LogError) -> LogError:
 
 
 def _messages(file: LogFile, batch: "_Batch", topics: TopicChoice | None) -> list[RawMessages]:
-    """Find the messages of some topics in chunks that were read."""
+    """Find the messages of the selected topics in a batch of chunks."""
     indices = batch.indices(_other_channels(file, topics))
     if not indices.keys() - file.undefined <= file.channels.keys():
         _define(file, indices.keys())
@@ -155,21 +155,21 @@ def read_in_batches(
     topics: TopicChoice | None = None,
     on_damage: OnDamage | None = None,
 ) -> Iterator[list[RawMessages]]:
-    """Read chunks as `read_chunks` does, a few megabytes at a time.
+    """Read chunks as `read_chunks` does, in batches of `BATCH_SIZE`.
 
     Parameters
     ----------
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
     topics : collection of str or callable, optional
-        Topics to read, or what tells whether one is read: all of them if None; none if empty, which
-        only adds definitions.
+        Topics to read, or a predicate: None for all; empty for none, which only adds
+        definitions.
 
     Raises
     ------
     LogError
-        If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
-        is of a channel that no sound chunk defines.
+        If the log cannot be read, a chunk is damaged, an index does not match its chunk, or no
+        undamaged chunk defines the channel of a message.
     """
     chunks = in_parts(file, chunks, on_damage)
     batches = np.cumsum(chunks["size"] + chunks["length"]) // BATCH_SIZE
@@ -183,7 +183,7 @@ def read_in_batches(
 def in_parts(
     file: LogFile, chunks: NDArray[np.void], on_damage: OnDamage | None = None
 ) -> NDArray[np.void]:
-    """Divide chunks that are larger than `LIMIT` into parts, and compare them with their checksums.
+    """Split chunks larger than `LIMIT` into parts, and verify the checksums of these chunks.
 
     Parameters
     ----------
@@ -192,12 +192,12 @@ def in_parts(
     Returns
     -------
     np.ndarray [shape=(m,)], of dtype `CHUNKS`
-        By start time, if there is a large one; a message that is larger than `LIMIT` is a part.
+        Sorted by start time if any chunk was split; a message larger than `LIMIT` is a part.
 
     Raises
     ------
     LogError
-        If the log cannot be read, or one of the large chunks is damaged.
+        If the log cannot be read, or a large chunk is damaged.
     """
     large = (chunks["part"] < 0) & (chunks["index_length"] >= 0)
     large &= (chunks["size"] > LIMIT) | (chunks["length"] > LIMIT)
@@ -215,7 +215,7 @@ def in_parts(
 
 
 def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
-    """Divide a large chunk into parts, and add what it defines to the file."""
+    """Split a large chunk into parts, and add its definitions to the file."""
     rows = array("q")
     try:
         for part in _parts_of(ContentStream(file.read, offset)):
@@ -243,7 +243,7 @@ def _parts(file: LogFile, offset: int) -> NDArray[np.void]:
 
 
 def _parts_of(stream: ContentStream) -> Iterator[Part]:
-    """Read the parts of a large chunk, as long as it has no more records than its size allows."""
+    """Iterate over the parts of a large chunk; stop if it has more records than its size allows."""
     left = (1 << 20) + 4 * stream.head.data.stop
     for part in read_parts(stream):
         left -= len(part.messages) + len(part.others)
@@ -255,7 +255,7 @@ def _parts_of(stream: ContentStream) -> Iterator[Part]:
 def _read_part(
     file: LogFile, row: NDArray[np.void], topics: TopicChoice | None
 ) -> list[RawMessages]:
-    """Read the messages of a part of a large chunk; one that is too large is left out."""
+    """Read the messages of a part of a large chunk; skip a message that is too large."""
     offset, first, size = (int(row[name][0]) for name in ("offset", "part", "size"))
     if size > LIMIT:
         (channel,) = file.channel_sets[int(row["channels"][0])] or _channel_of(file, offset)
@@ -276,18 +276,18 @@ def _read_part(
     if len(content) < size:
         raise file.damaged(offset, "a chunk is shorter than it was")
     row = row.copy()
-    row["index_length"] = -1  # so that its records are gone through
+    row["index_length"] = -1  # forces a walk through its records
     buffer, start = np.frombuffer(content, np.uint8), np.zeros(1, np.int64)
     return _messages(file, _Batch(file, row, np.array([size]), buffer, buffer, start), topics)
 
 
 def _channel_of(file: LogFile, offset: int) -> tuple[int]:
-    """Read the channel of a message outside of chunks."""
+    """Read the channel ID of a message outside of chunks."""
     return (MESSAGE.unpack(file.read(offset, MESSAGE.size))[2],)
 
 
 def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
-    """Decompress a part of a large chunk; where the last one ended, decompression goes on."""
+    """Decompress a part of a large chunk, resuming the stream where the last part ended."""
     with file.lock:
         before = [s for s in file.streams if s.offset == offset and s.position <= first]
         stream = max(before, key=attrgetter("position"), default=None)
@@ -303,7 +303,7 @@ def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
 
 
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
-    """Compare chunks with their checksums.
+    """Verify the checksums of chunks.
 
     Parameters
     ----------
@@ -313,17 +313,17 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
     Raises
     ------
     LogError
-        If the log cannot be read, a chunk is damaged, or what follows one is no message index.
+        If the log cannot be read, a chunk is damaged, or a record behind one is no message index.
     """
     for _ in read_in_batches(file, chunks, topics=()):
         pass
 
 
 def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Find the chunks that are byte for byte an earlier one of the same file.
+    """Find the chunks that repeat an earlier chunk of the same file byte for byte.
 
-    Chunks of a single log time are none of them: a writer with one message in each chunk makes
-    equal ones of equal messages.
+    Chunks of a single log time are excluded: a writer with one message per chunk writes equal
+    chunks for equal messages.
 
     Parameters
     ----------
@@ -351,11 +351,11 @@ def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_
 
 
 def read_definitions(file: LogFile, on_damage: OnDamage | None = None) -> None:
-    """Add to a log the schemas and channels that only its chunks define.
+    """Add the schemas and channels to a log that only its chunks define.
 
     Raise `LogError` if the log cannot be read, or one of these chunks is damaged.
     """
-    chunks = not_empty(file.chunks[file.chunks["index_length"] >= 0])  # a run defines nothing
+    chunks = not_empty(file.chunks[file.chunks["index_length"] >= 0])  # a run has no definitions
     for number, channels in enumerate(chunks["channels"].tolist()):
         identities = file.channel_sets[channels]
         if not identities or not identities <= file.channels.keys():
@@ -364,21 +364,21 @@ def read_definitions(file: LogFile, on_damage: OnDamage | None = None) -> None:
 
 
 def _other_channels(file: LogFile, topics: TopicChoice | None) -> list[int]:
-    """Return the channels of a file that are of other topics."""
+    """Return the channels of a file whose topics are not selected."""
     return [
         number for number, channel in file.channels.items() if not is_chosen(channel.topic, topics)
     ]
 
 
 def is_chosen(topic: str, topics: TopicChoice | None) -> bool:
-    """Tell whether a topic is among those that are chosen; None chooses all."""
+    """Return whether a topic is selected; None selects all."""
     if topics is None:
         return True
     return topics(topic) if callable(topics) else topic in topics
 
 
 def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
-    """Read and decompress chunks, and compare them with their checksums."""
+    """Read and decompress chunks, and verify their checksums."""
     raw, starts = _read_stored(file, chunks)
     limit = int(np.clip(chunks["size"], 0, LIMIT).sum()) + LIMIT
     read = None
@@ -391,7 +391,7 @@ def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
 def _decompress_each(
     file: LogFile, chunks: NDArray[np.void], raw: Bytes, starts: Int64, limit: int
 ) -> tuple[Bytes, Int64]:
-    """Decompress chunks one by one, and find the one that is damaged."""
+    """Decompress chunks one by one, to find the damaged one."""
     lengths, indexed = chunks["length"], chunks["index_length"] >= 0
     records: list[tuple[ChunkHead | None, memoryview]] = []
     for number, (start, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
@@ -418,7 +418,7 @@ def _decompress_each(
 
 
 def _read_stored(file: LogFile, chunks: NDArray[np.void]) -> tuple[Bytes, Int64]:
-    """Read chunks and the indexes behind them, neighbours at once; return where each begins."""
+    """Read chunks and their message indexes, adjacent ones at once; return their start offsets."""
     offsets = chunks["offset"]
     lengths = chunks["length"] + np.maximum(chunks["index_length"], 0)
     size = file.size
@@ -447,7 +447,7 @@ def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
 def _add_definitions(
     file: LogFile, content: bytes | memoryview, places: Sequence[tuple[int, int]]
 ) -> None:
-    """Add the schemas and channels to a file that are at some places of a chunk."""
+    """Add the schemas and channels at these offsets of a chunk to a file."""
     for start, end in places:
         record = file.parse(content[start], bytes(content[start + HEAD.size : end]))
         if isinstance(record, records.Schema | records.Channel):
@@ -455,7 +455,7 @@ def _add_definitions(
 
 
 def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.void]]:
-    """Go through the records of a chunk: add its definitions to the file, make its index."""
+    """Walk through the records of a chunk: add its definitions to the file, build its index."""
     starts = array("q")
     for opcode, start, end in iterate_records(content):
         if opcode == Opcode.MESSAGE and end - start >= MESSAGE_HEAD.itemsize:
@@ -469,7 +469,7 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.v
 
 
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
-    """Look for channels that nothing read so far defines, from the first chunk on."""
+    """Search the chunks for the definitions of undefined channels, from the first chunk on."""
     damage = None
     chunks = file.chunks[file.chunks["index_length"] >= 0]
     for chunk in chunks[np.argsort(chunks["offset"])]:
@@ -486,7 +486,7 @@ def _define(file: LogFile, identities: AbstractSet[int]) -> None:
 
 
 class _Batch(NamedTuple):
-    """The records of some chunks of a log, in one buffer, and the chunks as they are stored."""
+    """The decompressed records of some chunks of a log, in one buffer, and their stored bytes."""
 
     file: LogFile
     chunks: NDArray[np.void]
@@ -496,7 +496,7 @@ class _Batch(NamedTuple):
     starts: Int64
 
     def indices(self, others: Sequence[int]) -> dict[int, list[Entries]]:
-        """Return the index entries of all channels but some; chunks without index get one."""
+        """Return the index entries of all other channels; build the index of chunks without one."""
         ends = self.starts + self.chunks["length"]
         parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
         without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
@@ -510,7 +510,7 @@ class _Batch(NamedTuple):
         known = entries_of.keys() <= channels
         for number in np.flatnonzero(without).tolist() if known else range(len(self.chunks)):
             if not without[number] and entries_of.keys() <= channels:
-                continue  # those before it define all
+                continue  # earlier chunks define all channels
             made = self.index_records(number)
             for identity, entries in made.items() if without[number] else ():
                 of_chunk = np.full(len(entries), number)
@@ -518,7 +518,7 @@ class _Batch(NamedTuple):
         return entries_of
 
     def _entries(self, parts: Int64) -> Entries:
-        """Collect the index entries of some parts, as `_index_parts` gives them."""
+        """Collect the index entries of the parts that `_index_parts` returns."""
         width = INDEX_ENTRIES.itemsize
         counts = parts[:, 3] // width
         before = np.cumsum(counts) - counts
@@ -527,12 +527,12 @@ class _Batch(NamedTuple):
         return np.repeat(parts[:, 0], counts), entries
 
     def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
-        """Go through the message indexes behind all chunks, one of each chunk at a time.
+        """Walk through the message indexes of all chunks in parallel, one per chunk and step.
 
         Returns
         -------
         np.ndarray [shape=(n, 4)]
-            Number of the chunk, of the channel, and place and size of its entries.
+            Chunk number, channel ID, offset and size of the entries.
         """
         index_head = MESSAGE_INDEX_HEAD
         parts = [np.empty((0, 4), np.int64)]
@@ -546,7 +546,7 @@ class _Batch(NamedTuple):
                 raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
             heads = gather(self.raw, starts, index_head.itemsize).view(index_head)
             length, size = heads["length"], heads["size"].astype(np.int64)
-            # Records may grow at their end, but not by what may be entries: the size is wrong then.
+            # Records may have trailing fields, but smaller than an entry: the size is wrong then.
             content = size + index_head.itemsize - HEAD.size
             sound = (
                 (heads["opcode"] == Opcode.MESSAGE_INDEX)
@@ -565,7 +565,7 @@ class _Batch(NamedTuple):
         return np.concatenate(parts)
 
     def index_records(self, number: int = 0) -> dict[int, NDArray[np.void]]:
-        """Go through the records of a chunk: note its channels, make the index it should have."""
+        """Walk through the records of a chunk: add its channels to the file, build its index."""
         end = int(self.sizes[: number + 1].sum())
         content = self.buffer[end - int(self.sizes[number]) : end].data
         try:
@@ -574,7 +574,7 @@ class _Batch(NamedTuple):
             raise self.file.damaged(int(self.chunks["offset"][number]), error) from error
 
     def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:
-        """Follow the index entries of a channel to its messages, and check every one of them."""
+        """Read the messages of a channel at its index entries, and check each message."""
         number = np.concatenate([numbers for numbers, _ in parts])
         entries = np.concatenate([entries for _, entries in parts])
         channel = self.file.channels.get(identity)
@@ -603,7 +603,7 @@ class _Batch(NamedTuple):
         if not sound.all():
             raise self._damaged(number[sound.argmin()], _WRONG_INDEX)
         if (heads["length"] + HEAD.size).sum() > len(self.buffer):
-            raise self._damaged(number[0], _WRONG_INDEX)  # it leads to some of them twice
+            raise self._damaged(number[0], _WRONG_INDEX)  # two entries point at one message
         offsets = starts + MESSAGE_HEAD.itemsize
         times = heads["log_time"]
         if (times[1:] < times[:-1]).any():

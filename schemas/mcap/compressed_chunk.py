@@ -1,4 +1,4 @@
-"""Compressed chunks: built, decompressed many at once, and the largest in parts."""
+"""Compressed chunks: building, batch decompression, and streaming of large chunks."""
 
 import io
 import threading
@@ -30,41 +30,41 @@ from hearthlog.schemas.mcap.records import (
     zstd_decompressor,
 )
 
-LATEST = 1 << 63  # log time, in nanoseconds, after all that a file may have
+LATEST = 1 << 63  # log time, in nanoseconds, after all log times of a file
 
 
 class StoredChunk(NamedTuple):
-    """A chunk as a file holds it."""
+    """Chunk in its stored form."""
 
     compression: bytes
     data: bytes | memoryview  # compressed records
-    size: int  # bytes of the records, uncompressed
-    crc: int  # CRC-32 of the same
+    size: int  # uncompressed bytes of the records
+    crc: int  # CRC-32 of the uncompressed records
     start: int  # log time of the first message, in nanoseconds
-    end: int  # and of the last
+    end: int  # log time of the last message, in nanoseconds
     entries: Mapping[
         int, bytes | bytearray | memoryview
     ]  # the message index, `INDEX_ENTRIES` by channel
-    raw: bytes | bytearray | memoryview | None = None  # records, uncompressed, where they are kept
+    raw: bytes | bytearray | memoryview | None = None  # uncompressed records, if they are kept
 
     def times(self, channel: int) -> Int64:
-        """Return the log times of a channel's messages, as the message index has them."""
+        """Return the log times of a channel's messages from the message index."""
         return np.frombuffer(self.entries[channel], INDEX_ENTRIES)["time"]
 
     def content(self) -> bytes:
         """Decompress the records.
 
-        Raise `McapError` if they are damaged.
+        Raise `McapError` if the records are damaged.
         """
         head = ChunkHead(0, 0, self.size, 0, self.compression, slice(None))
         return decompress(head, self.data)
 
 
-_LEVEL = 1  # of zstd: the usual 3 takes half as long again and saves 0.5 % of a log
+_LEVEL = 1  # zstd level: the default of 3 takes 1.5 times the time and saves 0.5 % of a log
 
 
 class _Local(threading.local):
-    """Compressors are dear to make and must not be shared between threads."""
+    """Per-thread compressors: costly to create, and not thread-safe."""
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdCompressor(_LEVEL)
@@ -74,12 +74,12 @@ _LOCAL = _Local()
 
 
 class ChunkBuilder:
-    """A chunk in progress.
+    """Builder of a chunk.
 
     Attributes
     ----------
     entries : dict of int to bytearray
-        Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
+        Message index by channel: rows of dtype `INDEX_ENTRIES`.
     start, end : int
         First and last log time of its messages, in nanoseconds; `LATEST` and 0 without messages.
     """
@@ -95,11 +95,11 @@ class ChunkBuilder:
         Parameters
         ----------
         data : np.ndarray [shape=(b,)], uint8
-            The records, one behind the other.
+            Concatenated records.
         channels : np.ndarray [shape=(n,)], int64
-            Number of the channel of each; n is 1 or more.
+            Channel ID of each record; n is 1 or more.
         entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
-            Log time of each, and its offset in the content of the whole chunk.
+            Log time of each message, and its offset in the content of the complete chunk.
         """
         self.content += data.data
         numbers, firsts = np.unique(channels, return_index=True)
@@ -110,12 +110,12 @@ class ChunkBuilder:
         self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
 
     def add_chunk(self, chunk: StoredChunk, dropped: Collection[int] = ()) -> None:
-        """Append the records of a chunk, without the messages of some channels.
+        """Append the records of a chunk, without the messages of the dropped channels.
 
         Parameters
         ----------
         dropped : collection of int
-            Numbers of the channels; if there are no others, nothing is appended.
+            Channel IDs; if they include all channels of the chunk, nothing is appended.
         """
         kept = {channel: rows for channel, rows in chunk.entries.items() if channel not in dropped}
         if not kept:
@@ -136,7 +136,7 @@ class ChunkBuilder:
             self.content += content[first:last]
 
     def gather(self, chunk: StoredChunk, channels: Collection[int]) -> None:
-        """Append the messages of some channels of a chunk, and nothing else that it holds."""
+        """Append only the messages of the given channels of a chunk."""
         content = chunk.content()
         for channel, rows in chunk.entries.items():
             if channel not in channels:
@@ -150,7 +150,7 @@ class ChunkBuilder:
                 self.start, self.end = min(self.start, time), max(self.end, time)
 
     def compress(self) -> StoredChunk:
-        """Compress the records; return the chunk as a file will hold it."""
+        """Compress the records to a chunk in its stored form."""
         return compress_chunk(self.content, (self.start, self.end), self.entries)
 
 
@@ -159,43 +159,43 @@ def compress_chunk(
     span: tuple[int, int],
     entries: Mapping[int, bytes | bytearray | memoryview],
 ) -> StoredChunk:
-    """Compress the records of a chunk; return it as a file will hold it.
+    """Compress the records of a chunk to its stored form.
 
     Parameters
     ----------
     span : (int, int)
-        First and last log time of its messages, in nanoseconds.
+        First and last log time of the messages, in nanoseconds.
     entries : mapping of int to bytes-like
-        Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
+        Message index by channel: rows of dtype `INDEX_ENTRIES`.
     """
     data, crc = _LOCAL.zstd.compress(content), zlib.crc32(content)
     return StoredChunk(b"zstd", data, len(content), crc, *span, entries, content)
 
 
-_LARGE = 16 << 10  # bytes, uncompressed: for chunks of so many, a call of Python is nothing
+_LARGE = 16 << 10  # uncompressed bytes of a chunk that make the cost of a Python call negligible
 _IS_POSSIBLE = "multi_decompress_to_buffer" in zstandard.backend_features
 
 
 def decompress_together(
     raw: Bytes, starts: Int64, lengths: Int64, limit: int
 ) -> tuple[Bytes, Int64] | None:
-    """Decompress chunks, and compare them with their checksums, if all are sound and of zstd.
+    """Decompress chunks and verify their checksums, if all are undamaged and use zstd.
 
     Parameters
     ----------
     raw : np.ndarray [shape=(b,)], uint8
-        Holds the records of the chunks.
+        Buffer with the records of the chunks.
     starts, lengths : np.ndarray [shape=(n,)], int64
-        Where each record begins, with its opcode, and its bytes, heads included.
+        Offset of each record, and its size in bytes, both including the record head.
     limit : int
-        Bytes, uncompressed, that the chunks may have in all.
+        Maximum uncompressed size of all chunks together, in bytes.
 
     Returns
     -------
     buffer : np.ndarray [shape=(c,)], uint8
-        The records of all chunks, uncompressed, one behind the other.
+        Concatenated uncompressed records of all chunks.
     sizes : np.ndarray [shape=(n,)], int64
-        Bytes of each chunk, uncompressed.
+        Uncompressed bytes of each chunk.
     """
     fixed = ZSTD_CHUNK_HEAD.itemsize
     if not _IS_POSSIBLE or (lengths < fixed).any():
@@ -230,7 +230,7 @@ def decompress_together(
 
 
 def _one_by_one(raw: Bytes, first: list[int], last: list[int], ends: list[int]) -> Bytes:
-    """Decompress chunks to where they are to lie."""
+    """Decompress chunks one by one into one buffer."""
     buffer, decompressor, start = np.empty(ends[-1], np.uint8), zstd_decompressor(), 0
     content, out = raw.data, buffer.data
     for begin, end, stop in zip(first, last, ends, strict=True):
@@ -242,60 +242,60 @@ def _one_by_one(raw: Bytes, first: list[int], last: list[int], ends: list[int]) 
 
 
 def _all_at_once(raw: Bytes, first: Int64, stored: Int64, sizes: Int64) -> Bytes:
-    """Decompress chunks without Python between them, and put them together."""
+    """Decompress chunks in one call without Python between them, and concatenate them."""
     frames = np.stack([first, stored], axis=1).astype(np.uint64)
     chunks = zstd_decompressor().multi_decompress_to_buffer(
         zstandard.BufferWithSegments(raw.data, frames.tobytes()),
         decompressed_sizes=sizes.astype(np.uint64).tobytes(),
-        threads=1,  # whoever reads has threads of its own
+        threads=1,  # the readers have their own threads
     )
     return np.frombuffer(b"".join(chunks), np.uint8)  # type: ignore[arg-type]  # of buffers
 
 
 _PART = 4 << 20  # bytes of records
-_PIECE = 1 << 20  # bytes that are decompressed at once
-_HEAD_LIMIT = 128  # bytes in which the head of a chunk ends
-# A chunk may claim so many bytes, and so many more for each byte that it has: a small file that
-# claims more is not worth the time.
+_PIECE = 1 << 20  # bytes per decompression step
+_HEAD_LIMIT = 128  # bytes that hold the head of a chunk
+# Limit of the stated content size: a constant plus a multiple of the stored size. A small file
+# with a larger claim is not worth the time.
 _CLAIMED, _RATIO = 1 << 30, 256
 
-Read = Callable[[int, int], bytes]  # bytes of a file from an offset on
+Read = Callable[[int, int], bytes]  # called with offset and length, returns bytes of a file
 
 
 class TooLargeError(McapError):
-    """A chunk claims more than is worth the time."""
+    """Error of a chunk with a stated size that is not worth the time."""
 
 
 def most_content(length: Any) -> Any:
-    """Return how large the content of a chunk may be that is opened.
+    """Return the maximum content size of a chunk that is opened, in bytes.
 
     Parameters
     ----------
     length : int or np.ndarray
-        Bytes of the chunk's record.
+        Size of the chunk record in bytes.
     """
     return _CLAIMED + _RATIO * length
 
 
 class ContentStream:
-    """The records of a chunk, decompressed piece by piece.
+    """Stream of the decompressed records of a chunk.
 
     Parameters
     ----------
     read : callable
-        Returns bytes of the file from an offset on, fewer than asked for at its end.
+        Called with offset and length, returns bytes of the file; fewer at its end.
     offset : int
-        Byte of the file at which the chunk begins.
+        Offset of the chunk in the file.
 
     Attributes
     ----------
     position : int
-        Bytes that were read, uncompressed.
+        Number of uncompressed bytes read.
 
     Raises
     ------
     McapError
-        If no chunk begins there, or it is larger than hearthlog reads.
+        If there is no chunk at the offset, or it is larger than hearthlog reads.
     """
 
     def __init__(self, read: Read, offset: int) -> None:
@@ -316,7 +316,7 @@ class ContentStream:
     def read(self, length: int) -> bytes:
         """Read the next bytes; fewer at the end.
 
-        Raise `McapError` if they cannot be decompressed.
+        Raise `McapError` if the data cannot be decompressed.
         """
         parts = []
         left = min(length, self.head.size - self.position)
@@ -331,16 +331,15 @@ class ContentStream:
         return b"".join(parts)
 
     def skip(self, length: int) -> None:
-        """Pass over the next bytes."""
+        """Skip the next bytes."""
         end = self.position + length
         while self.position < end and self.read(min(_PIECE, end - self.position)):
             pass
 
     def check(self) -> int:
-        """Return the checksum of all that was read, which must be the whole content.
+        """Return the checksum of the complete content, which must have been read.
 
-        Raise `McapError` if the content has another size or another checksum than the chunk
-        claims.
+        Raise `McapError` if size or checksum of the content differ from the stated values.
         """
         if self.position != self.head.size or self._stream.read(1):
             raise McapError("a chunk has another size than it claims")
@@ -350,7 +349,7 @@ class ContentStream:
 
 
 class _Stored(io.RawIOBase):
-    """Some bytes of a file, as a stream."""
+    """Byte range of a file as a stream."""
 
     def __init__(self, read: Read, start: int, length: int) -> None:
         super().__init__()
@@ -367,11 +366,11 @@ class _Stored(io.RawIOBase):
 
 
 def _decompressing(compression: bytes, source: io.BufferedReader) -> Any:
-    """Open a stream of what was compressed."""
+    """Open a stream that decompresses a source."""
     if compression == b"zstd":
         return zstandard.ZstdDecompressor().stream_reader(source)
     if compression == b"lz4":
-        import lz4.frame  # noqa: PLC0415  only others write such files
+        import lz4.frame  # noqa: PLC0415  only other writers use lz4
 
         return lz4.frame.LZ4FrameFile(source)
     if compression:
@@ -380,7 +379,7 @@ def _decompressing(compression: bytes, source: io.BufferedReader) -> Any:
 
 
 def stated_size(compression: bytes, data: bytes) -> int | None:
-    """Return how large compressed data claim to be, by their first bytes; None if they do not.
+    """Return the decompressed size stated by compressed data; None if there is none.
 
     Parameters
     ----------
@@ -413,13 +412,13 @@ class Part(NamedTuple):
     Attributes
     ----------
     first : int
-        Byte of the content at which they begin.
+        Offset of the part in the content.
     size : int
-        Bytes of them.
+        Size of the part in bytes.
     messages : array of int
-        Bytes of `content` at which messages begin.
+        Offsets of messages in `content`.
     others : list of (int, int)
-        Bytes of `content` at which schemas and channels begin, and before which they end.
+        Start and end offsets of schemas and channels in `content`.
     """
 
     first: int
@@ -430,13 +429,13 @@ class Part(NamedTuple):
 
 
 def read_parts(stream: ContentStream) -> Iterator[Part]:
-    """Read all records of a chunk, and compare them with its checksum at the end.
+    """Read all records of a chunk, and verify its checksum at the end.
 
     Raise `McapError` if the chunk is damaged.
     """
-    held, first = bytearray(), 0  # byte of the content at which `held` begins
+    held, first = bytearray(), 0  # offset of `held` in the content
     messages, others = array("q"), list[tuple[int, int]]()
-    whole = 0  # bytes of `held` that are whole records
+    whole = 0  # bytes of complete records in `held`
     while piece := stream.read(_PIECE):
         held += piece
         whole, large = _next_records(held, whole, stream.head.size - first, messages, others)
@@ -461,9 +460,9 @@ def read_parts(stream: ContentStream) -> Iterator[Part]:
 def _next_records(
     held: bytearray, whole: int, end: int, messages: "array[int]", others: list[tuple[int, int]]
 ) -> tuple[int, int]:
-    """Go on from record to record; return where the last whole one ends.
+    """Walk through records; return the end of the last complete record.
 
-    The second number is the bytes of the record that begins there if that is larger than `LIMIT`.
+    The second number is the size of the next record if that is larger than `LIMIT`.
     """
     while len(held) - whole >= min(MESSAGE.size, end - whole):
         if end - whole < HEAD.size:

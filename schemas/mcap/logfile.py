@@ -1,4 +1,4 @@
-"""Records of one log, located by its index or by a walk from record to record."""
+"""Records of one log, located through its index or by a scan."""
 
 import struct
 import threading
@@ -53,27 +53,27 @@ from hearthlog.schemas.mcap.records import (
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
 _NO_UTF8 = "bytes that are not UTF-8 stand as \\xNN in names of topics, types or records"
-ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
+ACTIVE_SUFFIX = ".mcap.active"  # suffix of a file that is still being written
 RECOVER = "; `hearthlog recover` saves the rest"
 _CHANNEL_END = HEAD.size + UINT16.size
-_PLACES = 1000  # where a damaged record is followed by a chunk, at most
+_PLACES = 1000  # maximum number of damaged places with a chunk behind them
 _LENGTH = "a record has another length than it claims"
-_SEARCHED = 1 << 20  # bytes that are searched at once
+_SEARCHED = 1 << 20  # bytes per search step
 _ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
 
 
 @dataclass
 class _Lost:
-    """The damaged part of a file, which is left out."""
+    """Skipped damaged parts of a file."""
 
-    first: int = 0  # byte of the file
+    first: int = 0  # offset in the file
     why: str = ""
     places: int = 0
     size: int = 0  # bytes
-    _end: int = -1  # of the last place
+    _end: int = -1  # end of the last part
 
     def add(self, start: int, end: int, why: str) -> None:
-        """Add some bytes; those that follow the last ones are of one place with them."""
+        """Add a byte range; merge it with the last one if they are adjacent."""
         if not self.places:
             self.first, self.why = start, why
         self.places += start != self._end
@@ -82,35 +82,35 @@ class _Lost:
 
 
 class LogFile:
-    """A log, open for reading.
+    """Log, open for reading.
 
     Parameters
     ----------
     indexed : bool
-        Whether to look for the chunks at once; without that, `scan_new` finds them.
+        Whether to locate the chunks immediately; otherwise `scan_new` does.
     partial : bool
-        Whether damaged records are left out, with a warning that counts their bytes; by default
-        they are an error.
+        Whether to skip damaged records, with a warning that counts their bytes; by default they
+        are an error.
 
     Attributes
     ----------
     header : mcap.records.Header or None
-        None as long as none was met.
+        None until it is read.
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
-        Of a file without an index, those inside chunks are not among them.
+        Without definitions inside chunks if the file has no index.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        All chunks that were met so far, by start time.
+        All chunks found so far, by start time.
     channel_sets : list of frozenset of int
-        Channels with messages in a chunk; the empty set if the file does not tell which.
+        Channels with messages in a chunk; empty if the file does not list them.
     late : bool
-        Whether there may be messages with log times after `LAST_TIME`, which are not read.
+        Whether there may be messages with log times after `LAST_TIME`, which are skipped.
     statistics : mcap.records.Statistics or None
-        None unless the file has a sound index, with statistics.
+        None without a valid index or statistics.
 
     Raises
     ------
     LogError
-        If it cannot be read, is not an MCAP file, or is damaged.
+        If the file cannot be read, is not an MCAP file, or is damaged.
     """
 
     def __init__(self, path: Path, *, indexed: bool = True, partial: bool = False) -> None:
@@ -126,15 +126,15 @@ class LogFile:
         self.record_locations: list[RecordLocation] = []
         self.channel_sets: list[frozenset[int]] = []
         self.chunks = np.empty(0, CHUNKS)
-        self._end = len(MAGIC)  # of the records that were scanned
+        self._end = len(MAGIC)  # end of the scanned records
         self._sets: dict[frozenset[int], int] = {}
         self._lost = _Lost()
-        self.undefined: set[int] = set()  # channels that no chunk defines
-        self.doubtful: set[int] = set()  # channels that are defined in two ways
+        self.undefined: set[int] = set()  # channels without definition in any chunk
+        self.doubtful: set[int] = set()  # channels with two different definitions
         self._doubtful_schemas: set[int] = set()
-        self.streams: list[ContentStream] = []  # of large chunks that are being read
-        self.again: Counter[int] = Counter()  # bytes decompressed once more, by large chunk
-        self.lock = threading.Lock()  # of both
+        self.streams: list[ContentStream] = []  # large chunks that are being read
+        self.again: Counter[int] = Counter()  # bytes of repeated decompression, by large chunk
+        self.lock = threading.Lock()  # guards `streams` and `again`
         try:
             self._check_magic()
             if indexed:
@@ -155,12 +155,12 @@ class LogFile:
 
     @property
     def size(self) -> int:
-        """Bytes of the file: one of this machine may grow, one of a store does not."""
+        """Size of the file in bytes: a local file may grow, a file in a store does not."""
         return self._file.size
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """First and last log time of the chunks that were met; None if there are none."""
+        """First and last log time of the chunks found so far; None without chunks."""
         chunks = self.chunks
         if self.late:
             chunks = chunks[chunks["start"] < LAST_TIME]
@@ -171,18 +171,11 @@ class LogFile:
         return int(chunks["start"].min()), int(chunks["end"].max())
 
     def is_at(self, path: Path) -> bool:
-        """Tell whether a path leads to this open file, and not to another one or none."""
+        """Return whether a path refers to this open file."""
         return self._file.is_at(path)
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes from an offset on.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file.
-        length : int
-            Bytes to read.
+        """Read bytes at an offset.
 
         Raises
         ------
@@ -192,14 +185,12 @@ class LogFile:
         return self._file.read(offset, length)
 
     def read_into(self, out: memoryview, offset: int) -> None:
-        """Read bytes from an offset on into a buffer.
+        """Read bytes at an offset into a buffer.
 
         Parameters
         ----------
         out : memoryview
-            Filled from its beginning; only in part at the end of the file.
-        offset : int
-            Byte of the file.
+            Filled from its start; partly at the end of the file.
 
         Raises
         ------
@@ -209,17 +200,17 @@ class LogFile:
         self._file.read_into(out, offset)
 
     def record(self, location: RecordLocation) -> McapRecord | None:
-        """Read a metadata record, an attachment, or another one that holds no messages.
+        """Read a metadata record, an attachment, or another record without messages.
 
         Returns
         -------
         McapRecord or None
-            None for a chunk, a message, a message index, and a kind that MCAP does not define.
+            None for a chunk, a message, a message index, or a kind that MCAP does not define.
 
         Raises
         ------
         LogError
-            If it is larger than `LIMIT`, damaged, or cannot be read.
+            If the record is larger than `LIMIT`, damaged, or cannot be read.
         """
         if location.length > LIMIT:
             what = "an attachment" if location.opcode == Opcode.ATTACHMENT else "a record"
@@ -233,9 +224,9 @@ class LogFile:
             raise self.damaged(location.offset, error) from error
 
     def parse(self, opcode: int, content: bytes) -> McapRecord | None:
-        """Parse a record of this file; where a text is not UTF-8, warn of it, and read the rest.
+        """Parse a record of this file; warn of texts that are not UTF-8.
 
-        Raise `McapError` if it is too short for what it claims to hold.
+        Raise `McapError` if the record is shorter than its fields.
         """
         record, escaped = parse_escaped(opcode, content)
         if escaped:
@@ -245,7 +236,7 @@ class LogFile:
     def with_channels(
         self, chunks: NDArray[np.void], channels: AbstractSet[int]
     ) -> NDArray[np.void]:
-        """Select the chunks that may have messages of some channels.
+        """Select the chunks that may have messages of the given channels.
 
         Parameters
         ----------
@@ -255,26 +246,20 @@ class LogFile:
         Returns
         -------
         np.ndarray [shape=(m,)], of dtype `CHUNKS`
-            Chunks of which the file does not tell the channels are among them.
+            Includes chunks without a list of channels.
         """
         may_have = [not ids or not ids.isdisjoint(channels) for ids in self.channel_sets]
         return chunks[np.array(may_have, bool)[chunks["channels"]]]
 
     def damaged(self, offset: int, what: object) -> LogError:
-        """Make the error that says where this file is damaged.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which the damaged record begins.
-        """
+        """Return the error for a damaged record at an offset of this file."""
         return LogError(f"{self.path}: damaged at byte {offset} ({what}){RECOVER}")
 
     def _check_magic(self) -> None:
         start = self.read(0, 2 * len(MAGIC))
         magic = start[: len(MAGIC)]
         if magic == MAGIC or (self.path.name.endswith(ACTIVE_SUFFIX) and MAGIC.startswith(magic)):
-            return  # at first a writer has written less than that
+            return  # a new file may be shorter than the magic bytes
         raise LogError(f"{self.path}: {not_mcap(start)}")
 
     def _find_chunks(self) -> None:
@@ -289,7 +274,7 @@ class LogFile:
         self._warn_of_lost()
 
     def _scan(self, size: int) -> NDArray[np.void]:
-        """Walk through what is left of the records; behind a damaged one go on with a chunk."""
+        """Scan the remaining records; continue at the next chunk behind a damaged record."""
         rows = array("q")
         row = self._walk(rows, self._end, size)
         for _ in range(_PLACES):
@@ -306,7 +291,7 @@ class LogFile:
         return self._add_chunks(rows)
 
     def _next_chunk(self, start: int, size: int) -> int | None:
-        """Search for a compressed chunk that fits into the file, and that a record follows."""
+        """Search for a compressed chunk that fits into the file and precedes a record."""
         while start < size:
             window = self.read(start, min(_SEARCHED + CHUNK_HEAD_LIMIT, size - start))
             for place in find_chunk_heads(window):
@@ -318,7 +303,7 @@ class LogFile:
         return None
 
     def _is_chunk(self, offset: int, head: bytes, size: int) -> bool:
-        """Return whether a chunk whose lengths agree begins at a byte."""
+        """Return whether a chunk with consistent lengths begins at an offset."""
         opcode, length = HEAD.unpack_from(head)
         try:
             stop = begun_chunk_head(head[HEAD.size : CHUNK_HEAD_LIMIT]).data.stop
@@ -331,7 +316,7 @@ class LogFile:
         return not following or 0 < following[0] <= Opcode.DATA_END
 
     def _warn_of_lost(self) -> None:
-        """Say in one line what of the file is left out, because its records are damaged."""
+        """Warn in one line of the skipped damaged records."""
         lost = self._lost
         if lost.places and not self.partial:
             raise self.damaged(lost.first, lost.why)
@@ -356,7 +341,7 @@ class LogFile:
         return True
 
     def lists_all_messages(self) -> bool:
-        """Return whether the message indexes of all chunks have as many entries as are counted."""
+        """Return whether the message indexes have as many entries as the statistics count."""
         if self.statistics is None:
             return False
         counts = np.array([len(channels) for channels in self.channel_sets] or [0])
@@ -365,7 +350,7 @@ class LogFile:
         return size == self.statistics.message_count * INDEX_ENTRIES.itemsize
 
     def _walk_between(self, end: int) -> None:
-        """Find what the index does not list, such as messages outside of chunks."""
+        """Find records that the index does not list, such as messages outside of chunks."""
         every = [(each.offset, each.length) for each in self.record_locations]
         places = [place for place in every if sum(place) <= self.size]
         chunks = self.chunks
@@ -382,7 +367,7 @@ class LogFile:
         self._add_chunks(rows)
 
     def _read_summary(self, footer: records.Footer, end: int) -> bool:
-        """Read the summary, and return whether it is sound."""
+        """Read the summary, and return whether it is valid."""
         start = footer.summary_start
         if not len(MAGIC) <= start < end:
             return False
@@ -408,7 +393,7 @@ class LogFile:
         return self._is_consistent()
 
     def _is_consistent(self) -> bool:
-        """Return whether no chunk is listed twice, or out of the time that the statistics state."""
+        """Return whether no chunk is listed twice or outside of the time span of the statistics."""
         places = self.chunks[["offset", "length"]][np.argsort(self.chunks["offset"])]
         ends = places["offset"] + places["length"]
         if (ends[:-1] > places["offset"][1:]).any():
@@ -422,13 +407,13 @@ class LogFile:
         )
 
     def scan_new(self) -> NDArray[np.void]:
-        """Walk through the records that were written since the last scan.
+        """Scan the records that were written since the last scan.
 
         Returns
         -------
         np.ndarray [shape=(n,)], of dtype `CHUNKS`
-            The chunks among them, and runs of messages outside of chunks, by start time. They are
-            added to `chunks`, too.
+            New chunks and runs of messages outside of chunks, by start time. They are also added to
+            `chunks`.
 
         Raises
         ------
@@ -450,17 +435,17 @@ class LogFile:
         return self._add_chunks(rows)
 
     def _add_last_row(self, rows: "array[int]", row: ChunkRow | None) -> None:
-        """Add the last row that was met; its indexes may not all be there yet."""
+        """Add the last row found; its message indexes may be incomplete."""
         if row is not None:
             row.index_length = min(row.index_length, 0)
             row.channels.clear()
         self._add_row(rows, row)
 
     def _walk(self, rows: "array[int]", start: int, end: int) -> ChunkRow | None:
-        """Walk from record to record up to a byte; return the last row, which may not be whole.
+        """Scan records up to an offset; return the last row, which may be incomplete.
 
-        The rows before it are added to `rows`, `_end` is where the last whole record ends, and
-        `ended` whether the data end there.
+        Add the rows before it to `rows`, set `_end` to the end of the last complete record, and
+        `ended` to whether the data end there.
         """
         row: ChunkRow | None = None
         for opcode, offset, length, head in walk_records(self.read, start):
@@ -485,7 +470,7 @@ class LogFile:
         return row
 
     def _add_chunks(self, rows: "array[int]") -> NDArray[np.void]:
-        """Add rows to `chunks`; return them."""
+        """Add rows to `chunks`, and return them."""
         chunks = by_start(np.frombuffer(rows, CHUNKS))
         if len(chunks):
             self.chunks = by_start(np.concatenate([self.chunks, chunks]))
@@ -500,7 +485,7 @@ class LogFile:
         rows.extend([*row.numbers(), self.channel_set(frozenset(row.channels)), -1])
 
     def _last_time(self, row: ChunkRow) -> int:
-        """Find the last log time of a chunk up to `LAST_TIME` by the message indexes behind it."""
+        """Find the last log time of a chunk up to `LAST_TIME` in its message indexes."""
         last, offset, end = -1, row.offset + row.length, min(row.offset + row.length, self.size)
         if 0 < row.index_length <= LIMIT:
             end += row.index_length
@@ -538,7 +523,7 @@ class LogFile:
             return None
 
     def channel_set(self, ids: frozenset[int]) -> int:
-        """Return the place of a set of channels in `channel_sets`, where it is added if need be."""
+        """Return the index of a set of channels in `channel_sets`, adding a new set."""
         if ids not in self._sets:
             self._sets[ids] = len(self.channel_sets)
             self.channel_sets.append(ids)
@@ -557,11 +542,11 @@ class LogFile:
             self.record_locations.append(RecordLocation(opcode, record.offset, record.length))
 
     def define(self, record: records.Schema | records.Channel) -> None:
-        """Add a schema or a channel; one that contradicts an earlier one makes that doubtful."""
+        """Add a schema or a channel; a contradictory definition marks it as doubtful."""
         if isinstance(record, records.Schema):
             if self.schemas.setdefault(record.id, record) != record:
                 self._doubtful_schemas.add(record.id)
-                channels = list(self.channels.items())  # another thread may add one
+                channels = list(self.channels.items())  # another thread may add a channel
                 self._doubt({number for number, c in channels if c.schema_id == record.id})
             return
         first = self.channels.setdefault(record.id, record)
@@ -595,9 +580,9 @@ class LogFile:
 
 
 def open_log(path: Path) -> tuple[Path, LocalFile | StoredFile]:
-    """Open the file of a log by its name, or by the final name that it has got since.
+    """Open a log file by its name, or by its final name if it was renamed.
 
-    Raise `LogError` if it cannot be opened.
+    Raise `LogError` if the file cannot be opened.
     """
     try:
         return path, open_file(path)

@@ -1,4 +1,4 @@
-"""Encoded messages of one channel, and the records of a chunk in which they lie."""
+"""Encoded messages of one channel, and the records of a chunk."""
 
 import re
 import struct
@@ -21,17 +21,17 @@ class RawMessages:
 
     channel: Channel
     schema: Schema | None
-    buffer: Bytes  # [shape=(b,)], uint8: holds the messages, and others
-    offsets: Int64  # [shape=(n,)], int64: where in the buffer the payloads begin
+    buffer: Bytes  # [shape=(b,)], uint8: messages of this and other channels
+    offsets: Int64  # [shape=(n,)], int64: offsets of the payloads in the buffer
     heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
-    source: Path | None = None  # the log they were read from
+    source: Path | None = None  # log of the messages
 
     def __len__(self) -> int:
         return len(self.offsets)
 
     @property
     def sizes(self) -> Int64:
-        """Bytes of the payloads."""
+        """Sizes of the payloads in bytes."""
         return self.heads["length"] - MESSAGE_FIXED
 
     @property
@@ -40,12 +40,12 @@ class RawMessages:
         return self.heads["log_time"]
 
     def payload(self, row: int) -> bytes:
-        """Return one message as it was written: CDR, with its header."""
+        """Return the payload of one message: CDR, with its header."""
         start = int(self.offsets[row])
         return self.buffer[start : start + int(self.sizes[row])].tobytes()
 
     def take(self, rows: slice | Indices | Bool) -> "RawMessages":
-        """Return the messages at some places, or of a mask, with the same buffer."""
+        """Return the messages at indices, or of a mask, with the same buffer."""
         return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
 
     def between(self, start: int | None, end: int | None) -> "RawMessages":
@@ -65,7 +65,7 @@ class RawMessages:
 
 
 def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages, int]]:
-    """Go through the messages of several channels in the order of their log times."""
+    """Iterate over the messages of several channels in order of log time."""
     times = [part.log_times for part in parts]
     part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     rows = np.concatenate([np.arange(0), *(np.arange(len(part)) for part in parts)])
@@ -75,7 +75,7 @@ def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages
 
 
 def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
-    """Find the times with start <= time < end.
+    """Return the range of times with start <= time < end.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
     Returns
     -------
     first, last : int
-        Places of the first of these times, and behind the last of them; equal if there are none.
+        Index of the first of these times, and behind the last; equal if there are none.
     """
     first = 0 if start is None else int(np.searchsorted(times, start))
     last = len(times) if end is None else int(np.searchsorted(times, end))
@@ -103,7 +103,7 @@ def gather_heads(buffer: Bytes | bytes | memoryview, starts: Int64) -> NDArray[n
     ----------
     buffer : bytes-like or np.ndarray [shape=(b,)], uint8
     starts : np.ndarray [shape=(n,)], int64
-        Bytes of the buffer at which the message records begin, with their opcodes.
+        Offsets of the message records in the buffer, at their opcodes.
 
     Returns
     -------
@@ -115,34 +115,34 @@ def gather_heads(buffer: Bytes | bytes | memoryview, starts: Int64) -> NDArray[n
     return gather(array, starts, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
 
 
-_COMPRESSED = re.compile(  # from the length of the compression's name on, with the data's magic
+_COMPRESSED = re.compile(  # from the length of the compression name to the magic bytes of the data
     rb"\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18", re.DOTALL
 )
 _BEFORE_COMPRESSED = HEAD.size + CHUNK.size - 4
-CHUNK_HEAD_LIMIT = 64  # bytes, in which the head of a compressed chunk and its data's magic fit
+CHUNK_HEAD_LIMIT = 64  # bytes that hold the head of a compressed chunk and the data's magic bytes
 
 
 def iterate_records(
     content: bytes | memoryview, start: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Go from record to record in the content of a chunk.
+    """Iterate over the records in the content of a chunk.
 
     Parameters
     ----------
     start : int
-        Byte of the content at which the first record begins.
+        Offset of the first record in the content.
     end : int, optional
-        Byte before which the last record ends; None for the end of the content.
+        End of the last record; None for the end of the content.
 
     Yields
     ------
     start, end : int
-        Bytes of the content at which the record begins, with its opcode, and before which it ends.
+        Range of the record in the content, including its opcode.
 
     Raises
     ------
     McapError
-        If the last one is cut, or claims to be longer than the content.
+        If the last record is incomplete, or longer than the content.
     """
     last = len(content) if end is None else end
     unpack = HEAD.unpack_from
@@ -159,12 +159,12 @@ def iterate_records(
 
 
 def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:
-    """Make the message index of a chunk.
+    """Build the message index of a chunk.
 
     Parameters
     ----------
     starts : np.ndarray [shape=(n,)], int64
-        Bytes of the content at which whole message records begin, with their opcodes, ascending.
+        Offsets of complete message records in the content, at their opcodes, ascending.
 
     Returns
     -------
@@ -178,8 +178,8 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
     entries = np.empty(len(starts), INDEX_ENTRIES)
     entries["time"], entries["offset"] = heads["log_time"], starts
     channels = channels.copy()
-    del heads  # a copy of millions
-    if (channels == channels[0]).all():  # no need to sort them
+    del heads  # frees millions of rows
+    if (channels == channels[0]).all():  # no sorting needed
         return {int(channels[0]): entries.tobytes()}
     order = np.argsort(channels, kind="stable")
     numbers, firsts, counts = np.unique(channels, return_index=True, return_counts=True)
@@ -196,13 +196,12 @@ def find_chunk_heads(window: bytes) -> Iterator[int]:
     Parameters
     ----------
     window : bytes
-        Any part of a file. A head is found if `CHUNK_HEAD_LIMIT` bytes are there from its beginning
-        on.
+        Any part of a file. A head is found only with `CHUNK_HEAD_LIMIT` bytes from its start.
 
     Yields
     ------
     int
-        Bytes of the window at which the opcode of a chunk may stand, ascending.
+        Offsets of possible chunk opcodes in the window, ascending.
     """
     for match in _COMPRESSED.finditer(window):
         if match.start() >= _BEFORE_COMPRESSED:

@@ -1,11 +1,11 @@
-"""MCAP records within limits: binary layouts (https://mcap.dev/spec), parsing, decompression.
+"""MCAP records (https://mcap.dev/spec): binary layouts, parsing and decompression with limits.
 
-A file may come from anywhere: no length that it claims is believed before it is checked, and no
-record may be larger than `LIMIT`. A larger chunk is read in parts.
+Files are untrusted: every stated length is checked, and no record may be larger than `LIMIT`.
+A larger chunk is read in parts.
 
 All numbers are little-endian; times are nanoseconds. A record is its opcode, the length of its
-content, and its content. A `Struct` is the fixed beginning of a content, unless its comment says
-that opcode and length are part of it; a dtype has rows of entire records or entries.
+content, and its content. A `Struct` is the fixed start of a content, without opcode and length
+unless its comment includes them; the rows of a dtype are complete records or entries.
 """
 
 import struct
@@ -37,10 +37,10 @@ MESSAGE_HEAD = np.dtype(
         ("publish_time", "<i8"),
     ]
 )
-# First and last log time, size and CRC uncompressed, length of the compression's name; that name,
+# First and last log time, uncompressed size and CRC, length of the compression name; the name,
 # length of the data (UINT64), data.
 CHUNK = struct.Struct("<QQQII")
-ZSTD_CHUNK_HEAD = np.dtype(  # of a chunk whose compression's name has four letters
+ZSTD_CHUNK_HEAD = np.dtype(  # head of a chunk whose compression name has four letters
     [
         ("opcode", "u1"),
         ("length", "<i8"),
@@ -60,7 +60,7 @@ MESSAGE_INDEX_HEAD = np.dtype(
 INDEX_ENTRY = struct.Struct("<QQ")  # log time of a message, offset in the uncompressed chunk
 INDEX_ENTRIES = np.dtype([("time", "<i8"), ("offset", "<i8")])
 # First and last log time, offset and length of the chunk, bytes of the index offsets; these, the
-# tail, the compression's name, size compressed and uncompressed (UINT64 each).
+# tail, the compression name, compressed and uncompressed size (UINT64 each).
 CHUNK_INDEX = struct.Struct("<QQQQI")
 INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
 CHUNK_INDEX_TAIL = struct.Struct("<QI")  # bytes of the message indexes, length of a name
@@ -68,7 +68,7 @@ ATTACHMENT = struct.Struct("<QQI")  # log time, time of creation, length of the 
 SUMMARY_OFFSET = struct.Struct("<9xBQQ")  # with HEAD: opcode, start and length of a group
 FOOTER = struct.Struct("<QQ")  # start of the summary, start of the summary offsets; CRC (UINT32)
 FOOTER_SIZE = HEAD.size + FOOTER.size + UINT32.size + len(MAGIC)
-_OTHERS = {  # formats that are taken for MCAP, by how they begin, and what makes MCAP of them
+_OTHERS = {  # formats mistaken for MCAP by their first bytes, and the tool that converts each
     b"\x28\xb5\x2f\xfd": "is compressed as a whole: `zstd -d -o NEW.mcap` makes a log of it",
     b"\x04\x22\x4d\x18": "is compressed as a whole: `lz4 -d` makes a log of it",
     b"\x1f\x8b": "is compressed as a whole: `gzip -d` makes a log of it",
@@ -84,12 +84,12 @@ OTHER_SUFFIXES = (*_COMPRESSED, ".db3", ".bag")
 
 
 def not_mcap(start: bytes) -> str:
-    """Say what a file is that does not begin as MCAP does.
+    """Describe a file that does not start as MCAP.
 
     Parameters
     ----------
     start : bytes
-        The first 16 bytes of it, or all.
+        First 16 bytes of the file, or all of a shorter file.
     """
     for magic, what in _OTHERS.items():
         if start.startswith(magic):
@@ -97,7 +97,7 @@ def not_mcap(start: bytes) -> str:
     return "is not an MCAP file"
 
 
-LIMIT = 100 << 20  # bytes that are held at once; ours are below 2 MiB
+LIMIT = 100 << 20  # maximum bytes in memory at once; records of hearthlog are below 2 MiB
 TOO_LARGE = f"it is larger than hearthlog reads at once ({LIMIT >> 20} MiB)"
 _CLASSES: dict[int, Any] = {
     Opcode.HEADER: records.Header,
@@ -116,7 +116,7 @@ _CLASSES: dict[int, Any] = {
 
 
 class _Content(ReadDataStream):
-    """The content of one record, which must not end within a field."""
+    """Content of one record; an end within a field is an error."""
 
     def read(self, length: int) -> bytes:
         data = super().read(min(length, LIMIT))
@@ -126,20 +126,20 @@ class _Content(ReadDataStream):
 
 
 class _EscapedContent(_Content):
-    """The content of one record whose texts may not be UTF-8."""
+    """Content of one record whose texts may not be UTF-8."""
 
     def read_prefixed_string(self) -> str:
         return self.read(self.read4()).decode(errors="backslashreplace")
 
 
 def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord | None:
-    r"""Parse a record of a kind that holds no messages.
+    r"""Parse a record without messages.
 
     Parameters
     ----------
     escaped : bool
-        Put `\xNN` in the place of bytes of a text that are not UTF-8, so that two names stay two,
-        and raise no error.
+        Replace bytes that are not UTF-8 by `\xNN` instead of raising an error; different names
+        remain different.
 
     Returns
     -------
@@ -149,9 +149,9 @@ def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord |
     Raises
     ------
     McapError
-        If it is too short for what it claims to hold.
+        If the record is shorter than its fields.
     UnicodeDecodeError
-        If a text in it is not UTF-8.
+        If a text in the record is not UTF-8.
     """
     kind = _CLASSES.get(opcode)
     stream = _EscapedContent if escaped else _Content
@@ -159,9 +159,9 @@ def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord |
 
 
 def parse_escaped(opcode: int, content: bytes) -> tuple[McapRecord | None, bool]:
-    """Parse a record as `parse` does; return whether a text in it had to be escaped, too.
+    """Parse a record as `parse` does; also return whether a text had to be escaped.
 
-    Raise `McapError` if it is too short for what it claims to hold.
+    Raise `McapError` if the record is shorter than its fields.
     """
     try:
         return parse(opcode, content), False
@@ -175,12 +175,12 @@ def read_footer(tail: bytes) -> records.Footer | None:
     Parameters
     ----------
     tail : bytes
-        The last `FOOTER_SIZE` bytes of the file, or all of a shorter one.
+        Last `FOOTER_SIZE` bytes of the file, or all of a shorter file.
 
     Returns
     -------
     mcap.records.Footer or None
-        None if the file does not end with a footer and the magic.
+        None if the file does not end with a footer and the magic bytes.
     """
     if len(tail) < FOOTER_SIZE or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
         return None
@@ -190,7 +190,7 @@ def read_footer(tail: bytes) -> records.Footer | None:
 
 
 def encode(record: McapRecord) -> bytes:
-    """Encode a record, opcode and length included."""
+    """Encode a record, including opcode and length."""
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
@@ -204,13 +204,13 @@ class ChunkHead(NamedTuple):
     start, end : int
         Log times of the first and the last message, in nanoseconds.
     size : int
-        Bytes of the records, uncompressed.
+        Uncompressed bytes of the records.
     crc : int
-        CRC-32 of the same; 0 if there is none.
+        CRC-32 of the uncompressed records; 0 for none.
     compression : bytes
-        `zstd`, `lz4`, or empty if the records are stored as they are.
+        `zstd`, `lz4`, or empty for uncompressed records.
     data : slice
-        Which bytes of the chunk's content are its compressed records.
+        Range of the compressed records in the chunk's content.
     """
 
     start: int
@@ -224,7 +224,7 @@ class ChunkHead(NamedTuple):
 def chunk_head(content: bytes | memoryview) -> ChunkHead:
     """Read the head of a chunk from its content.
 
-    Raise `McapError` if it is shorter than it claims, or claims records larger than `LIMIT`.
+    Raise `McapError` if the head is incomplete, or states records larger than `LIMIT`.
     """
     head = begun_chunk_head(content)
     if head.data.stop > len(content):
@@ -235,17 +235,17 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
-    """Read the head of a chunk from the beginning of its content, whatever it claims.
+    """Read the head of a chunk from the start of its content, without checks.
 
     Parameters
     ----------
     content : bytes-like
-        The chunk's record, without opcode and length, at least up to its compressed records.
+        Chunk record without opcode and length, at least up to its compressed records.
 
     Raises
     ------
     McapError
-        If it is too short.
+        If the content is too short.
     """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)
@@ -259,12 +259,12 @@ def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
-    """Decompress the records of a chunk, and compare them with its checksum.
+    """Decompress the records of a chunk, and verify their checksum.
 
     Returns
     -------
     bytes
-        The records, one behind the other: `head.size` bytes.
+        Concatenated records: `head.size` bytes.
 
     Raises
     ------
@@ -277,12 +277,12 @@ def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
 
 
 def decompress_into(out: memoryview, head: ChunkHead, content: bytes | memoryview) -> None:
-    """Decompress the records of a chunk into a buffer, and compare them with its checksum.
+    """Decompress the records of a chunk into a buffer, and verify their checksum.
 
     Parameters
     ----------
     out : memoryview
-        Exactly `head.size` bytes, which are overwritten.
+        Exactly `head.size` bytes.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def decompress_into(out: memoryview, head: ChunkHead, content: bytes | memoryvie
         size = _DECOMPRESS[head.compression](content[head.data], out)
     except KeyError as error:
         raise McapError(f"a chunk has unknown compression {head.compression!r}") from error
-    except (zstandard.ZstdError, RuntimeError, EOFError) as error:  # the last two are lz4's
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:  # the last two are from lz4
         raise McapError(f"a chunk cannot be decompressed ({error})") from error
     if size != head.size:
         raise McapError("a chunk has another size than it claims")
@@ -308,7 +308,7 @@ def _zstd(data: bytes | memoryview, out: memoryview) -> int:
 
 
 def _lz4(data: bytes | memoryview, out: memoryview) -> int:
-    import lz4.frame  # noqa: PLC0415  only others write such files
+    import lz4.frame  # noqa: PLC0415  only other writers use lz4
 
     raw = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=len(out) + 1)
     return _stored(raw, out)
@@ -321,7 +321,7 @@ def _stored(data: bytes | memoryview, out: memoryview) -> int:
 
 
 class _Local(threading.local):
-    """Decompressors are dear to make and must not be shared between threads."""
+    """Per-thread decompressors: costly to create, and not thread-safe."""
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
@@ -342,9 +342,9 @@ Definition = Schema | Channel
 
 
 class Definitions:
-    """Schemas and channels by number, wherever a file defines them.
+    """Schemas and channels of a file by ID.
 
-    Notes which numbers have contradictory definitions.
+    Also records IDs with contradictory definitions.
     """
 
     def __init__(self) -> None:
@@ -353,17 +353,17 @@ class Definitions:
         self._doubtful: set[tuple[type, int]] = set()
 
     def add(self, record: Definition) -> bool:
-        """Add a definition, unless its number is taken."""
+        """Add a definition, unless its ID is taken."""
         if isinstance(record, Schema):
             return self.schemas.setdefault(record.id, record) == record
         return self.channels.setdefault(record.id, record) == record
 
     def doubt(self, record: Definition) -> None:
-        """Note that a definition contradicts another one of its number."""
+        """Mark a definition as contradictory to another one with its ID."""
         self._doubtful.add((type(record), record.id))
 
     def defines(self, number: int) -> bool:
-        """Tell whether it is certain what the messages of a channel are.
+        """Return whether the type of a channel's messages is certain.
 
         Returns
         -------
@@ -378,5 +378,5 @@ class Definitions:
         return is_defined and (Schema, schema) not in self._doubtful
 
     def topic(self, number: int) -> str:
-        """Name the topic of a channel."""
+        """Return the topic of a channel."""
         return self.channels[number].topic if self.defines(number) else f"channel {number}"

@@ -1,1 +1,1 @@
-"""Messages: definitions, topics, and CDR to arrays and back."""
+"""Message definitions, topics, and conversion between CDR and arrays."""

@@ -1,4 +1,4 @@
-"""Many messages of one type at once: from arrays to payloads, and back."""
+"""Batch conversion between arrays and CDR payloads of one message type."""
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -27,33 +27,33 @@ Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]
 UndecodableText = Literal["strict", "replace"]
 _LAST_UNIT = 0xFFFF  # of UTF-16
-_TRIED = 64  # layouts, before rows are looked at one by one
+_TRIED = 64  # number of layouts tried before rows are inspected one by one
 
 
 def encode_groups(
     typename: str, columns: Mapping[str, Column], count: int
 ) -> Iterator[tuple[Indices, NDArray[np.void]]]:
-    """Encode `count` messages, given as one column for each field.
+    """Encode `count` messages from one column per field.
 
     Parameters
     ----------
     columns : mapping from field path, such as "header.frame_id", to its values
-        An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
-        for an array of numbers, and (count, 0) for an array of messages, which must be empty; for
-        a string, one for all messages or a sequence of `count`. Fields that were appended to the
-        type may be left out.
+        Array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k) for
+        an array of numbers, and (count, 0) for an array of messages, which must be empty; for a
+        string, one value for all messages or a sequence of `count`. Fields appended to the type
+        are optional.
 
     Yields
     ------
     rows : np.ndarray [shape=(m,)], intp
-        Indices of messages whose strings have the same lengths.
+        Indices of messages with equal string lengths.
     payloads : np.ndarray [shape=(m,)], of a structured dtype
-        Equal to what the typestore gives for each of these messages.
+        Payloads, identical to those of the typestore.
 
     Raises
     ------
     LogError
-        If the type is unknown, if an array of messages in it is not empty, or if a message would be
+        If the type is unknown, an array of messages in it is not empty, or a message would be
         larger than 100 MiB.
     """
     kind = message_type(typename)
@@ -77,9 +77,9 @@ def encode_groups(
 
 
 def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
-    """Encode `count` messages, given as one column for each field, into one `bytes` each.
+    """Encode `count` messages from one column per field into one `bytes` each.
 
-    Raise `LogError` as `encode_groups`.
+    Raise `LogError` as `encode_groups` does.
     """
     payloads: list[bytes] = [b""] * count
     for rows, block in encode_groups(typename, columns, count):
@@ -90,7 +90,7 @@ def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> lis
 
 
 def _completed(typename: str, columns: Mapping[str, Column], count: int) -> Mapping[str, Column]:
-    """Add the defaults of fields that were appended to a type, where they are not given."""
+    """Add the defaults of missing fields that were appended to a type."""
     appended = APPENDED.get(typename)
     if not appended:
         return columns
@@ -127,35 +127,35 @@ def _fill(
 
 
 class _Texts:
-    """A column of strings: its distinct values, encoded, and which of them each row has."""
+    """Column of strings: distinct values, encoded, and the code of each row."""
 
     def __init__(self, values: Column, count: int) -> None:
         if isinstance(values, str):
             values = [values] * min(count, 1)
         numbers = {text: number for number, text in enumerate(dict.fromkeys(values))}
         self._values = [text.encode() for text in numbers]
-        self._codes: Indices | None = None  # not needed if all are alike
+        self._codes: Indices | None = None  # None if all are equal
         self.lengths: Indices | None = None
         if len(numbers) > 1:
             self._codes = np.fromiter(map(numbers.__getitem__, values), np.intp, count)
             self.lengths = np.array([len(value) for value in self._values])[self._codes]
 
     def length(self, row: np.intp) -> int:
-        """Bytes of the string of a row, with its end."""
+        """Return the byte length of the string of a row, including its end."""
         return len(self._values[0 if self._codes is None else self._codes[row]]) + 1
 
     def encoded(self, rows: Indices) -> NDArray[np.void] | np.void:
-        """Return the strings of some rows, all of one length."""
+        """Return the strings of some rows of equal length."""
         if self._codes is None:
             return np.void(self._values[0])
         codes = self._codes[rows]
         size = len(self._values[codes[0]])
-        # Those of other lengths do not occur, but keep the others in their places.
+        # Strings of other lengths are unused, but keep the indices valid.
         return np.array([value[:size] for value in self._values], f"V{size}")[codes]
 
 
 def _same_lengths(texts: Collection[_Texts], count: int) -> list[Indices]:
-    """Group the rows whose strings have the same lengths."""
+    """Group the rows by string lengths."""
     varying = [text.lengths for text in texts if text.lengths is not None]
     if not varying:
         return [np.arange(count)] if count else []
@@ -175,27 +175,27 @@ def decode_rows(  # noqa: PLR0913
     *,
     undecodable: UndecodableText = "strict",
 ) -> Fields:
-    """Decode messages of one type into one column for each field.
+    """Decode messages of one type into one column per field.
 
     Parameters
     ----------
     buffer : np.ndarray [shape=(b,)], uint8
         Bytes that contain the payloads.
     offsets, sizes : np.ndarray [shape=(n,)], int64
-        First byte of each payload in the buffer, and its number of bytes.
+        Offset in the buffer and size in bytes of each payload.
     undecodable : str
-        What becomes of a string that is not UTF-8: "strict" raises an error, "replace" puts U+FFFD
-        in the place of what cannot be read.
+        Handling of strings that are not UTF-8: "strict" raises an error, "replace" puts U+FFFD in
+        place of invalid bytes.
 
     Returns
     -------
     dict of str to np.ndarray [shape=(n, ...)]
-        By field path, as `Columns` has them; arrays of any length have no elements if n is 0.
+        By field path, as in `Columns`; arrays of any length have no elements if n is 0.
 
     Raises
     ------
     LogError
-        If a payload is not of this type, or a string in it is not UTF-8.
+        If a payload does not match the type, or a string in it is not UTF-8.
     """
     parts = [
         (rows, _decode(layout.leaves, block, fields, undecodable))
@@ -210,7 +210,7 @@ def decode_rows(  # noqa: PLR0913
 def unreadable_rows(
     kind: MessageType, buffer: Bytes, offsets: Int64, sizes: Int64
 ) -> dict[int, LogError]:
-    """Find the messages that are not of their type."""
+    """Return the errors of messages that do not match their type."""
     errors: dict[int, LogError] = {}
     for _ in rows_by_layout(kind, buffer, offsets, sizes, errors):
         pass
@@ -224,29 +224,29 @@ def rows_by_layout(
     sizes: Int64,
     errors: dict[int, LogError] | None = None,
 ) -> Iterator[tuple[Layout, Indices, NDArray[np.void]]]:
-    """Group messages of one type by where their fields lie.
+    """Group messages of one type by layout.
 
     Parameters
     ----------
     buffer : np.ndarray [shape=(b,)], uint8
         Bytes that contain the payloads.
     offsets, sizes : np.ndarray [shape=(n,)], int64
-        First byte of each payload in the buffer, and its number of bytes.
+        Offset in the buffer and size in bytes of each payload.
     errors : dict of int to LogError, optional
-        Messages that are not of this type are added by row, and left out; without it, the first of
-        them raises its error.
+        Receives the error of each message that does not match the type, by row; the message is
+        skipped. Without it, the first error is raised.
 
     Yields
     ------
     rows : np.ndarray [shape=(m,)], intp
-        Which messages have it.
+        Indices of the messages with the layout.
     payloads : np.ndarray [shape=(m,)], of the dtype of the layout
-        A copy of them.
+        Copy of the messages.
 
     Raises
     ------
     LogError
-        If a payload is not of this type.
+        If a payload does not match the type.
     """
     for size, rows in _by_size(sizes):
         payloads = gather(buffer, offsets[rows], size)
@@ -259,16 +259,16 @@ def rows_by_layout(
 
 
 def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
-    if len(sizes) and (sizes == sizes[0]).all():  # most often, and quicker
+    if len(sizes) and (sizes == sizes[0]).all():  # the most frequent case, and faster
         return [(int(sizes[0]), np.arange(len(sizes)))]
-    # np.unique would be no quicker, and imports a megabyte of masked arrays.
+    # np.unique is not faster, and imports a megabyte of masked arrays.
     return [(size, np.flatnonzero(sizes == size)) for size in sorted(set(sizes.tolist()))]
 
 
 def _by_layout(
     kind: MessageType, payloads: NDArray[np.void], errors: dict[int, LogError] | None
 ) -> Iterator[tuple[Layout, Indices]]:
-    """Group payloads of one size by layout, without those that have none."""
+    """Group payloads of one size by layout, without invalid ones."""
     rest = np.arange(len(payloads))
     for layout in kind.layouts(payloads.dtype.itemsize)[:_TRIED]:
         fitting = layout.fits(payloads[rest].view(layout.dtype))
@@ -293,7 +293,7 @@ def _by_layout(
         if not len(rest):
             return
     rows_of: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
-    for row in rest.tolist():  # so many layouts that trying them one by one would take for ever
+    for row in rest.tolist():  # too many layouts to try each on all rows
         if (found := _layout_of(kind, payloads, row, errors, {})) is not None:
             rows_of.setdefault(tuple(found.fixed.items()), (found, []))[1].append(row)
     yield from ((layout, np.array(same)) for layout, same in rows_of.values())
@@ -302,7 +302,7 @@ def _by_layout(
 def _alike(
     payloads: NDArray[np.void], words: Mapping[int, bytes], error: LogError
 ) -> NDArray[np.bool_]:
-    """Find the payloads that have the fault of the first one, as what it depends on tells."""
+    """Find the payloads with the same fault as the first one, by the bytes that cause it."""
     alike = np.ones(len(payloads), bool)
     raw = payloads.view(np.uint8).reshape(len(payloads), payloads.dtype.itemsize)
     for place, word in words.items():
@@ -319,7 +319,7 @@ def _layout_of(
     errors: dict[int, LogError] | None,
     words: dict[int, bytes],
 ) -> Layout | None:
-    """Find the layout of one payload; None, and an error more, if it has none."""
+    """Find the layout of one payload; None, and a new error, if there is none."""
     try:
         return kind.layout_of(memoryview(payloads[row].tobytes()), words)
     except LogError as error:
@@ -366,7 +366,7 @@ def _texts(block: NDArray[np.void], name: str, undecodable: UndecodableText) -> 
         texts.fill("")
         return texts
     raw, encoding = np.ascontiguousarray(block[name]), "utf-8"
-    if raw.dtype.kind == "u":  # a wstring
+    if raw.dtype.kind == "u":  # wstring
         raw, encoding = _utf16(raw, name, undecodable), "utf-16-le"
     if (raw == raw[:1]).all():
         texts.fill(_text(raw[0], name, encoding, undecodable))
@@ -377,7 +377,7 @@ def _texts(block: NDArray[np.void], name: str, undecodable: UndecodableText) -> 
 
 
 def _utf16(units: NDArray[Any], name: str, undecodable: UndecodableText) -> NDArray[np.void]:
-    """Turn each row of words of four bytes, which hold one unit each, into UTF-16."""
+    """Convert rows of four-byte words with one unit each to UTF-16."""
     wrong = units > _LAST_UNIT
     if wrong.any():
         if undecodable == "strict":
@@ -396,7 +396,7 @@ def _text(value: np.void, name: str, encoding: str, undecodable: UndecodableText
 def _messages(
     array: MessageArray, block: NDArray[np.void], undecodable: UndecodableText
 ) -> NDArray[np.object_]:
-    """Turn an array of messages into one list of dicts a row."""
+    """Convert an array of messages to one list of dicts per row."""
     elements = []
     for leaves in array.elements:
         columns = {
@@ -409,7 +409,7 @@ def _messages(
 
 
 def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
-    """Put rows that were decoded apart back into their order."""
+    """Merge separately decoded rows in their original order."""
     if len(parts) == 1:
         return parts[0][1]
     columns_by_path: Fields = {}
@@ -428,7 +428,7 @@ def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
 
 
 def ragged(column: NDArray[Any]) -> NDArray[np.object_]:
-    """Turn each row of an array into an object of its own.
+    """Convert each row of an array to a separate object.
 
     Parameters
     ----------

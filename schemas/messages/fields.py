@@ -19,17 +19,17 @@ _FIELDS_LIMIT = 10_000
 
 
 class Field(NamedTuple):
-    """One field, as `Columns` has it.
+    """Field of a message type, as in `Columns`.
 
     Attributes
     ----------
     type : str
-        Of a number, or "string", or `TIME`, or `DURATION`, or empty for a message.
+        Name of a number type, "string", `TIME`, `DURATION`, or empty for a message.
     size : int or None
-        Of an array: how many elements it has, 0 if that differs between messages; None for a
-        field that is no array.
+        Number of elements of an array, 0 if it differs between messages; None for a field that is
+        no array.
     elements : mapping of str to Field
-        The fields of each element of an array of messages.
+        Fields of each element of an array of messages.
     """
 
     type: str
@@ -39,10 +39,10 @@ class Field(NamedTuple):
 
 @lru_cache(256)
 def fields_of(kind: MessageType) -> dict[str, Field]:
-    """List all fields of a message type by path, with the fields of the messages inside it.
+    """List all fields of a message type by path, including fields of nested messages.
 
-    Raise `LogError` if the type contains itself, builds on one that is not defined, or has too
-    many fields.
+    Raise `LogError` if the type contains itself, refers to an undefined type, or has too many
+    fields.
     """
     return dict(_fields(kind, kind.name, "", 0, iter(range(_FIELDS_LIMIT))))
 
@@ -78,7 +78,7 @@ def _type(base: str) -> str:
 
 
 def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field]:
-    """List the fields that any of several definitions of a type has, wide enough for all of them.
+    """Return the union of the fields of several definitions of a type, widened to fit all.
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field
     Returns
     -------
     dict of str to Field
-        By path: those of the first definition in its order, then those that only others have.
+        By path: fields of the first definition in its order, then additional fields of others.
 
     Raises
     ------
     LogError
-        If no number type holds all values of a field, or a field is not of the same kind.
+        If no number type holds all values of a field, or the kinds of a field differ.
     """
     common = dict(definitions[0])
     for fields in definitions[1:]:
@@ -103,7 +103,7 @@ def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field
 
 
 def optional_fields(definitions: Sequence[Mapping[str, Field]]) -> list[str]:
-    """List the paths of fields that some of several definitions lack, as `points[].x` in arrays."""
+    """List the paths of fields that some definitions lack, such as `points[].x` in arrays."""
     found: list[str] = []
     for path in dict.fromkeys(path for fields in definitions for path in fields):
         having = [fields[path] for fields in definitions if path in fields]
@@ -116,7 +116,7 @@ def optional_fields(definitions: Sequence[Mapping[str, Field]]) -> list[str]:
 
 
 def _wide(path: str, one: Field, other: Field) -> Field:
-    """Return a field that holds all values of two."""
+    """Return a field that holds all values of two fields."""
     size = one.size if one.size == other.size else 0
     if (one.size is None) != (other.size is None) or bool(one.elements) != bool(other.elements):
         raise LogError(f"{path} is not always of the same kind")
@@ -133,9 +133,9 @@ def _wide(path: str, one: Field, other: Field) -> Field:
 
 
 def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
-    """List the paths at which a file's definition lacks a field, or has another one than ours.
+    """List the paths of fields that a file's definition lacks, or defines differently.
 
-    A field that was appended to one of our types is not lacking: it has a default.
+    Fields appended to hearthlog types do not count: they have defaults.
 
     Returns
     -------
@@ -145,8 +145,8 @@ def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
     Raises
     ------
     LogError
-        If the definition contains itself, builds on a type that is not defined, or is too large, or
-        if there is no type of its name in ROS 2 or hearthlog.
+        If the definition contains itself, refers to an undefined type, or is too large, or ROS 2
+        and hearthlog have no type of this name.
     """
     theirs, ours = fields_of(kind), fields_of(message_type(kind.name))
     return sorted(p for p in paths if p not in theirs or not _fits(theirs[p], ours.get(p)))
@@ -154,7 +154,7 @@ def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
 
 @lru_cache
 def missing_fields(type_: str, encoding: str, text: bytes, paths: frozenset[str]) -> str:
-    """Say which fields of ours cannot be read by a definition; empty if all can."""
+    """Return which fields cannot be read with a definition; empty if all can."""
     try:
         return ", ".join(lacking(message_type(type_, encoding, text), paths))
     except LogError:
@@ -162,7 +162,7 @@ def missing_fields(type_: str, encoding: str, text: bytes, paths: frozenset[str]
 
 
 def _fits(theirs: Field, ours: Field | None) -> bool:
-    """Tell whether what is read of one field has all that is read of the other."""
+    """Return whether values of one field can be read as the other field."""
     return (
         ours is not None
         and (_plain(theirs.type), theirs.size) == (_plain(ours.type), ours.size)
@@ -174,25 +174,25 @@ def _fits(theirs: Field, ours: Field | None) -> bool:
 
 
 def _plain(name: str) -> str:
-    """Name a type as all do that mean the same: ROS 2 has three names for a byte."""
+    """Return the canonical name of a type: ROS 2 has three names for a byte."""
     return "uint8" if name in {"byte", "char"} else name
 
 
 def difference(kind: MessageType, version: int) -> str:
-    """Say how a file's definition of a type differs from every definition that was released.
+    """Describe how a file's definition of a type differs from every released definition.
 
     Parameters
     ----------
     kind : MessageType
-        As the file defines it; there must be a type of its name in ROS 2 or hearthlog.
+        Type as defined in the file; ROS 2 or hearthlog must have a type of this name.
     version : int
-        Schema version of the file's messages. Fields that were appended up to it must be there;
-        more may follow, as a later version would append them.
+        Schema version of the file's messages. Fields appended up to this version are required;
+        more may follow, as appended by a later version.
 
     Returns
     -------
     str
-        Words for an error message; empty if there is no difference.
+        Text for an error message; empty if there is no difference.
     """
     ours = message_type(kind.name).types
     for name in _built_on(ours, kind.name):
@@ -211,7 +211,7 @@ def difference(kind: MessageType, version: int) -> str:
 
 
 def _built_on(types: Mapping[str, Any], name: str) -> dict[str, None]:
-    """List a type and those it builds on."""
+    """List a type and its nested types."""
     names = {name: None}
     for _, (node, details) in types[name]:
         element, base = (node, details) if node in {Nodetype.BASE, Nodetype.NAME} else details[0]
@@ -221,7 +221,7 @@ def _built_on(types: Mapping[str, Any], name: str) -> dict[str, None]:
 
 
 def _words(name: str, described: tuple[Nodetype, Any]) -> str:
-    """Write a field as message definitions do."""
+    """Format a field as in message definitions."""
     node, details = described
     if node is Nodetype.BASE:
         return f"{_base(details)} {name}"
@@ -238,9 +238,9 @@ def _base(details: tuple[str, int]) -> str:
 
 
 def type_hash_of(kind: MessageType) -> str:
-    """Return the RIHS01 hash of a type as a file defines it.
+    """Return the RIHS01 hash of a type defined in a file.
 
-    Raise `LogError` if the type contains itself, or builds on one that is not defined.
+    Raise `LogError` if the type contains itself, or refers to an undefined type.
     """
     store = get_typestore(Stores.EMPTY)
     store.fielddefs.update({name: ([], list(fields)) for name, fields in kind.types.items()})

@@ -1,7 +1,7 @@
-"""The messages of a log, their CDR encoding on the typestore of rosbags, and their growth.
+"""Message types of a log, their CDR encoding with the typestore of rosbags, and appended fields.
 
-Fields are only ever appended to `msg/*.msg`; none is renamed, moved, removed, or given another
-type. Who appends one raises `SCHEMA_VERSION` and enters the field in `APPENDED`: docs/log.md.
+Fields are only ever appended to `msg/*.msg`, never renamed, moved, removed, or changed in type.
+An appended field needs a higher `SCHEMA_VERSION` and an entry in `APPENDED`: see docs/log.md.
 """
 
 from functools import cache
@@ -15,21 +15,21 @@ from rosbags.typesys.store import Typestore
 
 from hearthlog.schemas.frames import NANOSECONDS
 
-SCHEMA_VERSION = 3  # of the messages and records that this version writes
+SCHEMA_VERSION = 3  # of messages and records written by this version
 
 
 class Appended(NamedTuple):
-    """A field that messages did not have from the beginning.
+    """Field that was appended to a message type.
 
-    Its default is what a message without it says; None stands for a number of 0, no time, an empty
-    text or sequence.
+    The default applies to messages without the field; None is a number of 0, no time, or an
+    empty text or sequence.
     """
 
-    since: int  # the first schema version that has it
+    since: int  # first schema version with the field
     default: float | str | None = None
 
 
-# By type and name of the field.
+# By type and field name.
 APPENDED: dict[str, dict[str, Appended]] = {
     "hearthlog_msgs/msg/AudioMark": {"reason": Appended(since=3)},
 }
@@ -65,7 +65,7 @@ _DEFINED_HERE = (
 )
 
 
-# As ROS 2 Jazzy has them: all that it has takes longer to import than all else.
+# Subset of ROS 2 Jazzy: importing all its types takes longer than all other imports together.
 _OF_ROS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
@@ -100,7 +100,7 @@ uint32 line""",
 
 @cache
 def typestore() -> Typestore:
-    """Return the types of ROS 2 and those of the folder `msg`."""
+    """Return the types of ROS 2 and of the folder `msg`."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(_types_here())
     return store
@@ -108,7 +108,7 @@ def typestore() -> Typestore:
 
 @cache
 def recorded_types() -> Typestore:
-    """Return the types of what a recorder writes, and no others."""
+    """Return only the types that a recorder writes."""
     store = get_typestore(Stores.EMPTY)
     of_ros = (get_types_from_msg(text, name) for name, text in _OF_ROS.items())
     store.register({name: types for same in of_ros for name, types in same.items()} | _types_here())
@@ -125,19 +125,19 @@ def _types_here() -> dict[str, Any]:
 
 
 def store_of(typename: str) -> Typestore:
-    """Return a typestore that has a type, if any has: of what a recorder writes, a small one."""
+    """Return a typestore with a type; for types of a recorder, the small one."""
     recorded = recorded_types()
     return recorded if typename in recorded.fielddefs else typestore()
 
 
 def message(typename: str, **fields: Any) -> Any:
-    """Make a message of a type.
+    """Create a message.
 
     Parameters
     ----------
     **fields : Any
-        Values by name of the field, as rosbags has them. Fields that were appended to the type may
-        be left out, and have their defaults then.
+        Field values by name, as in rosbags. Fields appended to the type are optional, and have
+        defaults.
     """
     absent = APPENDED.get(typename, {}).keys() - fields.keys()
     if absent:
@@ -148,7 +148,7 @@ def message(typename: str, **fields: Any) -> Any:
 
 
 def _default(description: tuple[Nodetype, Any], value: float | str | None = None) -> Any:
-    """Return what stands for a field in a message, as `default_rows` does for one in columns."""
+    """Return the default of a field in a message, as `default_rows` does for columns."""
     node, kind = description
     if node is Nodetype.BASE:
         return ("" if kind[0] == "string" else 0) if value is None else value
@@ -165,35 +165,35 @@ def _default(description: tuple[Nodetype, Any], value: float | str | None = None
 
 
 def number_type(name: str) -> np.dtype[Any]:
-    """Return the dtype of numbers of a primitive type.
+    """Return the dtype of a primitive number type.
 
     Parameters
     ----------
     name : str
-        As message definitions name it, such as "float32" or "byte".
+        Name in message definitions, such as "float32" or "byte".
     """
     return np.dtype("uint8" if name in {"byte", "char"} else name)
 
 
 def header(stamp: int, frame_id: str) -> Any:
-    """Make a `std_msgs/Header`."""
+    """Create a `std_msgs/Header`."""
     return message("std_msgs/msg/Header", stamp=time_message(stamp), frame_id=frame_id)
 
 
 def time_message(nanoseconds: int) -> Any:
-    """Make a `builtin_interfaces/Time`.
+    """Create a `builtin_interfaces/Time`.
 
     Parameters
     ----------
     nanoseconds : int
-        Of UTC, since 1970.
+        UTC since 1970.
     """
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
 
 
 def duration_message(nanoseconds: int) -> Any:
-    """Make a `builtin_interfaces/Duration`."""
+    """Create a `builtin_interfaces/Duration`."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=rest)
 
@@ -215,26 +215,26 @@ def decode(data: bytes | memoryview, typename: str) -> Any:
     Parameters
     ----------
     data : bytes or memoryview
-        The payload, of either byte order.
+        Payload, in either byte order.
     """
     return store_of(typename).deserialize_cdr(data, typename)
 
 
 @cache
 def definition(typename: str) -> str:
-    """Return the definitions of a type and of those that it builds on, as MCAP's `ros2msg` text."""
+    """Return the definitions of a type and its nested types, as MCAP's `ros2msg` text."""
     return store_of(typename).generate_msgdef(typename, ros_version=2)[0]
 
 
 @cache
 def type_hash(typename: str) -> str:
-    """Return the RIHS01 hash of a type, by which ROS 2 compares the types of two sides."""
+    """Return the RIHS01 hash of a type, which ROS 2 compares between publisher and subscriber."""
     return store_of(typename).hash_rihs01(typename)
 
 
-LOG_DAMAGED = "the log was damaged"  # the reason of a gap that `recover` writes
-CLOCK_SET = "the clock was set"  # in the reason: the gap may have any length, also less than none
-QUIET_HOURS, PAUSED = ON_PURPOSE = "quiet hours", "paused"  # nobody was to be listened to
+LOG_DAMAGED = "the log was damaged"  # reason of gaps written by `recover`
+CLOCK_SET = "the clock was set"  # part of the reason: the gap may have any length, even negative
+QUIET_HOURS, PAUSED = ON_PURPOSE = "quiet hours", "paused"  # recording was disabled
 
 
 def encode_gap(microphone: str, start: int, end: int, reason: str, frames_lost: int) -> bytes:

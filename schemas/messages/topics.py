@@ -1,4 +1,4 @@
-"""The topics of a log: types, quality of service, array names; labels for no sound."""
+"""Topics of a log: types, quality of service, array names; labels of no sound."""
 
 import json
 import re
@@ -11,11 +11,11 @@ from hearthlog.schemas.messages import message_types
 
 DIAGNOSTICS = "/diagnostics"
 ROSOUT = "/rosout"
-# Labellings: the recorder's, that of a model on trial beside it, a reviewer's, by its name
-# `scenario/<name>`, what a reviewer says of that, and by its model `relabel/<model>`.
+# Labellings: of the recorder, of a model on trial next to it, of a reviewer, of a scenario
+# (`scenario/<name>`), of its reviewer, and of a model that relabelled (`relabel/<model>`).
 LIVE, CANDIDATE, REVIEW, RELABEL = "live", "candidate", "review", "relabel"
 SCENARIO = "scenario"
-_MICROPHONE = "[a-z](?:_?[a-z0-9])*"  # and the name of a scenario
+_MICROPHONE = "[a-z](?:_?[a-z0-9])*"  # also the name of a scenario
 _SCENARIO = f"{SCENARIO}/{_MICROPHONE}"
 _NOT_LIVE = rf"{CANDIDATE}|{REVIEW}(?:/{_SCENARIO})?|{_SCENARIO}|{RELABEL}/\w{{1,200}}"
 LABELLING = re.compile(f"{LIVE}|{_NOT_LIVE}", re.ASCII)
@@ -25,25 +25,25 @@ _TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_NOT_LIVE})/)?(\w+)", re.ASCII)
 
 @dataclass(frozen=True)
 class Quality:
-    """The quality of service of a topic, where topics differ: the defaults are those of ROS 2."""
+    """Quality of service of a topic; the defaults are those of ROS 2."""
 
-    depth: int = 10  # how many messages are kept
-    transient_local: bool = False  # they are kept for those who come late
-    lifespan_seconds: int | None = None  # for how long; None: for ever
+    depth: int = 10  # number of kept messages
+    transient_local: bool = False  # whether late subscribers get the kept messages
+    lifespan_seconds: int | None = None  # lifetime of kept messages; None: unlimited
 
 
 _LATCHED = Quality(depth=1, transient_local=True)
-_OF_ROSOUT = Quality(depth=1000, transient_local=True, lifespan_seconds=10)  # of any ROS 2 node
+_OF_ROSOUT = Quality(depth=1000, transient_local=True, lifespan_seconds=10)  # ROS 2 default
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One channel of a log.
+    """Channel of a log.
 
     Attributes
     ----------
     array_names : mapping of str to sequence of str
-        Names of the elements of an array, by the name of the field that holds the array.
+        Names of the array elements, by the name of the array field.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Topic:
 
 
 class EmbeddingSpace(NamedTuple):
-    """Network and projection of embeddings; only those of the same space can be compared."""
+    """Network and projection of embeddings; embeddings are comparable within one space only."""
 
     network: str
     projection_sha256: str
@@ -62,7 +62,7 @@ class EmbeddingSpace(NamedTuple):
 
 
 class EmbeddingSource(NamedTuple):
-    """The network and the projection behind the embeddings of a microphone."""
+    """Network and projection of the embeddings of a microphone."""
 
     network: str
     network_sha256: str
@@ -72,11 +72,11 @@ class EmbeddingSource(NamedTuple):
 
     @property
     def space(self) -> EmbeddingSpace:
-        """With which embeddings these can be compared."""
+        """Space in which these embeddings are comparable."""
         return EmbeddingSpace(self.network, self.projection_sha256, len(self.names))
 
     def metadata(self) -> dict[str, str]:
-        """Return what the channel says besides the names."""
+        """Return the channel metadata other than the element names."""
         return {
             "network": self.network,
             "network_sha256": self.network_sha256,
@@ -86,7 +86,7 @@ class EmbeddingSource(NamedTuple):
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "EmbeddingSource | None":
-        """Read what a channel says of its embeddings; None where it does not."""
+        """Parse the embedding source in channel metadata; None if there is none."""
         try:
             names = json.loads(metadata["values_names"])
             steps = tuple(float(step) for step in json.loads(metadata["values_steps"]))
@@ -99,9 +99,9 @@ class EmbeddingSource(NamedTuple):
 
 
 def check_microphone_name(name: str) -> str:
-    """Return the name of a microphone if it can be part of a ROS topic.
+    """Return the name of a microphone if it is valid in a ROS topic.
 
-    Raise `LogError` if the name has another form.
+    Raise `LogError` otherwise.
     """
     if not re.fullmatch(_MICROPHONE, name):
         raise LogError(
@@ -112,12 +112,12 @@ def check_microphone_name(name: str) -> str:
 
 
 def check_scenario_name(name: str) -> str:
-    """Return the name of a scenario if it can be part of a ROS topic.
+    """Return the name of a scenario if it is valid in a ROS topic.
 
     Parameters
     ----------
     name : str
-        As that of a microphone, of up to 64 characters.
+        Same form as a microphone name, up to 64 characters.
 
     Raises
     ------
@@ -134,44 +134,44 @@ def check_scenario_name(name: str) -> str:
 
 
 def scenario_labelling(name: str) -> str:
-    """Name the labelling of a scenario: `scenario/<name>`."""
+    """Return the labelling of a scenario: `scenario/<name>`."""
     return f"{SCENARIO}/{name}"
 
 
 def is_scenario(labelling: str) -> bool:
-    """Tell whether a labelling is that of a scenario."""
+    """Return whether a labelling belongs to a scenario."""
     return labelling.startswith(f"{SCENARIO}/")
 
 
 def scenario_name(labelling: str) -> str:
-    """Return the name of the scenario that a labelling is of; empty if it is of none."""
+    """Return the scenario name of a labelling; empty if there is none."""
     parts = labelling.removeprefix(f"{REVIEW}/").partition("/")
     return parts[2] if parts[0] == SCENARIO else ""
 
 
 def review_labelling(scenario: str = "") -> str:
-    """Name what reviewers say: `review`, or of a scenario `review/scenario/<name>`.
+    """Return the labelling of reviews: `review`, or `review/scenario/<name>` for a scenario.
 
     Parameters
     ----------
     scenario : str
-        Its name; empty for the sounds of the home.
+        Name of the scenario; empty for the sounds of the home.
     """
     return f"{REVIEW}/{scenario_labelling(scenario)}" if scenario else REVIEW
 
 
 def is_review(labelling: str) -> bool:
-    """Tell whether a labelling is that of a reviewer."""
+    """Return whether a labelling belongs to a reviewer."""
     return labelling.partition("/")[0] == REVIEW
 
 
 def topic(microphone: str, kind: str) -> str:
-    """Name the topic of one kind of a microphone: `/<microphone>/<kind>`."""
+    """Return the topic of a microphone and kind: `/<microphone>/<kind>`."""
     return f"/{microphone}/{kind}"
 
 
 class TopicName(NamedTuple):
-    """The parts of the name of a topic."""
+    """Parts of the name of a topic."""
 
     microphone: str
     labelling: str  # `live`, `candidate`, `review`, `scenario/<name>`, `relabel/<model>` …
@@ -179,12 +179,12 @@ class TopicName(NamedTuple):
 
 
 def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
-    """Name the topic of one kind of a labelling."""
+    """Return the topic of a microphone, labelling and kind."""
     return topic(microphone, kind if labelling == LIVE else f"{labelling}/{kind}")
 
 
 def relabelling(model: str) -> str:
-    """Name the labelling of a model that relabelled logs: `relabel/<model>`."""
+    """Return the labelling of a model that relabelled logs: `relabel/<model>`."""
     return f"{RELABEL}/{re.sub('[^A-Za-z0-9_]', '_', model)}"
 
 
@@ -194,14 +194,14 @@ def parse_topic(name: str) -> TopicName | None:
     Returns
     -------
     TopicName or None
-        None if it is no topic of a microphone.
+        None if the topic does not belong to a microphone.
     """
     match = _TOPIC.fullmatch(name)
     return None if match is None else TopicName(match[1], match[2] or LIVE, match[3])
 
 
 def microphone_of(topic: str) -> str:
-    """Return the name of a topic's microphone; empty if it has none.
+    """Return the microphone of a topic; empty if there is none.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def label_topics(microphone: str, labelling: str, classes: Sequence[str]) -> tup
     Parameters
     ----------
     classes : sequence of str
-        Names of the classes, in the order of the probabilities.
+        Class names in the order of the probabilities.
     """
     label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
     return (
@@ -241,12 +241,12 @@ def topics_of(  # noqa: PLR0913
     Parameters
     ----------
     classes : sequence of str or None
-        Names of the classes, in the order of the probabilities; None for a recorder without a
-        model, which writes no labels and no segments.
+        Class names in the order of the probabilities; None for a recorder without a model, which
+        writes no labels and no segments.
     directions : bool
-        Whether it is an array, and has directions.
+        Whether the microphone is an array, with directions.
     embedding : EmbeddingSource, optional
-        Of its embeddings; None without a network.
+        Source of the embeddings; None without a network.
     """
     statistics = {"mean": feature_names, "std": feature_names}
     topics = [
@@ -280,7 +280,7 @@ def topics_of(  # noqa: PLR0913
 
 
 def audio_topic(microphone: str) -> Topic:
-    """Return the only topic of a layer of sound."""
+    """Return the only topic of an audio layer."""
     return Topic(topic(microphone, "audio"), message_types.RAW_AUDIO)
 
 
@@ -288,10 +288,10 @@ SILENCE, UNKNOWN = "silence", "unknown"
 
 
 def spelt(label: str) -> str:
-    """Spell a label as the names of classes are: `Crying, sobbing` as `crying_sobbing`."""
+    """Convert a label to the form of class names: `Crying, sobbing` to `crying_sobbing`."""
     return re.sub("[ ,-]+", "_", label.lower())
 
 
 def is_sound(label: str) -> bool:
-    """Tell whether a label names a sound, and neither silence nor what the model does not know."""
+    """Return whether a label names a sound, rather than silence or an unknown sound."""
     return spelt(label) not in {SILENCE, UNKNOWN}

@@ -1,7 +1,7 @@
-"""Message types by the definitions in files, and the CDR layout of their messages.
+"""Message types from definitions in files, and CDR layouts of their messages.
 
-The payloads of a channel differ only in their numbers as long as their strings and sequences
-keep their lengths, so one numpy record type describes all rows of the same lengths.
+Payloads of a channel with the same string and sequence lengths have the same field offsets,
+so one numpy record type describes all of them.
 """
 
 import re
@@ -24,7 +24,7 @@ from hearthlog.schemas.messages.message_types import (
     store_of,
 )
 
-START = 4  # of the fields: alignment counts from here
+START = 4  # offset of the first field: alignment counts from here
 _ENCAPSULATION = {"<": b"\x00\x01", ">": b"\x00\x00"}  # plain CDR, by byte order
 ORDERS = {value: order for order, value in _ENCAPSULATION.items()}
 _FORMATS = {
@@ -39,9 +39,9 @@ _DEPTH_LIMIT = 32
 
 
 class Leaf(NamedTuple):
-    """One field that holds no message: a number, a text, a stamp, or an array of them.
+    """Field without nested messages: a number, a text, a stamp, or an array of these.
 
-    `names` are the fields of the layout that make it up: one, or one each for an array of texts.
+    `names` are its fields in the layout: one, or one per element of an array of texts.
     """
 
     path: str
@@ -50,14 +50,14 @@ class Leaf(NamedTuple):
 
 
 class MessageArray(NamedTuple):
-    """One field that is an array of messages, and the leaves of each of them."""
+    """Field that is an array of messages, with the leaves of each message."""
 
     path: str
     elements: tuple[tuple["AnyLeaf", ...], ...]
 
 
 class Default(NamedTuple):
-    """One field that the messages of a file do not have, and the row that stands for it."""
+    """Field that is absent in the messages of a file, with the row of its default value."""
 
     path: str
     row: NDArray[Any]
@@ -67,15 +67,15 @@ AnyLeaf = Leaf | MessageArray | Default
 
 
 class Layout(NamedTuple):
-    """Where the fields of a message lie whose strings and sequences have certain lengths.
+    """Field offsets of messages with given lengths of strings and sequences.
 
     Attributes
     ----------
     dtype : np.dtype
-        Of the whole payload. A field has its path as its name. The word before a string or a
-        sequence, which holds its length, has that name and " length".
+        Type of the payload. Fields are named by their paths. The length word before a string or a
+        sequence has the name of the field and " length".
     fixed : dict of str to int or np.void
-        What every payload of this layout has in common: byte order, lengths, ends of strings.
+        Values common to all payloads of this layout: byte order, lengths, ends of strings.
     """
 
     dtype: np.dtype[np.void]
@@ -83,7 +83,7 @@ class Layout(NamedTuple):
     fixed: dict[str, Any]
 
     def fits(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Tell which payloads have this layout.
+        """Return whether each payload has this layout.
 
         Parameters
         ----------
@@ -100,17 +100,17 @@ class Layout(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """How a file's definition of one of our types is an older or a newer one."""
+    """Difference between a file's definition of a hearthlog type and that of this version."""
 
-    later: frozenset[str]  # fields that a later version appended, which are not read
-    absent: Sequence[tuple[str, Any]]  # fields that were appended since: they have defaults
+    later: frozenset[str]  # fields appended by a later version, which are not read
+    absent: Sequence[tuple[str, Any]]  # fields appended since, with defaults
 
 
 _SAME = Growth(frozenset(), ())
 
 
 def default_rows(name: str, fields: Sequence[tuple[str, Any]], prefix: str = "") -> list[Default]:
-    """Make the default values of fields, for messages that do not have these fields."""
+    """Return the default values of fields, for messages without them."""
     appended = APPENDED.get(name, {})
     return [
         leaf
@@ -146,30 +146,30 @@ def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -
 
 
 class TypeDefinition(NamedTuple):
-    """A message type as a file defines it, and the types that it builds on."""
+    """Message type defined in a file, with the types of its fields."""
 
     name: str
-    types: Mapping[str, Any]  # by name: fields and their descriptions, as rosbags has them
-    growth: Mapping[str, Growth]  # by name, where the file has another version of the type
+    types: Mapping[str, Any]  # fields and descriptions by type name, as in rosbags
+    growth: Mapping[str, Growth]  # by type name, for types of another version
 
 
 class LayoutWalk:
-    """One way through the fields of a message, on which the layout is noted.
+    """Walk through the fields of a message that records their layout.
 
     Parameters
     ----------
     order : str
-        Byte order, as numpy has it: "<" or ">".
+        Byte order in numpy notation: "<" or ">".
     length_at : callable
-        Told the path of a string or sequence and the offset of its length word in bytes; returns
-        its length. That of a string is in bytes, with its end; that of a wstring in UTF-16 units.
+        Called with the path of a string or sequence and the byte offset of its length word;
+        returns its length: for a string in bytes, with its end; for a wstring in UTF-16 units.
     size : int
-        Bytes of the message, at most.
+        Maximum size of the message in bytes.
 
     Attributes
     ----------
     end : int
-        Bytes so far.
+        Bytes walked through.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class LayoutWalk:
         length_at: Callable[[str, int], int],
         size: int,
     ) -> None:
-        self.end = START  # bytes so far
+        self.end = START
         self._name, self._types, self._growth = definition
         self._order = order
         self._length_at = length_at
@@ -190,13 +190,7 @@ class LayoutWalk:
         self._fixed: dict[str, Any] = {"encapsulation": np.void(_ENCAPSULATION[order])}
 
     def layout(self, leaves: tuple[AnyLeaf, ...], size: int) -> Layout:
-        """Return the layout that was noted.
-
-        Parameters
-        ----------
-        size : int
-            Bytes of a payload.
-        """
+        """Return the recorded layout of a payload of `size` bytes."""
         fields = {
             "names": list(self._fields),
             "formats": [form for form, _ in self._fields.values()],
@@ -209,7 +203,7 @@ class LayoutWalk:
         """Walk through the fields of a message and return their leaves.
 
         Raise `LogError` if the type is not defined, contains itself, or has a field of an
-        unsupported type; if the message ends before one of its fields, or has too many of them.
+        unsupported type; if the message ends before one of its fields, or has too many fields.
         """
         if name not in self._types:
             raise LogError(f"{self._name}: builds on {name}, which is not defined")
@@ -277,7 +271,7 @@ class LayoutWalk:
         if length > self._size:
             raise LogError(f"{self._name}: a message ends before its field {path}")
         if base == "wstring":
-            # As the middlewares of ROS 2 have it: UTF-16, a word of four bytes a unit, no end.
+            # As in the middlewares of ROS 2: UTF-16, four bytes per unit, no terminator.
             if length:
                 self._add(path, f"({length},){self._order}u4", 4)
             return
@@ -314,17 +308,17 @@ _LAYOUTS_KEPT = 256
 _TYPES_KEPT = 256
 _ESCAPED = re.compile(r"\\(?=x[0-9a-f]{2})")  # in a name that is not UTF-8
 _LINE_END = re.compile(r"\r+\n?")
-# Between the files of a type stand 80 signs; some writers have fewer or more, or blanks there.
+# The files of a type are separated by 80 signs; some writers use fewer, more, or blanks.
 _SEPARATOR = re.compile(r"^[ \t]*={3,}[ \t]*$\n?", re.MULTILINE)
 _FILE_NAME = re.compile(r"^[ \t]*(MSG|IDL):[ \t]*(\S+)[ \t]*$", re.MULTILINE)
-# How MCAP's registry joins the files of a type, and lines of them that rosbags does not read.
+# How MCAP's registry joins the files of a type, and lines that rosbags does not parse.
 _IDL_FILE = re.compile(r"^={80}\nIDL: .*$", re.MULTILINE)
 _INCLUDE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
-_WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")  # which rosbags does not read either
+_WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")  # unsupported by rosbags, too
 
 
 class EndlessTextError(LogError):
-    """A string in a message does not end where its length says."""
+    """Error of a string that does not end at its stated length."""
 
     def __init__(self, text: str, layout: Layout) -> None:
         super().__init__(text)
@@ -332,9 +326,9 @@ class EndlessTextError(LogError):
 
 
 class MessageType:
-    """A ROS 2 message type as a file defines it.
+    """ROS 2 message type defined in a file.
 
-    Of our own types, the fields of this version are read, whichever version wrote them.
+    For hearthlog types, the fields of this version are read, whichever version wrote them.
     """
 
     def __init__(
@@ -346,24 +340,24 @@ class MessageType:
         self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
 
     def read_fields(self, name: str) -> list[tuple[str, Any]]:
-        """List the fields that are read of this type, or of one that it builds on."""
+        """List the fields that are read of this type, or of a nested type."""
         if name not in self.growth:
             return list(self.types[name])
         later, absent = self.growth[name]
         return [*(field for field in self.types[name] if field[0] not in later), *absent]
 
     def layouts(self, size: int) -> list[Layout]:
-        """Return the layouts that were found last for payloads of one size.
+        """Return the most recent layouts of payloads of one size.
 
         Parameters
         ----------
         size : int
-            Bytes of a payload.
+            Size of a payload in bytes.
 
         Returns
         -------
         list of Layout
-            Empty before `layout_of` has found one. The caller must not change it.
+            Empty before the first call of `layout_of`. The caller must not change it.
         """
         return self._layouts.get(size, [])
 
@@ -405,18 +399,18 @@ class MessageType:
         return layout
 
     def layout_for(self, lengths: Mapping[str, int]) -> Layout:
-        """Lay out a little-endian message with strings and sequences of given lengths.
+        """Return the layout of a little-endian message with given string and sequence lengths.
 
         Parameters
         ----------
         lengths : mapping of str to int
-            By field path: bytes of a string, with its end, and number of elements of a sequence.
+            By field path: bytes of a string, with its end, or number of elements of a sequence.
 
         Raises
         ------
         LogError
             If the type is not defined, contains itself, or has a field of an unsupported type, or
-            if the message would be larger than 100 MiB or have too many fields.
+            the message would be larger than 100 MiB or have too many fields.
         """
         key = tuple(lengths.items())
         if key not in self._made:
@@ -430,19 +424,19 @@ class MessageType:
 
 @lru_cache(_TYPES_KEPT)
 def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
-    """Read the definition of a message type.
+    """Parse the definition of a message type.
 
     Parameters
     ----------
     encoding : str
-        `ros2msg` or `ros2idl`; empty for the definition of ROS 2 or hearthlog.
+        `ros2msg` or `ros2idl`; empty for the built-in definition of ROS 2 or hearthlog.
     text : bytes
-        The definition in that encoding, in UTF-8; what is not may only be in comments.
+        Definition in that encoding, in UTF-8; other bytes are allowed in comments only.
 
     Raises
     ------
     LogError
-        If the encoding is another one, or the text is larger than 256 KiB or cannot be understood.
+        If the encoding is unknown, or the text is larger than 256 KiB or cannot be parsed.
     """
     ours = {key: fields for key, (_, fields) in store_of(name).fielddefs.items()}
     theirs = {key: fields for key, (_, fields) in defined_types(name, encoding, text).items()}
@@ -455,13 +449,13 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
 
 
 def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
-    """Read a message type, and those that it builds on, as a file defines them.
+    """Parse a message type and its nested types from a definition in a file.
 
     Returns
     -------
     dict of str to (list, list)
-        Constants and fields by ROS 2 name, as rosbags has them; empty for the definition of ROS 2
-        or hearthlog.
+        Constants and fields by ROS 2 name, as in rosbags; empty for the built-in definition of
+        ROS 2 or hearthlog.
 
     Raises
     ------
@@ -477,7 +471,7 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
         raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
     if len(text) > _DEFINITION_LIMIT:
         raise LogError(f"the definition of {name} is too long")
-    name = _usual_name(name)  # which is how its definition is named
+    name = _usual_name(name)  # the name in the parsed definition
     if not text.strip():
         if name not in ours:
             raise LogError(f"the log does not define {name}")
@@ -491,19 +485,19 @@ def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
 
 
 def _usual_name(name: str) -> str:
-    """Write the name of a type as rosbags reads it, also one that is not UTF-8."""
+    """Return a type name in the form that rosbags parses, also for names that are not UTF-8."""
     return normalize_msgtype(_ESCAPED.sub("_", name))
 
 
 def _with_usual_lines(text: str) -> str:
-    """Write ends of lines, separators and names of files as rosbags reads them."""
+    """Return a definition with line ends, separators and file names that rosbags parses."""
     text = _LINE_END.sub("\n", text.removeprefix("\ufeff"))
     text = _SEPARATOR.sub(f"{'=' * 80}\n", text)
     return _FILE_NAME.sub(r"\1: \2", text)
 
 
 def _types_from_msg(text: str, name: str) -> dict[str, Any]:
-    """Read a definition; a wstring, which rosbags takes for a message, is a wstring."""
+    """Parse a definition; restore wstrings, which rosbags takes for messages."""
     types = get_types_from_msg(_WSTRING_BOUND.sub("", text), name)
     return {
         key: (constants, [(field, _with_wstring(*described)) for field, described in fields])
@@ -528,7 +522,7 @@ def _types_from_idl(text: str) -> dict[str, Any]:
 
 
 def _growth(name: str, theirs: Sequence[Any], ours: Sequence[Any]) -> Growth:
-    """Compare a definition of one of our types with that of this version."""
+    """Compare a file's definition of a hearthlog type with that of this version."""
     appended = APPENDED.get(name, {})
     there = {field for field, _ in theirs}
     later = theirs[len(ours) :] if theirs[: len(ours)] == ours else []

@@ -1,1 +1,1 @@
-"""What is whole in a damaged file, and what was lost."""
+"""Undamaged records and losses of a damaged file."""

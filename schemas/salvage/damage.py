@@ -1,4 +1,4 @@
-"""Losses in a damaged file, by its index and neighbouring records."""
+"""Losses in a damaged file, found by its index and neighbouring records."""
 
 import zlib
 from array import array
@@ -48,25 +48,24 @@ from hearthlog.schemas.salvage.whole_records import (
 
 _BLOCK = 1 << 20
 _DATA_END = HEAD.pack(Opcode.DATA_END, UINT32.size)
-_DATA_ENDS = 4  # so many of what looks like one are tried
+_DATA_ENDS = 4  # maximum number of Data End candidates
 _UNMET = -1
 
 
 class Index(NamedTuple):
-    """The index of a file, whose checksum is right if it has one.
+    """Index of a file, with a valid checksum if it has one.
 
     Attributes
     ----------
     start : int
-        Byte at which it begins.
+        Offset of the index.
     moved : bool
-        Whether that is another byte than the footer says: bytes of the file are missing, or were
-        added.
+        Whether the offset differs from the footer: bytes of the file are missing or were added.
     messages : dict of int to int, or None
-        How many messages each channel has; None if the index does not say so.
+        Number of messages of each channel; None if the index does not state it.
     chunks : np.ndarray [shape=(n, 6)], int64
         Offset, length, length of the message indexes, first and last log time of each chunk, and
-        the byte at which its record in the index begins; in the order of the file.
+        the offset of its record in the index; in file order.
     """
 
     reader: RecordVerifier
@@ -78,7 +77,7 @@ class Index(NamedTuple):
     names: dict[int, str]
 
     def messages_of(self, first: int, last: int) -> Counter[int]:
-        """Count the messages of successive chunks, by channel."""
+        """Count the messages of consecutive chunks, by channel."""
         messages: Counter[int] = Counter()
         for place in self.chunks[first:last, 5].tolist():
             record = self.reader.whole(place).record
@@ -88,17 +87,17 @@ class Index(NamedTuple):
 
 
 def read_index(reader: RecordVerifier, limit: int) -> Index | None:
-    """Read the index of a finished file, also where bytes before it are missing or were added.
+    """Read the index of a finished file, even if bytes before it are missing or were added.
 
     Parameters
     ----------
     limit : int
-        Bytes; a larger index is not read.
+        Maximum size of the index in bytes.
 
     Returns
     -------
     Index or None
-        None if the file is not finished, or if its index is damaged or larger than the limit. That
+        None if the file is unfinished, or its index is damaged or larger than the limit. The index
         of a finished file may be empty.
     """
     end = reader.end - FOOTER_SIZE
@@ -122,7 +121,7 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
 
 
 def _starts(reader: RecordVerifier, claimed: int, end: int, limit: int) -> Iterator[int]:
-    """Yield where the index begins by the footer, and then behind what looks like a Data End."""
+    """Yield the index offset of the footer, and then those behind possible Data End records."""
     yield claimed
     if claimed == end:
         return
@@ -137,7 +136,7 @@ def _starts(reader: RecordVerifier, claimed: int, end: int, limit: int) -> Itera
 
 
 def _find_back(reader: RecordVerifier, what: bytes, first: int, last: int) -> int:
-    """Return the last byte before `last` at which something begins; -1 if there is none."""
+    """Return the last offset of a byte string before `last`; -1 if there is none."""
     while first < last:
         start = max(last - _BLOCK, first)
         place = reader.read(start, last - start + len(what) - 1).rfind(what)
@@ -166,7 +165,7 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int, *, moved: bo
             times = record.message_start_time, record.message_end_time
             chunks.extend([*(min(time, LAST_TIME) for time in times), offset])
         elif isinstance(record, records.MetadataIndex):
-            if record.name != ROSBAG2_METADATA:  # it is made anew
+            if record.name != ROSBAG2_METADATA:  # the writer builds a new one
                 names[record.offset] = _name_of(record)
         elif isinstance(record, records.AttachmentIndex):
             names[record.offset] = _name_of(record)
@@ -197,7 +196,7 @@ def _name_of(
 
 
 def _messages_of(chunk: records.ChunkIndex) -> dict[int, int]:
-    """Count the messages of a chunk, by channel, from the lengths of its message indexes."""
+    """Count the messages of a chunk by channel, from the lengths of its message indexes."""
     places = sorted(chunk.message_index_offsets.items(), key=itemgetter(1))
     ends = [place for _, place in places[1:]]
     ends.append(chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length)
@@ -209,30 +208,30 @@ def _messages_of(chunk: records.ChunkIndex) -> dict[int, int]:
 
 
 class UnmetChunks(NamedTuple):
-    """Successive chunks of the index that were not met, and the bytes between their neighbours."""
+    """Consecutive missing chunks of the index, and the byte range between their neighbours."""
 
     start: int
     end: int
     messages: dict[int, int]  # by channel
-    exact: bool  # whether the index tells how many there are
+    exact: bool  # whether the index states their number
     times: tuple[int, int]  # first and last log time
 
 
 class MetRecords:
-    """Which records of an index were met in the file, wherever bytes before them are missing."""
+    """Records of an index that were found in the file, even at shifted offsets."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
-        self._places = np.full(len(index.chunks), _UNMET)  # bytes of the file
-        self._ends = self._places.copy()  # bytes of the file
-        self._row, self._shift = -1, 0  # of the last one
+        self._places = np.full(len(index.chunks), _UNMET)  # offsets in the file
+        self._ends = self._places.copy()  # end offsets in the file
+        self._row, self._shift = -1, 0  # row and shift of the last chunk found
         self._names = Counter(index.names.values())
         keys = index.chunks[:, [1, 4, 3]]  # length, last and first log time
         self._order = np.lexsort(keys.T)
         self._keys = np.ascontiguousarray(keys[self._order, ::-1])
 
     def meet(self, whole: WholeRecord) -> None:
-        """Note that a record was met."""
+        """Mark a record as found."""
         record = whole.record
         if isinstance(record, records.Metadata | WholeAttachment | LargeAttachment):
             self._names[_name_of(record)] -= 1
@@ -254,11 +253,11 @@ class MetRecords:
         self._ends[row] = whole.end
 
     def unmet_names(self) -> list[str]:
-        """List the metadata records and attachments that were not met, as in `Index.names`."""
+        """List the missing metadata records and attachments, as in `Index.names`."""
         return list((+self._names).elements())
 
     def unmet(self) -> Iterator[UnmetChunks]:
-        """Go through the chunks that were not met."""
+        """Iterate over the missing chunks."""
         missing = np.concatenate([[False], self._places == _UNMET, [False]])
         borders = np.flatnonzero(missing[1:] != missing[:-1]).reshape(-1, 2)
         for first, last in borders.tolist():
@@ -271,7 +270,7 @@ class MetRecords:
             yield UnmetChunks(min(start, end), end, messages, exact, times)
 
     def _like(self, start: int, end: int, length: int) -> int:
-        """Find a chunk that was not met yet by its times and its length; -1 if there is none."""
+        """Find a missing chunk by its times and its length; -1 if there is none."""
         first, last = 0, len(self._keys)
         for column, value in enumerate((start, end, length)):
             same = self._keys[first:last, column]
@@ -286,28 +285,28 @@ class MetRecords:
         return bool(self._places[row] == _UNMET)
 
 
-_DAMAGES = 1000  # as many are told apart
+_DAMAGES = 1000  # maximum number of separate damages
 _MORE_IN_INDEX = "the index lists more than there is"
-_NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
+_NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # offset of the name in bytes
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A part of a file that is not whole, and what was lost with it."""
+    """Damaged part of a file, and its losses."""
 
-    start: int  # bytes of the file
+    start: int  # byte range in the file
     end: int
     why: str
-    messages: Mapping[str, int] = field(default_factory=dict)  # that are lost, by topic
-    exact: bool = True  # whether these are all that are lost
-    times: tuple[int, int] | None = None  # log times of the first and last of them
+    messages: Mapping[str, int] = field(default_factory=dict)  # lost messages by topic
+    exact: bool = True  # whether these are all lost messages
+    times: tuple[int, int] | None = None  # first and last log time of the lost messages
     others: tuple[str, ...] = ()  # names of lost metadata records and attachments
-    cut: bool = False  # whether the file just ends here
-    sound: bool = False  # whether the file is whole here, and something is left out all the same
+    cut: bool = False  # whether the file is truncated here
+    sound: bool = False  # whether the file is undamaged here, but data are skipped
 
     @property
     def lossless(self) -> bool:
-        """Whether nothing was lost with it."""
+        """Whether nothing was lost."""
         return self.exact and not self.messages and not self.others
 
     def __str__(self) -> str:
@@ -324,10 +323,10 @@ class Damage:
 
 
 class DamageList:
-    """The damages of a file, and its whole messages of channels that are nowhere defined."""
+    """Damages of a file, and undamaged messages of undefined channels."""
 
     def __init__(self) -> None:
-        # By channel: messages, first and last log time, and the bytes of the file between them.
+        # By channel: number of messages, first and last log time, and their byte range in the file.
         self.unnamed: dict[int, tuple[int, tuple[int, int], tuple[int, int]]] = {}
         self._damages: list[tuple[Damage, dict[int, int]]] = []
 
@@ -335,9 +334,9 @@ class DamageList:
         return len(self._damages)
 
     def add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
-        """Add a damage, which must be behind all others in the file.
+        """Add a damage behind all others in the file.
 
-        All from the thousandth on count as one, with the lost messages of the first of them.
+        From the thousandth on, damages are merged, with the lost messages of the first of them.
 
         Parameters
         ----------
@@ -354,28 +353,28 @@ class DamageList:
     def add_unnamed(
         self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
     ) -> None:
-        """Add messages of a channel that is not defined so far.
+        """Add messages of a channel without a definition so far.
 
         Parameters
         ----------
         times : tuple of int
-            First and last log time of them, in nanoseconds.
+            First and last log time in nanoseconds.
         whole : WholeRecord
-            The record they are in, which must be behind those added before for the channel.
+            Record of the messages, behind those added before for the channel.
         """
         count, span, (start, _) = self.unnamed.get(channel, (0, times, (whole.offset, 0)))
         span = min(span[0], times[0]), max(span[1], times[1])
         self.unnamed[channel] = count + messages, span, (start, whole.end)
 
     def add_unmet(self, unmet: Iterable[UnmetChunks], names: Sequence[str]) -> None:
-        """Add what an index lists and the file does not have, unless damages tell of it already.
+        """Add records of the index that the file lacks, unless known damages cover them.
 
-        Where the index knows more than a damage, the damage is told.
+        If the index has more detail than a damage, the damage is updated.
 
         Parameters
         ----------
         names : sequence of str
-            All metadata records and attachments of the index that were not met.
+            All missing metadata records and attachments of the index.
         """
         starts = [damage.start for damage, _ in self._damages]
         more: list[tuple[Damage, dict[int, int]]] = []
@@ -404,14 +403,14 @@ class DamageList:
         self._insert(more)
 
     def add_claims(self, claims: Iterable[Claim]) -> None:
-        """Add what message indexes list and no chunk has."""
+        """Add messages that message indexes list and no chunk holds."""
         why = "message indexes list more than there is"
         self._insert(
             [(Damage(start, start, why, times=times), dict(lost)) for start, lost, times in claims]
         )
 
     def _insert(self, more: list[tuple[Damage, dict[int, int]]]) -> None:
-        """Put damages among the others by their offsets; too many of them become one."""
+        """Insert damages by offset; merge them beyond the limit."""
         room = max(_DAMAGES - len(self._damages), 1)
         if len(more) > room:
             rest = more[room - 1 :]
@@ -422,7 +421,7 @@ class DamageList:
         self._damages = sorted([*self._damages, *more], key=lambda each: each[0].start)
 
     def resolve(self, definitions: Definitions) -> list[Damage]:
-        """List the damages, then the messages without a definition, with the names of topics."""
+        """List the damages, then the messages without a definition, with topic names."""
         damages = []
         for damage, lost in self._damages:
             messages: dict[str, int] = {}
@@ -438,16 +437,16 @@ class DamageList:
 
 
 class DamagedRange(NamedTuple):
-    """Bytes of a file that hold no whole record.
+    """Byte range of a file without any complete record.
 
     Attributes
     ----------
     start, end : int
-        Bytes of the file at which the range begins, and before which it ends.
+        First offset of the range, and its end.
     opcode : int
-        The first byte of the range.
+        First byte of the range.
     ends : tuple of int
-        Bytes at which the record should end that may have been here.
+        Possible ends of the damaged record.
     """
 
     start: int
@@ -457,7 +456,7 @@ class DamagedRange(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """What was lost in a damaged range; fields as of `Damage`, but messages by channel."""
+    """Losses in a damaged range; fields as in `Damage`, but messages by channel."""
 
     messages: dict[int, int]
     exact: bool
@@ -473,13 +472,13 @@ def _span(first: tuple[int, int] | None, second: tuple[int, int]) -> tuple[int, 
 
 
 def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) -> Loss:
-    """Find out what was lost in a damaged range.
+    """Determine the losses in a damaged range.
 
     Parameters
     ----------
     index : Index or None
-        Index of the file. None if the file has none that is whole: the bytes of the range and the
-        message indexes behind it then tell what was lost, as where the index has moved.
+        Index of the file. None without a valid index: the bytes of the range and the message
+        indexes behind it are used instead, as for a moved index.
     """
     if index is None or index.moved:
         return _loss_by_neighbours(reader, damaged)
@@ -505,7 +504,7 @@ def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:
         return _NOTHING
     is_record = end in ends or end == reader.end
     if end in ends and reader.like_message_index(start):
-        return _NOTHING  # whatever its first byte says
+        return _NOTHING  # regardless of the first byte
     if opcode == Opcode.CHUNK:
         messages: dict[int, int] = {}
         behind, span = _count(reader, end, messages)
@@ -526,7 +525,7 @@ def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:
 def _count(
     reader: RecordVerifier, offset: int, messages: dict[int, int]
 ) -> tuple[int, tuple[int, int] | None]:
-    """Count messages by the indexes from here on; return where these end, and their times."""
+    """Count messages by the message indexes at an offset; return their end and log times."""
     times = []
     with suppress(McapError):
         while True:

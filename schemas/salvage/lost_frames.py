@@ -1,4 +1,4 @@
-"""Frames that could not be saved, where their number is known, and the channel of their gaps."""
+"""Lost frames, found by frame numbers, and the channel of their gap messages."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -31,15 +31,15 @@ _FIELDS = {
     (_GAP, message_types.GAP): [_STAMP, "frames_lost", "duration"],
     (_INFO, message_types.STREAM_INFO): [],
 }
-_MOST = 1000  # gaps of a piece that are looked at
+_MOST = 1000  # maximum number of gaps read per piece
 
 
 class FramePosition(NamedTuple):
-    """A message that tells of frames, or of their lack."""
+    """Message that gives the position of a frame or a gap."""
 
-    place: int  # byte of the content of its piece
+    place: int  # offset in the content of its piece
     kind: str  # `features`, `label`, `gap` or `info`
-    number: int  # of the frame; of a gap the frames that it lost
+    number: int  # frame number; for a gap, the number of lost frames
     start: int  # nanoseconds of UTC
     end: int
 
@@ -47,13 +47,13 @@ class FramePosition(NamedTuple):
 def read_marks(
     piece: WholeChunk | Message, definitions: Definitions
 ) -> dict[str, list[FramePosition]]:
-    """Read the gaps of a piece, and the first and the last of its frames.
+    """Read the gaps of a piece, and its first and last frames.
 
     Returns
     -------
     dict of str to list of Mark
-        By microphone, in the order of the piece. Messages that are not of the type that their
-        channel names are left out.
+        By microphone, in the order of the piece. Messages that do not match the type of their
+        channel are skipped.
     """
     marks: dict[str, list[FramePosition]] = {}
     content = b""
@@ -66,7 +66,7 @@ def read_marks(
         fields = _FIELDS.get((topic.kind, schema.name))
         if fields is None or not _defines(schema, fields):
             continue
-        content = content or _content(piece)  # that of other files is not looked at
+        content = content or _content(piece)  # contents without such channels are not read
         rows = places[:_MOST] if topic.kind in {_GAP, _INFO} else places[[0, -1]]
         buffer, heads = np.frombuffer(content, np.uint8), gather_heads(content, rows)
         raw = RawMessages(channel, schema, buffer, rows + MESSAGE.size, heads)
@@ -82,7 +82,7 @@ def _defines(schema: Schema, fields: Sequence[str]) -> bool:
 
 
 def _places(piece: WholeChunk | Message) -> Iterator[tuple[int, Int64]]:
-    """Yield each channel of a piece, and where in its content the messages are."""
+    """Yield each channel of a piece, with the offsets of its messages in the content."""
     if isinstance(piece, Message):
         yield piece.channel_id, np.zeros(1, np.int64)
     else:
@@ -114,12 +114,12 @@ def _decode(
         yield FramePosition(place, kind, number, start, end)
 
 
-_OF_SOUND = {"features", "statistics", "label", "segment"}  # say that there was sound
-_LATEST = NANOSECONDS << 31  # stamps have seconds of 32 bits
+_OF_SOUND = {"features", "statistics", "label", "segment"}  # prove that there was sound
+_LATEST = NANOSECONDS << 31  # stamps have 32-bit seconds
 
 
 class LostFrames(NamedTuple):
-    """Successive frames of a microphone that could not be saved."""
+    """Consecutive lost frames of a microphone."""
 
     end: int  # nanoseconds of UTC
     start: int
@@ -128,12 +128,12 @@ class LostFrames(NamedTuple):
 
 
 class FrameSearch:
-    """Looks for frames that are missing between the saved pieces of a log.
+    """Search for frames missing between the saved pieces of a log.
 
     Parameters
     ----------
     salvage : Salvage
-        Of the log; `before` is told each of its pieces as it comes.
+        Salvage of the log; `before` must be called with each piece as it is read.
     """
 
     def __init__(self, salvage: Salvage) -> None:
@@ -141,7 +141,7 @@ class FrameSearch:
         self._followers: dict[str, _FrameFollower] = {}
 
     def before(self, piece: WholeChunk | Message) -> list[LostFrames]:
-        """Find the frames that are missing before the first frames of a piece."""
+        """Return the frames missing before the first frames of a piece."""
         lost: list[LostFrames] = []
         for microphone, marks in read_marks(piece, self._salvage.definitions).items():
             if microphone not in self._followers:
@@ -150,17 +150,17 @@ class FrameSearch:
         return sorted(lost)
 
     def at_end(self, ends: Mapping[int, int]) -> list[LostFrames]:
-        """Find the frames that are missing behind the last piece.
+        """Return the frames missing behind the last piece.
 
         Parameters
         ----------
         ends : mapping of int to int
-            Last log time that was saved of each channel, in nanoseconds of UTC.
+            Last saved log time of each channel, in nanoseconds of UTC.
 
         Returns
         -------
         list of LostFrames
-            None of them ends before the last of these times.
+            None ends before the last of these times.
         """
         heard: dict[str, int] = {}
         for number, end in ends.items():
@@ -175,26 +175,26 @@ class FrameSearch:
 
 
 class _Place(NamedTuple):
-    """What is known of the place behind a mark."""
+    """Expected position of the next frame behind a mark."""
 
-    number: int | None  # of the frame that follows
-    time: int  # at which it follows, in nanoseconds of UTC
+    number: int | None  # number of the next frame
+    time: int  # its time in nanoseconds of UTC
     of_frame: bool  # whether the mark is a frame
 
 
 class _FrameFollower:
-    """Follows the frames of one microphone, by its features or, if there are none, its labels."""
+    """Tracker of the frames of one microphone, by its features or, without features, its labels."""
 
     def __init__(self, microphone: str, salvage: Salvage) -> None:
         self._name = microphone
         self._salvage = salvage
-        # Without an index bytes can be missing between two records, and nothing is broken.
+        # Without an index, bytes can be missing between two records without visible damage.
         gaps = topic(microphone, _GAP)
         has_gaps = any(c.topic == gaps for c in salvage.definitions.channels.values())
         self._has_all_gaps = has_gaps and not salvage.complete
         self._kind = _LABEL
         self._place: _Place | None = None  # behind the last mark
-        self._damages = 0  # that lie before it
+        self._damages = 0  # number of damages before the last mark
 
     def follow(self, marks: Sequence[FramePosition]) -> list[LostFrames]:
         if any(mark.kind == _FEATURES for mark in marks):
@@ -204,7 +204,7 @@ class _FrameFollower:
         for mark in marks:
             if mark.kind not in {self._kind, _GAP, _INFO} or self._is_repeated(mark):
                 continue
-            count = 0 if has_frames else self._missing(mark)  # a piece is whole in itself
+            count = 0 if has_frames else self._missing(mark)  # a piece has no internal losses
             if count:
                 lost += self._lost(self._start(mark, count), mark.start, count)
             has_frames |= mark.kind == self._kind
@@ -213,7 +213,7 @@ class _FrameFollower:
         return lost
 
     def at_end(self, heard: int, last: int) -> list[LostFrames]:
-        """Find the frames behind the last one; `heard` is when there still was sound."""
+        """Return the frames missing at the end; `heard` is the end of the known sound."""
         if self._place is None or self._place.number is None or not self._is_damaged():
             return []
         start = self._place.time
@@ -223,12 +223,12 @@ class _FrameFollower:
         return self._lost(start, max(start + count * FRAME_NANOSECONDS, last), count)
 
     def _is_repeated(self, mark: FramePosition) -> bool:
-        """Tell whether a mark was passed already: a damaged file may hold a piece twice."""
+        """Return whether a mark is repeated: a damaged file may hold a piece twice."""
         return self._place is not None and mark.end <= self._place.time
 
     def _missing(self, mark: FramePosition) -> int:
-        """Count the frames that are missing before a mark."""
-        if mark.kind == _INFO:  # another recording begins, or the next log of a merged one
+        """Count the frames missing before a mark."""
+        if mark.kind == _INFO:  # start of another recording, or of the next log of a merged one
             return 0
         if self._place is None:
             return self._counted()
@@ -259,7 +259,7 @@ class _FrameFollower:
         return self._salvage.damage_count > self._damages
 
     def _counted(self) -> int:
-        """Count the frames in the damages since the last mark; 0 if that is not known."""
+        """Count the frames in the damages since the last mark; 0 if unknown."""
         damages = self._salvage.damages()[self._damages :]
         if not all(damage.exact for damage in damages):
             return 0
@@ -271,21 +271,21 @@ class _FrameFollower:
         return [LostFrames(end, start, self._name, count)]
 
 
-_LAST = 0xFFFF  # number of a schema or a channel
+_LAST = 0xFFFF  # maximum schema or channel ID
 
 
 def gap_channel(definitions: Definitions, microphone: str) -> int | None:
-    """Find the channel for the gaps of a microphone, or define it.
+    """Return the channel for the gaps of a microphone; define a missing one.
 
     Parameters
     ----------
     definitions : Definitions
-        Are added to if there is none.
+        Extended if there is no such channel.
 
     Returns
     -------
     int or None
-        Number of the channel; None if the topic has one for messages of another type.
+        Channel ID; None if the topic has a channel of another type.
     """
     name = topic(microphone, "gap")
     for number, channel in definitions.channels.items():
@@ -310,7 +310,7 @@ def _is_ours(definitions: Definitions, channel: Channel) -> bool:
 
 
 def _schema(definitions: Definitions) -> int:
-    """Return the number of the schema of gaps, which is defined if there is none."""
+    """Return the schema ID of gaps; define a missing schema."""
     data = definition(GAP).encode()
     for number, schema in definitions.schemas.items():
         if (schema.name, schema.encoding, schema.data) == (GAP, SCHEMA_ENCODING, data):
@@ -321,5 +321,5 @@ def _schema(definitions: Definitions) -> int:
 
 
 def _free(numbers: dict[int, Channel] | dict[int, Schema]) -> int:
-    """Return a number that a definition further on in the file hardly has."""
+    """Return an ID that later definitions of the file are unlikely to use."""
     return next(number for number in range(_LAST, 0, -1) if number not in numbers)

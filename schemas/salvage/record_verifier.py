@@ -1,7 +1,7 @@
-"""Verification of records, and of message indexes, in a file that may be damaged anywhere.
+"""Verification of records and message indexes in a damaged file.
 
-What has a checksum is compared with it. What has none is believed if the lengths inside a record
-add up to the length before it, or to less: the format allows that records grow at their end.
+Data with a checksum are compared with it. Other records are accepted if their inner lengths
+add up to their length or to less: the format allows trailing fields.
 """
 
 import struct
@@ -59,44 +59,37 @@ from hearthlog.schemas.salvage.whole_records import (
     WholeRecord,
 )
 
-_VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # have lengths inside
+_VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # with inner lengths
 _LARGE = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT}  # may be larger than `LIMIT`
-_ATTACHMENT_HEAD = 1 << 16  # bytes in which names and times of a large attachment end
-_CHUNK_HEAD = 128  # bytes in which the head of a chunk ends, and that of its data
+_ATTACHMENT_HEAD = 1 << 16  # bytes that hold the names and times of a large attachment
+_CHUNK_HEAD = 128  # bytes that hold the head of a chunk and the head of its data
 _PIECE = 1 << 20  # bytes
-_UNKNOWN_CHAIN = 16  # records of unknown kinds in a row
+_UNKNOWN_CHAIN = 16  # consecutive records of unknown kinds
 _LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format may add
 
 
 class RecordVerifier:
-    """Reads whole records of a file from any byte on.
+    """Reader of complete records at any offset of a file.
 
     Parameters
     ----------
     end : int
-        Byte of the file before which reading ends.
+        Offset at which reading ends.
 
     Attributes
     ----------
     work : int
-        Bytes that were read and decompressed so far.
+        Bytes read and decompressed so far.
     """
 
     def __init__(self, file: LocalFile, end: int) -> None:
         self.end = end
-        self.work = 0  # bytes that were read and decompressed
-        self.inner = 0  # records inside of chunks that were gone through
+        self.work = 0
+        self.inner = 0  # records inside of chunks that were checked
         self._file = file
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes from an offset on.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file.
-        length : int
-            Bytes to read.
+        """Read bytes at an offset.
 
         Raises
         ------
@@ -108,22 +101,17 @@ class RecordVerifier:
         return data
 
     def head(self, offset: int) -> tuple[int, int]:
-        """Read the opcode and the length of a record, whatever they claim.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which the record begins.
+        """Read the opcode and the length of a record, without checks.
 
         Returns
         -------
         length : int
-            Bytes of its content, by its own claim.
+            Stated size of its content, in bytes.
 
         Raises
         ------
         McapError
-            If the file ends before that.
+            If the file ends within opcode and length.
         """
         data = self.read(offset, HEAD.size)
         if len(data) < HEAD.size:
@@ -132,19 +120,14 @@ class RecordVerifier:
         return opcode, length
 
     def ends(self, offset: int, kind: int | None = None) -> tuple[int, int]:
-        """Find where a record ends by the length before it, and by the lengths inside of it.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which the record begins.
+        """Find the end of a record by its length, and by its inner lengths.
 
         Returns
         -------
         outer : int
-            End by the length before it: byte of the file.
+            Offset of the end by the length of the record.
         inner : int
-            End by the lengths inside of it. The same as `outer` for a message, and for what is no
+            Offset of the end by the inner lengths. Equal to `outer` for a message or an invalid
             record; `UNKNOWN` if the file ends before one of these lengths.
 
         Raises
@@ -166,13 +149,7 @@ class RecordVerifier:
         return outer, inner
 
     def like_message_index(self, offset: int) -> bool:
-        """Tell whether a record could be a message index, whatever its opcode says.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which the record begins.
-        """
+        """Return whether a record could be a message index, ignoring its opcode."""
         data = self.read(offset, HEAD.size + MESSAGE_INDEX.size)
         if len(data) < HEAD.size + MESSAGE_INDEX.size:
             return False
@@ -181,13 +158,7 @@ class RecordVerifier:
         return bool(length == size + MESSAGE_INDEX.size and size % INDEX_ENTRIES.itemsize == 0)
 
     def plausible(self, offset: int) -> bool:
-        """Tell whether a record may begin at a byte, or the file may be cut there.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file.
-        """
+        """Return whether a record may begin at an offset, or the file may be truncated there."""
         if offset >= self.end:
             return offset == self.end
         for _ in range(_UNKNOWN_CHAIN):
@@ -199,26 +170,26 @@ class RecordVerifier:
                 fits = opcode in _LARGE and offset + HEAD.size + length <= self.end
                 most = self.end if fits else LIMIT
                 return bool(SHORTEST[opcode] <= length <= most) or data.startswith(MAGIC)
-            offset += HEAD.size + length  # it is known by what follows alone
+            offset += HEAD.size + length  # only the records behind it can confirm it
             if offset >= self.end:
                 return offset == self.end
         return True
 
     def whole(self, offset: int, chained: int = 1) -> WholeRecord:
-        """Read a record, if it is whole.
+        """Read a complete record.
 
         Parameters
         ----------
         offset : int
-            Byte of the file at which the record begins.
+            Offset of the record.
         chained : int
-            How many plausible records must follow a message outside of chunks, which has nothing
-            else to be known by. The count ends at the first of them that is no message.
+            Number of plausible records required behind a message outside of chunks, which has no
+            other check. Counting ends at the first record that is no message.
 
         Raises
         ------
         McapError
-            If the record is not whole, or this is none.
+            If there is no record at the offset, or it is incomplete.
         """
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
@@ -232,7 +203,7 @@ class RecordVerifier:
         return self._framed(offset, opcode, strict=chained > 1)
 
     def _framed(self, offset: int, opcode: int, *, strict: bool) -> WholeRecord:
-        """Read a record whose inner lengths tell where it ends; a strict one in UTF-8 only."""
+        """Read a record that ends by its inner lengths; if `strict`, only with valid UTF-8."""
         outer, inner = self.ends(offset)
         end = outer if self._is_padded(inner, outer) else inner
         wrong = "" if end == outer else "the length of a record"
@@ -248,7 +219,7 @@ class RecordVerifier:
             raise McapError("a record claims to be longer than the file")
         if wrong and not self.plausible(inner):
             raise McapError("a record has another length than it claims")
-        if opcode == Opcode.MESSAGE_INDEX:  # it is made anew
+        if opcode == Opcode.MESSAGE_INDEX:  # the writer builds a new one
             return WholeRecord(offset, end, None, wrong)
         raw = self.read(offset, inner - offset)
         if inner != outer:
@@ -265,19 +236,14 @@ class RecordVerifier:
         return WholeRecord(offset, end, record, wrong, escaped=(name,) * is_escaped)
 
     def chunk(self, offset: int) -> WholeRecord:
-        """Read a chunk whose content is proved, whatever its head says.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which the chunk should begin.
+        """Read a chunk with a verified content, whatever its head states.
 
         Raises
         ------
         McapError
-            If no chunk begins here, or its content is not proved.
+            If there is no chunk at the offset, or its content cannot be verified.
         """
-        name = HEAD.size + CHUNK.size  # where that of the compression begins
+        name = HEAD.size + CHUNK.size  # offset of the compression name
         head = self.read(offset, name + 4 + UINT64.size)
         try:
             opcode, length = HEAD.unpack_from(head)
@@ -298,8 +264,8 @@ class RecordVerifier:
             return WholeRecord(offset, outer, self._large_chunk(offset, outer))
         compression = head[name : first - UINT64.size]
         claim = ChunkHead(start, end, size, 0, compression, slice(None))
-        # One of two lengths may be wrong. Decompressors overlook what follows their data, so the
-        # shorter one comes first: if it is enough it is right.
+        # One of two lengths may be wrong. Decompressors ignore trailing bytes,
+        # so the shorter length is tried first: if it suffices, it is right.
         lengths = sorted({stored, length + HEAD.size - first})
         for number in lengths:
             try:
@@ -330,7 +296,7 @@ class RecordVerifier:
         return WholeRecord(offset, behind, whole, wrong, escaped=tuple(escaped), proved=proved)
 
     def _large_chunk(self, offset: int, end: int) -> LargeChunk:
-        """Go through a chunk that is too large for the memory."""
+        """Verify a chunk that is too large for the memory."""
         try:
             stream = ContentStream(self.read, offset)
         except TooLargeError as error:
@@ -366,7 +332,7 @@ class RecordVerifier:
         return LargeChunk(stored, data, definitions, leading, unread)
 
     def _unopened_chunk(self, offset: int, end: int, why: str) -> LargeChunk:
-        """Describe a chunk that is not opened, by its head and the indexes behind it."""
+        """Describe an unopened chunk by its head and its message indexes."""
         head = begun_chunk_head(self.read(offset + HEAD.size, _CHUNK_HEAD))
         first = offset + HEAD.size
         data = first + head.data.start, first + head.data.stop
@@ -386,7 +352,7 @@ class RecordVerifier:
         return LargeChunk(stored, data, [], 0, counts, why)
 
     def _large_message(self, offset: int, end: int) -> LargeChunk:
-        """Make a chunk of a message outside of chunks that is too large to be read."""
+        """Wrap a message outside of chunks that is too large to read in a chunk."""
         _, _, channel, _, time, _ = MESSAGE.unpack(self.read(offset, MESSAGE.size))
         if time > LAST_TIME:
             raise McapError("a log time is out of range")
@@ -395,7 +361,7 @@ class RecordVerifier:
         return LargeChunk(stored, (offset, end), [], 0, Counter({channel: 1}))
 
     def _large_attachment(self, offset: int, end: int) -> LargeAttachment:
-        """Check an attachment that is too large to be read."""
+        """Check an attachment that is too large to read."""
         head = whole_records.attachment_head(self.read(offset, _ATTACHMENT_HEAD))
         (crc,) = UINT32.unpack(self.read(end - UINT32.size, UINT32.size))
         if crc not in {0, self._crc(offset + HEAD.size, end - UINT32.size)}:
@@ -404,14 +370,14 @@ class RecordVerifier:
         return LargeAttachment(head.index_record, (offset, end), inner, head.escaped)
 
     def _crc(self, start: int, end: int) -> int:
-        """Return the checksum of some bytes of the file."""
+        """Return the checksum of a byte range of the file."""
         crc = 0
         for place in range(start, end, _PIECE):
             crc = zlib.crc32(self.read(place, min(_PIECE, end - place)), crc)
         return crc
 
     def _unknown(self, offset: int, opcode: int, length: int) -> WholeRecord:
-        """Read a record of a kind that MCAP leaves to others, unless it was one of a known kind."""
+        """Read a record of a private kind, unless it is a damaged record of a defined kind."""
         with suppress(McapError):
             return self.chunk(offset)
         end = offset + HEAD.size + length
@@ -422,22 +388,22 @@ class RecordVerifier:
         return WholeRecord(offset, end, whole_records.UnknownRecord(head, (offset, end)))
 
     def _is_padded(self, inner: int, outer: int) -> bool:
-        """Tell whether a record holds more than this version of the format knows.
+        """Return whether a record has trailing fields of a later version of the format.
 
-        Else its length may be wrong: what seems to be in it are then the records behind it.
+        Otherwise its length may be wrong, and its tail consists of the records behind it.
         """
         if not inner < outer <= min(inner + _LONGEST_PADDING, self.end):
             return False
         return self.plausible(outer) and not self._are_records(inner, outer)
 
     def _are_records(self, start: int, end: int) -> bool:
-        """Tell whether the bytes from a start to an end could be whole records."""
+        """Return whether a byte range could consist of complete records."""
         while start + HEAD.size <= end and self.plausible(start):
             start += HEAD.size + self.head(start)[1]
         return start == end
 
     def _data(self, offset: int, length: int) -> memoryview:
-        """Read the data of a chunk, of which there may be any length."""
+        """Read the data of a chunk, of any length."""
         if not 0 <= length <= LIMIT:
             raise McapError("a chunk claims to be too large")
         if offset + length > self.end:
@@ -445,7 +411,7 @@ class RecordVerifier:
         return memoryview(self.read(offset, length))
 
     def _prove(self, head: ChunkHead, data: memoryview, crc: int) -> tuple[bytes, int]:
-        """Decompress a chunk; return its content and its checksum, which `crc` is, or 0."""
+        """Decompress a chunk; return content and checksum, which must be `crc` unless that is 0."""
         self.work += head.size
         content = decompress(head, data)
         checksum = zlib.crc32(content)
@@ -478,22 +444,17 @@ class RecordVerifier:
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index.
 
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which it begins.
-
         Returns
         -------
         entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
-            Those with log times up to `LAST_TIME`.
+            Entries with log times up to `LAST_TIME`.
         end : int
-            Byte of the file before which it ends.
+            Offset of its end.
 
         Raises
         ------
         McapError
-            If there is none, or it is damaged.
+            If there is no message index, or it is damaged.
         """
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")
@@ -512,36 +473,36 @@ class RecordVerifier:
 
 _NO_TIMES = (LATEST, 0)
 _KEPT = 1000  # claims
-_INDEXES = 1 << 16  # behind a chunk: as many as there can be channels
+_INDEXES = 1 << 16  # per chunk: the maximum number of channels
 
 
 class Claim(NamedTuple):
-    """Messages that are listed by message indexes, and are in no chunk."""
+    """Messages that message indexes list but no chunk holds."""
 
-    start: int  # byte of the file behind which they are missing
+    start: int  # offset behind which they are missing
     messages: Counter[int]  # by channel
     times: tuple[int, int]  # first and last log time
 
 
 class IndexClaims:
-    """Compares the message indexes behind each chunk with the messages of the chunk."""
+    """Comparison of the message indexes of each chunk with its messages."""
 
     def __init__(self) -> None:
         self._claims: list[Claim] = []
         self._spans = array("q")  # first and last log times of all chunks
-        self._own: dict[int, NDArray[np.void]] | None = {}  # entries that the chunk should have
+        self._own: dict[int, NDArray[np.void]] | None = {}  # expected entries of the chunk
         self._listed: Counter[int] = Counter()  # entries by channel
-        self._others: set[tuple[int, int]] = set()  # indexes that are not its own
+        self._others: set[tuple[int, int]] = set()  # indexes that do not belong to the chunk
         self._times = _NO_TIMES
         self._start = 0
 
     def add_chunk(self, end: int, chunk: StoredChunk) -> None:
-        """Begin with a chunk.
+        """Start with a chunk.
 
         Parameters
         ----------
         end : int
-            Byte of the file at which it ends.
+            Offset of the end of the chunk.
         """
         self._spans.extend([chunk.start, chunk.end])
         self._begin(end)
@@ -569,13 +530,7 @@ class IndexClaims:
             self._times = min(self._times[0], first), max(self._times[1], last)
 
     def close(self, end: int) -> None:
-        """End with the indexes of a chunk: another record follows.
-
-        Parameters
-        ----------
-        end : int
-            Byte of the file at which that record begins.
-        """
+        """Finish the indexes of a chunk at the offset of the next record."""
         if self._own is not None and self._others and len(self._claims) < _KEPT:
             own = Counter({channel: len(same) for channel, same in self._own.items()})
             if self._listed.total() > own.total():
@@ -583,7 +538,7 @@ class IndexClaims:
         self._begin(end)
 
     def give_up(self) -> None:
-        """Ignore the indexes that follow: the chunk before them is damaged, and tells of them."""
+        """Ignore the following indexes: the damage of the chunk before them is reported already."""
         self._begin(0)
         self._own = None
 
@@ -592,7 +547,7 @@ class IndexClaims:
         self._others, self._times = set(), _NO_TIMES
 
     def unmet(self) -> Iterator[Claim]:
-        """List the claims whose time no chunk covers, wherever that is in the file."""
+        """List the claims with times that no chunk of the file covers."""
         spans = np.frombuffer(self._spans, np.int64).reshape(-1, 2)
         spans = spans[np.argsort(spans[:, 0], kind="stable")]
         ends = np.maximum.accumulate(spans[:, 1])

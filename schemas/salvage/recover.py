@@ -1,4 +1,4 @@
-"""New logs from old ones: recovered from a damaged log, or thinned to save space."""
+"""Recovery of damaged logs, and thinning of logs to save space."""
 
 import fcntl
 import os
@@ -59,28 +59,28 @@ from hearthlog.schemas.salvage.whole_records import (
 
 @dataclass
 class TopicRecovery:
-    """What was saved of a topic."""
+    """Recovery result of a topic."""
 
     type: str
     messages: int = 0
-    stated: int = 0  # gaps that were not in the log, and say what could not be saved
-    expected: int | None = None  # messages that there should be, if the index of the log says so
+    stated: int = 0  # new gap messages that describe lost data
+    expected: int | None = None  # message count in the index of the log, if there is one
     end: int = 0  # log time of the last message, in nanoseconds
-    unread: int = 0  # of the messages: copied, and larger than is read
+    unread: int = 0  # messages copied without reading, as they are too large
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was saved of a log, and what was lost."""
+    """Recovery result of a log: saved messages and losses."""
 
     topics: dict[str, TopicRecovery]
     damages: list[Damage]
-    complete: bool  # whether the log was finished, and its index is whole
-    escaped: Sequence[str] = ()  # names of what has texts that are not UTF-8
+    complete: bool  # whether the log was finished, and its index is complete
+    escaped: Sequence[str] = ()  # names of records with texts that are not UTF-8
 
     @property
     def messages(self) -> int:
-        """Messages that were saved."""
+        """Number of saved messages."""
         return sum(topic.messages for topic in self.topics.values())
 
     @property
@@ -90,7 +90,7 @@ class Recovery:
 
     @property
     def losses(self) -> list[str]:
-        """What was lost: a text for each damage, or one where only the frames tell of it."""
+        """Description of each damage, or one description if only frame numbers reveal a loss."""
         losses = [str(damage) for damage in self.damages if not damage.lossless]
         if not losses and any(topic.stated for topic in self.topics.values()):
             return ["frames are missing, or lie elsewhere in the log: see its gaps"]
@@ -98,24 +98,24 @@ class Recovery:
 
 
 class TopicFilter(Protocol):
-    """What a copy leaves out, and says of it."""
+    """Selection of the topics that a copy omits."""
 
     @property
     def note(self) -> Mapping[str, str]:
-        """What the `hearthlog` record of the copy says besides."""
+        """Additional entries of the `hearthlog` record of the copy."""
 
     def drops(self, topic: str) -> bool:
-        """Tell whether the messages of a topic are left out."""
+        """Return whether the messages of a topic are omitted."""
 
 
 class SalvagedCopy:
-    """Copies the whole pieces of a damaged log into a new one.
+    """Copy of the undamaged pieces of a log in a new log.
 
     Parameters
     ----------
     chunk_span : int
-        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged. Where they
-        are joined, embeddings get chunks of their own.
+        Nanoseconds of log time up to which chunks are merged; 0 to copy them unchanged. Merging
+        puts embeddings in separate chunks.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class SalvagedCopy:
         chunk_span: int = 0,
         selection: TopicFilter | None = None,
     ) -> None:
-        self.pieces = 0  # pieces that were copied
+        self.pieces = 0
         self._salvage = salvage
         self._profile = profile
         self._chunk_span = chunk_span
@@ -134,26 +134,26 @@ class SalvagedCopy:
         self._search = FrameSearch(salvage)
         self._writer = CountedWriter(stream, salvage.definitions)
         self._begun = False
-        self._counted: dict[str, int] = {}  # messages by topic, as the `rosbag2` record has them
+        self._counted: dict[str, int] = {}  # messages by topic, from the `rosbag2` record
         self._written: set[tuple[type, int]] = set()
         self._counts: Counter[int] = Counter()
-        self._stated: Counter[int] = Counter()  # gaps that were not in the log
+        self._stated: Counter[int] = Counter()  # new gap messages
         self._unread: Counter[int] = Counter()
         self._ends: dict[int, int] = {}
         self._span = (1 << 63, 0)
 
     def write(self, name: str, progress: Progress) -> None:
-        """Write all pieces, and complete the file.
+        """Write all pieces, and finish the file.
 
         Parameters
         ----------
         progress : callable
-            Called after each piece with the share of the damaged log that is passed, 0 to 1.
+            Called after each piece with the processed share of the damaged log, 0 to 1.
         """
         for piece in self._salvage.pieces():
             self._add(piece)
             progress(self._salvage.offset / self._salvage.size)
-            del piece  # before the next is read, which may be as large
+            del piece  # frees memory before the next piece, which may be as large
         self._begin()
         for lost in self._search.at_end(self._ends):
             self._add_gap(lost)
@@ -168,24 +168,18 @@ class SalvagedCopy:
         self._writer.finish()
 
     def could_be_better(self) -> bool:
-        """Tell whether another attempt would know definitions or a profile from the start."""
+        """Return whether a second attempt would have definitions or a profile from the start."""
         defines = self._salvage.definitions.defines
         late = any(defines(channel) for channel in self._salvage.unnamed)
         return late or (self._salvage.header is None and self.profile() != self._profile)
 
     def profile(self) -> str:
-        """Guess the profile of a log without header by how its messages are encoded.
-
-        Returns
-        -------
-        str
-            `ros2` if a channel is encoded as CDR; else an empty text.
-        """
+        """Guess the profile of a log without header: `ros2` if a channel is CDR, else empty."""
         channels = self._salvage.definitions.channels.values()
         return PROFILE if any(c.message_encoding == ENCODING for c in channels) else ""
 
     def recovery(self) -> Recovery:
-        """Count what was saved, and list what was lost."""
+        """Count saved messages, and list losses."""
         topics: dict[str, TopicRecovery] = {}
         expected = self._salvage.expected
         for number, channel, kind in self._channel_types():
@@ -236,7 +230,7 @@ class SalvagedCopy:
             self._writer.add_metadata(piece.name, piece.metadata)
 
     def _add_chunk(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
-        """Copy a chunk, as it is unless something is dropped or gaps stand between its messages."""
+        """Copy a chunk, unchanged unless messages are dropped or gaps inserted."""
         chunk = piece.stored
         if any(lost.end > chunk.start for lost in losses):
             self._add_messages(piece, losses)
@@ -265,7 +259,7 @@ class SalvagedCopy:
         return self._salvage.stored(*piece.data)
 
     def _add_large(self, piece: LargeChunk) -> None:
-        """Copy a chunk that was not opened."""
+        """Copy an unopened chunk."""
         chunk, (start, end) = piece.stored, piece.data
         dropped = [self._drops(number) for number in chunk.entries]
         if dropped and all(dropped):
@@ -288,9 +282,9 @@ class SalvagedCopy:
         return self._selection.drops(self._salvage.definitions.channels[number].topic)
 
     def _is_gathered(self, number: int) -> bool:
-        """Return whether the messages of a channel get chunks of their own.
+        """Return whether the messages of a channel get separate chunks.
 
-        Among features, whose bytes are as good as random, embeddings take half as much again.
+        Mixed with features, which are nearly incompressible, embeddings take 1.5 times the space.
         """
         definitions = self._salvage.definitions
         schema = definitions.schemas.get(definitions.channels[number].schema_id)
@@ -314,7 +308,7 @@ class SalvagedCopy:
         self._count(number, 1, time, time)
 
     def _add_gap(self, lost: LostFrames) -> None:
-        """Say that frames are missing, unless log time is beyond them already."""
+        """Write a gap message for lost frames, unless log time is already later."""
         end, start, microphone, frames = lost
         number = gap_channel(self._salvage.definitions, microphone)
         if number is None or end < self._span[1]:
@@ -331,7 +325,7 @@ class SalvagedCopy:
             self._begun = True
 
     def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
-        """Write what defines these channels before their first message, unless it stands there."""
+        """Write the definitions of channels before their first message, unless they are written."""
         self._written.update((type(record), record.id) for record in inside)
         definitions = self._salvage.definitions
         for number in numbers:
@@ -340,7 +334,7 @@ class SalvagedCopy:
             for record in (schema, channel):
                 if record is not None and (type(record), record.id) not in self._written:
                     if self._chunk_span:
-                        self._writer.flush()  # what it refers to may be in there
+                        self._writer.flush()  # its buffer may hold related definitions
                     self._writer.write_definition(record)
                     self._written.add((type(record), record.id))
 
@@ -350,19 +344,19 @@ class SalvagedCopy:
         self._span = min(self._span[0], first), max(self._span[1], last)
 
     def _rosbag2(self, name: str) -> dict[str, str] | None:
-        """Make the `rosbag2` record, by which rosbag2 lists topics; None if that is impossible."""
+        """Build the `rosbag2` record, the source of rosbag2's topic list; None if impossible."""
         topics: dict[str, TopicCount] = {}
         for number, channel, kind in self._channel_types():
             topic = topics.setdefault(channel.topic, TopicCount(kind, channel.metadata))
             topic.messages += self._counts[number]
         try:
             return rosbag2_metadata(name, topics, self._span if self._counts else (0, 0))
-        except (KeyError, ValueError, RecursionError):  # other writers describe channels otherwise
+        except (KeyError, ValueError, RecursionError):  # others describe channels differently
             return None
 
 
 def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[Damage]:
-    """List messages that a count in the log has, while nothing shows where they were."""
+    """List lost messages that are counted in the log, but leave no trace of their location."""
     if not all(damage.exact for damage in damages):
         return []
     missing = {
@@ -375,7 +369,7 @@ def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[D
 
 
 class NothingWholeError(LogError):
-    """Nothing in a log is whole."""
+    """No part of a log is undamaged."""
 
 
 def recover_log(
@@ -386,21 +380,21 @@ def recover_log(
     *,
     chunk_span: int = 0,
 ) -> Recovery:
-    """Copy what is whole in a log to a new one, and check the copy.
+    """Copy the undamaged parts of a log to a new log, and check the copy.
 
     Parameters
     ----------
     progress : callable, optional
-        Called with the share that is done, 0 to 1; starts again if a second attempt is needed.
+        Called with the completed share, 0 to 1; restarts at 0 for a second attempt.
     chunk_span : int
-        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged.
+        Nanoseconds of log time up to which chunks are merged; 0 to copy them unchanged.
 
     Raises
     ------
     NothingWholeError
-        If the source is not an MCAP file, or nothing in it is whole.
+        If the source is not an MCAP file, or no part of it is undamaged.
     LogError
-        If it cannot be read, or the copy does not hold what was written to it.
+        If the source cannot be read, or the copy differs from the written messages.
     OSError
         If the copy cannot be written.
     """
@@ -434,20 +428,20 @@ def recover_log(
 
 
 def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
-    """Put a whole log in the place of a damaged one, which is kept beside it as `*.damaged`.
+    """Replace a damaged log by its recovered copy, and keep the original as `*.damaged`.
 
     Parameters
     ----------
     progress : callable, optional
-        Called with the share that is done, 0 to 1.
+        Called with the completed share, 0 to 1.
 
     Raises
     ------
     NothingWholeError
-        If the log is not an MCAP file, or nothing in it is whole.
+        If the log is not an MCAP file, or no part of it is undamaged.
     LogError
-        If it is being written, cannot be read, or there is a file of a name needed here; or if the
-        copy cannot be written, or does not hold what was written to it.
+        If the log is being written, cannot be read, or a required file name is taken; or if the
+        copy cannot be written, or differs from the written messages.
     """
     path = log.with_name(stem(log) + SUFFIX)
     kept = path.with_name(path.name + ".damaged")
@@ -476,16 +470,15 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
 
 def _keep(log: Path, name: Path) -> None:
     try:
-        name.hardlink_to(log)  # so that there is a file of its own name at any time
-    except OSError:  # FAT knows no links
+        name.hardlink_to(log)  # keeps a file at the name of the log at any time
+    except OSError:  # FAT has no links
         log.rename(name)
 
 
 def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
-    """Read a recovered log with all its checksums, and count its messages.
+    """Verify all checksums of a recovered log, and count its messages.
 
-    Raise `LogError` if it is damaged or cannot be read, or does not hold the messages that were
-    recovered.
+    Raise `LogError` if the log is damaged, cannot be read, or lacks recovered messages.
     """
     expected = Counter(
         {name: each.messages + each.stated - each.unread for name, each in topics.items()}
@@ -508,7 +501,7 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
 
 @contextmanager
 def lock_abandoned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a log, unless the process that writes the log holds it.
+    """Hold the lock of a log, unless its writer holds it.
 
     Raise `LogError` if the log cannot be read.
     """
@@ -526,7 +519,7 @@ def lock_abandoned(path: Path) -> Iterator[bool]:
 
 
 def _is_at(stream: BinaryIO, path: Path) -> bool:
-    """Tell whether a path still leads to an open file."""
+    """Return whether a path still refers to an open file."""
     try:
         return os.path.samestat(os.fstat(stream.fileno()), path.stat())
     except OSError:
@@ -535,20 +528,20 @@ def _is_at(stream: BinaryIO, path: Path) -> bool:
 
 _CHUNK_SPAN = 10 * NANOSECONDS
 _REST = "all but labels, segments and gaps"
-STEPS = ("", "statistics", "statistics and features", _REST)  # what a log is thinned of
+STEPS = ("", "statistics", "statistics and features", _REST)  # dropped message kinds of each step
 _SOUND = {"statistics", "features", "embedding"}
 _DROPPED = (set[str](), {"statistics"}, _SOUND, _SOUND)
 _KEPT = {"info", "label", "segment", "gap"}
 
 
 class Thinning(NamedTuple):
-    """A step of thinning."""
+    """Step of thinning."""
 
     step: int
     note: Mapping[str, str]
 
     def drops(self, topic: str) -> bool:
-        """Tell whether the messages of a topic are dropped."""
+        """Return whether the messages of a topic are dropped."""
         parts = parse_topic(topic)
         if STEPS[self.step] == _REST:
             if parts is None or parts.kind not in _KEPT:
@@ -558,15 +551,15 @@ class Thinning(NamedTuple):
 
 
 def dropped_kinds(text: str | None) -> set[str]:
-    """Return which of a log's frame by frame messages were dropped."""
+    """Return the dropped kinds of per-frame messages of a log."""
     return _DROPPED[STEPS.index(text)] if text in STEPS else set()
 
 
 def thinned_step(log: Path) -> int:
-    """Return how far a log was thinned already, a place in `STEPS`.
+    """Return the thinning step of a log, an index of `STEPS`.
 
-    Raise `LogError` if it cannot be read or is damaged, or a newer version has thinned it
-    otherwise.
+    Raise `LogError` if the log cannot be read, is damaged, or was thinned in another way by a
+    newer version.
     """
     with LogFile(log) as file:
         texts = {record.get(THINNED, "") for record in provenance_records(file)}
@@ -577,11 +570,11 @@ def thinned_step(log: Path) -> int:
 
 
 def thin_log(source: Path, copy: Path, step: int) -> None:
-    """Copy a log without what a step of thinning drops, and check the copy.
+    """Copy a log without the messages that a thinning step drops, and check the copy.
 
-    All other messages stay as they are, in their order. Channels stay defined, without messages.
+    Other messages keep content and order. Channels stay defined, without messages.
 
-    Raise `LogError` if the log is damaged, or the copy does not hold what was written to it.
+    Raise `LogError` if the log is damaged, or the copy differs from the written messages.
     Raise `OSError` if the copy cannot be written.
     """
     with LogFile(source) as file:

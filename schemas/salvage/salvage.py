@@ -1,11 +1,11 @@
-"""The undamaged pieces of an MCAP file that was cut or damaged, and its damages.
+"""Undamaged pieces of a truncated or damaged MCAP file, and its damages.
 
-The file is walked from record to record. Where no whole record follows, the next one is searched
-for: a length that is wrong hides nothing behind it.
+The file is scanned record by record. Behind damaged data, the next complete record is searched
+for, so a wrong length hides nothing behind it.
 
-The time that this takes grows with the size of the file, not with what it claims: what is whole
-is read once, and what is read in vain, because it only looks like a record, may be `_VAIN` times
-the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, and reported.
+The time grows with the actual size of the file, not with stated sizes: undamaged data are read
+once, and futile reads of false records are limited to `_VAIN` times the bytes passed so far plus
+`4 * LIMIT`. Beyond the limit, data are skipped and reported.
 """
 
 from bisect import bisect_left
@@ -47,7 +47,7 @@ from hearthlog.schemas.salvage.whole_records import (
 )
 
 _VAIN = 8
-_KEPT_LIMIT = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
+_KEPT_LIMIT = 128 << 20  # maximum bytes of definitions, names and indexes kept in memory
 _KEPT_EACH = 256
 _WINDOW = 1 << 20
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
@@ -58,7 +58,7 @@ Piece = records.Metadata | records.Message | Whole
 
 
 class _Places(NamedTuple):
-    """Where in a window of the file records may begin, bytes ascending: chunks, and all of them."""
+    """Candidate record offsets in a window of the file, ascending: chunks, and all records."""
 
     window: int
     chunks: list[int]
@@ -66,24 +66,24 @@ class _Places(NamedTuple):
 
 
 class Salvage:
-    """Reads the whole pieces of an MCAP file that was cut or damaged.
+    """Reader of the undamaged pieces of a truncated or damaged MCAP file.
 
     Attributes
     ----------
     unnamed : dict of int to tuple
-        By channel that was not defined when its messages were met: how many these are, their first
-        and last log time, and the bytes of the file between which they are.
+        By channel without a definition before its messages: number of messages, first and last log
+        time, and their byte range in the file.
     size : int
-        Bytes of the file.
+        Size of the file in bytes.
     offset : int
-        Bytes that `pieces` has passed so far.
+        Number of bytes passed by `pieces` so far.
     escaped : dict of str
-        Names that were met so far and are not UTF-8, or of what has other texts that are not.
+        Names found so far that are not UTF-8, or of records with other texts that are not.
 
     Raises
     ------
     LogError
-        If it cannot be read.
+        If the file cannot be read.
     """
 
     def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:
@@ -94,7 +94,7 @@ class Salvage:
         self.unnamed = self._damages.unnamed
         self._file = LocalFile(path)
         self.size = self._file.size
-        self.offset = 0  # bytes that have been passed
+        self.offset = 0
         self.escaped: dict[str, None] = {}
         self._reader = RecordVerifier(self._file, self.size)
         start = self._reader.read(0, len(MAGIC))
@@ -110,13 +110,13 @@ class Salvage:
         for record in definitions:
             self.definitions.add(record)
         self._claims = IndexClaims()
-        self._next: WholeRecord | None = None  # by the last search
-        self._places = _Places(-1, [], [])  # of the window that was searched last
+        self._next: WholeRecord | None = None  # found by the last search
+        self._places = _Places(-1, [], [])  # of the last searched window
         self._vain = self._kept = 0
-        self._cost = 0  # of what was last read in vain
+        self._cost = 0  # bytes of the last futile read
         self._has_chunks = False
-        self._ended = False  # the data: the index follows
-        self._astray = False  # perhaps inside a damaged chunk
+        self._ended = False  # whether the data ended: the index follows
+        self._astray = False  # whether the position may be inside a damaged chunk
         self._last_index: int | None = None  # start of the last record, if it is a message index
 
     def __enter__(self) -> Self:
@@ -126,23 +126,23 @@ class Salvage:
         self._file.close()
 
     def damages(self) -> list[Damage]:
-        """List the damages met so far by offset, then the messages of undefined channels."""
+        """List the damages found so far by offset, then the messages of undefined channels."""
         return self._damages.resolve(self.definitions)
 
     @property
     def damage_count(self) -> int:
-        """How many damages were met so far; as many of `damages` come first."""
+        """Number of damages found so far; they are the first entries of `damages`."""
         return len(self._damages)
 
     def pieces(self) -> Iterator[Piece]:
-        """Read whatever is whole, in the order of the file.
+        """Read all undamaged pieces, in file order.
 
         Yields
         ------
-        mcap.records.Metadata, mcap.records.Message, or what is in `Whole`
-            Chunks have been compared with their checksums, and have the message index that they
-            should have. They hold no messages of undefined channels: where there are such, the
-            other messages come one by one.
+        mcap.records.Metadata, mcap.records.Message, or a member of `Whole`
+            Chunks have verified checksums and a rebuilt message index. They hold no messages of
+            undefined channels: in chunks with such messages, the other messages are yielded one by
+            one.
         """
         yield from self._walk()
         if self._met is not None:
@@ -170,10 +170,10 @@ class Salvage:
             self._last_index = offset if whole.record is None else None
             self._compare_index(whole)
             yield from self._take(whole)
-            del whole  # before the next is read, which may be as large
+            del whole  # frees memory before the next record, which may be as large
 
     def _compare_index(self, whole: WholeRecord) -> None:
-        """Compare message indexes with the chunk before them, where there is no other index."""
+        """Compare message indexes with the chunk before them, if there is no other index."""
         if self._index is not None:
             return
         if whole.record is None:
@@ -186,7 +186,7 @@ class Salvage:
             self._claims.add_chunk(whole.end, whole.record.stored)
 
     def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> WholeRecord:
-        """Read the record that begins here; raise McapError if there is none that is whole."""
+        """Read the record at an offset; raise McapError if there is no complete one."""
         if self._next is not None and self._next.offset == offset:
             whole, self._next = self._next, None
             return whole
@@ -207,7 +207,7 @@ class Salvage:
         return whole
 
     def _count_kept(self, whole: WholeRecord) -> None:
-        """Count the bytes that will be kept of a record; raise McapError if they are too many."""
+        """Count the bytes to keep of a record; raise McapError if they are too many."""
         record, size = whole.record, _KEPT_EACH
         if isinstance(record, WholeChunk | LargeChunk):
             size += 16 * len(record.stored.entries)
@@ -225,7 +225,7 @@ class Salvage:
         self._kept += size
 
     def _doubt(self, whole: WholeRecord, *, searching: bool) -> None:
-        """Raise McapError for what may be another record, or look like one only by chance."""
+        """Raise McapError for a possibly misread or accidental record."""
         unproved = records.Message | Definition | UnknownRecord
         if self._astray and isinstance(whole.record, unproved):
             raise McapError("what is in a damaged chunk is not proved")
@@ -244,14 +244,14 @@ class Salvage:
             raise McapError("no record begins where this one ends")
 
     def _like_message(self, record: bytes) -> bool:
-        """Return whether a record of an unknown kind was a message of a channel, but for a bit."""
+        """Return whether an unknown record is a message of a channel with a flipped bit."""
         if len(record) < MESSAGE.size or (record[0] ^ Opcode.MESSAGE).bit_count() != 1:
             return False
         _, _, channel, _, log_time, _ = MESSAGE.unpack_from(record)
         return self.definitions.defines(channel) and 0 < log_time <= LAST_TIME
 
     def _pass(self, offset: int, why: str) -> int:
-        """Note that no whole record begins here; return where the next one does."""
+        """Record a damage at an offset; return the offset of the next complete record."""
         reader, cost = self._reader, self._cost
         self._claims.close(offset)
         self._claims.give_up()
@@ -263,7 +263,7 @@ class Salvage:
             ends = reader.ends(offset)
         if opcode == Opcode.CHUNK:
             self._has_chunks = True
-        else:  # perhaps only this byte of it is wrong
+        else:  # perhaps only this byte is damaged
             try:
                 self._next = self._at(offset, chunk=True)
             except McapError:
@@ -274,7 +274,7 @@ class Salvage:
         if opcode in _FRAMED:
             end = next((e for e in sorted(ends) if e < reader.end and reader.plausible(e)), -1)
         if end < 0:
-            self._vain += cost  # for its bytes are read again
+            self._vain += cost  # as its bytes are read again
             self._astray = opcode == Opcode.CHUNK
             end = self._search(offset + 1)
         cut = end == self.size and SHORTEST[opcode] < LIMIT and min(ends, default=end + 1) > end
@@ -282,7 +282,7 @@ class Salvage:
             why = "the file ends within a record"
         elif not any(reader.read(offset, 64)):
             why = "zeros"
-        if self._ended:  # it was part of the index
+        if self._ended:  # part of the index
             self._damages.add(Damage(offset, end, why, cut=cut))
         else:
             lost = loss_in(reader, DamagedRange(offset, end, opcode, ends), self._index)
@@ -290,9 +290,9 @@ class Salvage:
         return end
 
     def _chunk_in_last_index(self, offset: int) -> int | None:
-        """Return where a whole chunk begins in what passed for a message index before a byte.
+        """Return the offset of a complete chunk within the supposed message index before an offset.
 
-        An index has no checksum: with bytes missing, it may end inside a later chunk.
+        A message index has no checksum: if bytes are missing, its end may be inside a later chunk.
         """
         index, self._last_index = self._last_index, None
         if index is None:
@@ -304,9 +304,9 @@ class Salvage:
         return place
 
     def _search(self, start: int, *, before: int | None = None) -> int:
-        """Return where the next whole record begins, or where the data end.
+        """Return the offset of the next complete record, or of the end of the data.
 
-        `before` a byte only chunks are searched for; it is returned if there is none.
+        With `before`, search only for chunks up to this offset; return it if there is none.
         """
         end = self._reader.end if before is None else before
         while start < end:
@@ -327,7 +327,7 @@ class Salvage:
         return end
 
     def _find_places(self, window: int) -> "_Places":
-        """Look through a window for what may be the head of a record."""
+        """Search a window for possible record heads."""
         start = window * _WINDOW
         size = min(_WINDOW + CHUNK_HEAD_LIMIT, self._reader.end - start)
         data = self._file.read(start, size)
@@ -337,7 +337,7 @@ class Salvage:
         return _Places(window, sorted(chunks), sorted(chunks | heads))
 
     def _take(self, whole: WholeRecord) -> Iterator[Piece]:
-        """Note what a record tells of the file; yield it if the new log will hold it."""
+        """Register the contents of a record; yield it if it belongs into the new log."""
         record = whole.record
         if self._met is not None:
             self._met.meet(whole)
@@ -365,7 +365,7 @@ class Salvage:
             yield record
 
     def _take_large(self, chunk: LargeChunk, whole: WholeRecord) -> Iterator[Piece]:
-        """Yield a chunk that is copied as it is, if all its channels are defined."""
+        """Yield a chunk for an unchanged copy, if all its channels are defined."""
         for record in chunk.definitions:
             if not self.definitions.add(record):
                 self.definitions.doubt(record)
@@ -389,12 +389,12 @@ class Salvage:
             yield chunk
 
     def stored(self, start: int, end: int) -> Iterator[bytes]:
-        """Read some bytes of the file, a megabyte at a time."""
+        """Read a byte range of the file in pieces of 1 MiB."""
         for place in range(start, end, _WINDOW):
             yield self._file.read(place, min(_WINDOW, end - place))
 
     def _take_message(self, message: records.Message, whole: WholeRecord) -> Iterator[Piece]:
-        """Yield a message outside of chunks, if its channel is defined and its time can be read."""
+        """Yield a message outside of chunks, if its channel is defined and its time is valid."""
         if message.log_time > LAST_TIME:
             self._add_late(whole, {message.channel_id: 1})
         elif self.definitions.defines(message.channel_id):
@@ -404,12 +404,12 @@ class Salvage:
             self._damages.add_unnamed(message.channel_id, 1, times, whole)
 
     def _add_late(self, whole: WholeRecord, messages: Mapping[int, int]) -> None:
-        """Note messages that are left out, because nobody could read their log times."""
+        """Register messages that are skipped because readers cannot represent their log times."""
         if messages:
             self._damages.add(Damage(whole.offset, whole.end, _LATE, sound=True), dict(messages))
 
     def _take_chunk(self, chunk: WholeChunk, whole: WholeRecord) -> Iterator[Piece]:
-        """Yield a chunk if all its channels are defined, else its messages of those that are."""
+        """Yield a chunk if all its channels are defined; else its messages of defined ones."""
         self._add_late(whole, chunk.late)
         agree = True
         for record in chunk.definitions:

@@ -1,4 +1,4 @@
-"""Undamaged records of a damaged file: sizes that are possible, and contents."""
+"""Undamaged records of a damaged file: possible sizes, and contents."""
 
 import struct
 import zlib
@@ -30,8 +30,8 @@ from hearthlog.schemas.mcap.records import (
     parse_escaped,
 )
 
-UNKNOWN = 1 << 62  # bytes, more than any file has
-# The content of each kind of record: so many bytes, or a length of this format and so many bytes.
+UNKNOWN = 1 << 62  # larger than any file, in bytes
+# Content of each kind of record: a number of bytes, or a length of this format and that many bytes.
 FIELDS: dict[int, tuple[int | struct.Struct, ...]] = {
     Opcode.HEADER: (UINT32, UINT32),
     Opcode.FOOTER: (20,),
@@ -48,11 +48,11 @@ FIELDS: dict[int, tuple[int | struct.Struct, ...]] = {
     Opcode.SUMMARY_OFFSET: (17,),
     Opcode.DATA_END: (4,),
 }
-SHORTEST = np.full(256, UNKNOWN)  # bytes of the shortest content, by opcode
+SHORTEST = np.full(256, UNKNOWN)  # minimum content size in bytes, by opcode
 for _opcode, _fields in FIELDS.items():
     SHORTEST[_opcode] = sum(f if isinstance(f, int) else f.size for f in _fields)
 SHORTEST[Opcode.MESSAGE] = MESSAGE_FIXED
-LARGEST = np.full(256, 16 << 20)  # bytes of the largest record that is read, by opcode
+LARGEST = np.full(256, 16 << 20)  # maximum record size in bytes that is read, by opcode
 LARGEST[[Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX]] = LIMIT
 
 
@@ -62,7 +62,7 @@ def find_record_heads(window: bytes) -> list[int]:
     Returns
     -------
     list of int
-        Bytes of the window at which an opcode and a length may stand that go together, ascending.
+        Offsets in the window with a plausible pair of opcode and length, ascending.
     """
     count = len(window) - HEAD.size + 1
     if count <= 0:
@@ -78,76 +78,76 @@ _DEFINITIONS_LIMIT = 1 << 19
 
 
 class WholeChunk(NamedTuple):
-    """A chunk whose content is proved, and the definitions in it."""
+    """Chunk with verified content, and its definitions."""
 
     stored: StoredChunk
     definitions: list[Definition]
-    leading: int  # how many of them stand before the first message
-    late: Mapping[int, int] = {}  # by channel: messages that were left out of it for their log time
+    leading: int  # number of definitions before the first message
+    late: Mapping[int, int] = {}  # by channel: messages omitted for their log time
 
 
 class LargeChunk(NamedTuple):
-    """A chunk that is too large to be read at once, or a message that is to become one."""
+    """Chunk that is too large to read at once, or a large message that becomes a chunk."""
 
     stored: StoredChunk  # without its data
-    data: tuple[int, int]  # bytes of the file at which these begin, and before which they end
+    data: tuple[int, int]  # start and end offset of the data in the file
     definitions: list[Definition]
-    leading: int  # how many of them stand before the first message
-    unread: Mapping[int, int]  # by channel: messages that are themselves too large
-    unopened: str = ""  # why nothing of it was looked at
+    leading: int  # number of definitions before the first message
+    unread: Mapping[int, int]  # by channel: messages that are too large themselves
+    unopened: str = ""  # reason why the content was not read
 
 
 class LargeAttachment(NamedTuple):
-    """An attachment that is too large to be read."""
+    """Attachment that is too large to read."""
 
     index_record: records.AttachmentIndex
-    data: tuple[int, int]  # bytes of the file at which it begins, and before which it ends
-    inner: tuple[int, int]  # the same of what was attached
-    escaped: bool  # whether a text before that is not UTF-8
+    data: tuple[int, int]  # start and end offset of the content in the file
+    inner: tuple[int, int]  # start and end offset of the attached data in the file
+    escaped: bool  # whether a text before the data is not UTF-8
 
 
 class UnknownRecord(NamedTuple):
-    """A record of a later version of MCAP, or of an application, of any size."""
+    """Record of a later version of MCAP, or of an application, of any size."""
 
     head: bytes  # its first bytes
-    data: tuple[int, int]  # bytes of the file at which it begins, and before which it ends
+    data: tuple[int, int]  # start and end offset of the record in the file
 
 
 class WholeAttachment(NamedTuple):
-    """An attachment as the file holds it, and what an index says of it."""
+    """Attachment of a file, with its index entry."""
 
     record: bytes
     index_record: records.AttachmentIndex
 
 
 class WholeRecord(NamedTuple):
-    """A whole record."""
+    """Complete record."""
 
     offset: int
     end: int
     record: "McapRecord | Whole | None"  # None for a message index
-    corrected: str = ""  # what of its head was wrong
-    escaped: tuple[str, ...] = ()  # names of what had texts that are not UTF-8
-    proved: bool = True  # False: without a checksum, what is in it may be wrong instead
+    corrected: str = ""  # description of the error in its head
+    escaped: tuple[str, ...] = ()  # names of records with texts that are not UTF-8
+    proved: bool = True  # False: there is no checksum, so its content may be wrong
 
 
 Whole = WholeChunk | LargeChunk | WholeAttachment | LargeAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
-    """Find where the messages and the definitions of a chunk begin.
+    """Find the offsets of messages and definitions in a chunk.
 
     Returns
     -------
     messages : np.ndarray [shape=(m,)], int64
-        Bytes of the content at which messages begin, with their opcodes, ascending.
+        Offsets of messages in the content, at their opcodes, ascending.
     definitions : np.ndarray [shape=(d,)], int64
-        The same of schemas and channels.
+        Offsets of schemas and channels, likewise.
 
     Raises
     ------
     McapError
-        If a record is damaged, or of a kind that no chunk holds.
+        If a record is damaged, or not allowed in a chunk.
     """
     messages, definitions = array("q"), array("q")
     kind, shortest = int(Opcode.MESSAGE), MESSAGE.size
@@ -155,7 +155,7 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
         if opcode == kind and end - start >= shortest:
             messages.append(start)
         elif opcode > Opcode.DATA_END:
-            continue  # of a later version of MCAP, or of an application
+            continue  # from a later version of MCAP, or an application
         elif opcode not in {Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL}:
             raise McapError("the records of a chunk are damaged")
         elif end - start < HEAD.size + SHORTEST[opcode]:
@@ -166,12 +166,12 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
 
 
 def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChunk:
-    """Leave out of a chunk the messages whose log times are after `LAST_TIME`.
+    """Remove the messages with log times after `LAST_TIME` from a chunk.
 
     Parameters
     ----------
     messages : np.ndarray [shape=(m,)], int64
-        As `split_content` returns it.
+        First result of `split_content`.
     """
     times = gather_heads(content, messages)["log_time"].astype(np.uint64)
     starts = messages[times > LAST_TIME]
@@ -187,12 +187,12 @@ def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChu
 
 
 def with_definitions(chunk: WholeChunk, content: bytes, starts: Int64) -> tuple[WholeChunk, bytes]:
-    """Write the definitions of a chunk into it anew; return its content, too.
+    """Rewrite the definitions of a chunk; return the chunk and its content.
 
     Parameters
     ----------
     starts : np.ndarray [shape=(d,)], int64
-        Bytes of the content at which its definitions begin, with their opcodes.
+        Offsets of the definitions in the content, at their opcodes.
     """
     parts, place = [], 0
     for start, record in zip(starts.tolist(), chunk.definitions, strict=True):
@@ -203,7 +203,7 @@ def with_definitions(chunk: WholeChunk, content: bytes, starts: Int64) -> tuple[
 
 
 def _stored(content: bytes) -> StoredChunk:
-    """Compress the records of a chunk that were written anew."""
+    """Compress rewritten records to a chunk."""
     entries = index_messages(content, split_content(content)[0])
     return compress_chunk(memoryview(content), span_of(entries), entries)._replace(raw=None)
 
@@ -214,7 +214,7 @@ def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], l
     Parameters
     ----------
     starts : np.ndarray [shape=(d,)], int64
-        Bytes of the content at which they begin, with their opcodes.
+        Offsets in the content, at their opcodes.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], l
 
 
 def name_of(record: McapRecord | None) -> str:
-    """Name a record by its topic, its type or its own name."""
+    """Return the topic, type or name of a record."""
     if isinstance(record, records.Channel):
         return record.topic
     if isinstance(record, records.Header):
@@ -245,12 +245,12 @@ def name_of(record: McapRecord | None) -> str:
 
 
 def span_of(entries: Mapping[int, bytes | bytearray]) -> tuple[int, int]:
-    """Find the first and the last log time of a message index.
+    """Return the first and the last log time of a message index.
 
     Parameters
     ----------
     entries : mapping of int to bytes-like
-        By channel: rows of dtype `INDEX_ENTRIES`.
+        Rows of dtype `INDEX_ENTRIES`, by channel.
 
     Returns
     -------
@@ -272,26 +272,26 @@ def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
 
 
 def read_message(raw: bytes) -> records.Message:
-    """Read a message from its record."""
+    """Parse a message record."""
     _, _, channel, sequence, log_time, publish_time = MESSAGE.unpack_from(raw)
     return records.Message(channel, log_time, raw[MESSAGE.size :], publish_time, sequence)
 
 
 class AttachmentHead(NamedTuple):
-    """The fields of an attachment before its data."""
+    """Fields of an attachment before its data."""
 
     index_record: records.AttachmentIndex  # its offset and length are 0
-    first: int  # byte of the record at which the data begin
+    first: int  # offset of the data in the record
     escaped: bool  # whether a text in it is not UTF-8
 
     @property
     def end(self) -> int:
-        """Byte of the record before which the data end."""
+        """End of the data in the record."""
         return self.first + self.index_record.data_size
 
 
 def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
-    """Read an attachment from its record; return whether a text in it is not UTF-8, too.
+    """Parse an attachment record; also return whether a text in it is not UTF-8.
 
     Raise `McapError` if its checksum is wrong.
     """
@@ -306,9 +306,9 @@ def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
 
 
 def attachment_head(raw: bytes) -> AttachmentHead:
-    """Read what stands before the data of an attachment.
+    """Read the fields of an attachment before its data.
 
-    Raise `McapError` if the record ends before that.
+    Raise `McapError` if the record ends within them.
     """
     record = memoryview(raw)
     try:
