@@ -1,1 +1,1 @@
-"""Everything that reads logs and labelled audio: training, summaries, pictures."""
+"""Readers of logs and labelled audio: training, evaluation, reports, review."""

@@ -1,4 +1,4 @@
-"""The colour of a class: the same wherever it is shown, on a screen or on paper."""
+"""Colours of classes, the same on screen and on paper."""
 
 import hashlib
 
@@ -12,13 +12,7 @@ _LIGHT: Colour = (205, 205, 205)
 
 
 def colour(name: str) -> Colour:
-    """Return the colour of a class; one of somebody's own gets a bright one from its name.
-
-    Returns
-    -------
-    tuple of int
-        Red, green and blue, 0 to 255.
-    """
+    """Return the RGB colour of a class, 0 to 255; custom classes get a bright hash of the name."""
     row = find_class(name)
     if row is not None:
         return row.colour
@@ -27,6 +21,6 @@ def colour(name: str) -> Colour:
 
 
 def colour_on_paper(name: str) -> Colour:
-    """Return the colour of a class on a white ground."""
+    """Return the colour of a class on a white background."""
     shade = colour(name)
     return _LIGHT if shade == _WHITE else shade

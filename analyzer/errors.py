@@ -4,12 +4,12 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 class DataError(HearthlogError):
-    """Logs or labelled sounds cannot be used, or what is made of them cannot be written."""
+    """Logs or labelled sounds cannot be used, or a result cannot be written."""
 
 
 class WorkerError(HearthlogError):
-    """A task was not done, through no fault of its own, or there is nothing to run it."""
+    """A worker failed before finishing its task, or no worker is available."""
 
 
 class LostClusterError(WorkerError):
-    """The Dask cluster is gone, with all tasks that were not done."""
+    """The connection to the Dask cluster is lost, with all unfinished tasks."""

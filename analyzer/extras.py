@@ -1,4 +1,4 @@
-"""What to install where a package is missing that the recorder alone does without."""
+"""Checks for the packages of extras, and the commands that install them."""
 
 import json
 import os
@@ -32,17 +32,17 @@ class MissingModuleError(HearthlogError, ModuleNotFoundError):
 
 
 def require(*modules: str) -> None:
-    """Check that modules of an extra can be imported, before any work is done that needs them.
+    """Check that modules of an extra can be imported, before starting work that needs them.
 
     Parameters
     ----------
     *modules : str
-        Their import names.
+        Import names.
 
     Raises
     ------
     MissingModuleError
-        If one is not installed.
+        If a module is not installed.
     """
     absent = [module for module in modules if find_spec(module) is None]
     if absent:
@@ -50,7 +50,7 @@ def require(*modules: str) -> None:
 
 
 def missing(*modules: str) -> str:
-    """Say that modules are not installed, and what to do."""
+    """Format an error message for missing modules, with the command that installs them."""
     tops = [module.partition(".")[0] for module in modules]
     names = list(dict.fromkeys(_NAMES.get(top, top) for top in tops))
     are = "is" if len(names) == 1 else "are"
@@ -58,7 +58,7 @@ def missing(*modules: str) -> str:
 
 
 def remedy(*modules: str) -> str:
-    """Say how to install the extras of modules, in the way in which hearthlog was installed."""
+    """Return the command that installs the extras of modules the way hearthlog was installed."""
     extra = ",".join(
         dict.fromkeys(_EXTRAS.get(module.partition(".")[0], "headless") for module in modules)
     )
@@ -83,7 +83,7 @@ def _installer() -> str:
 
 
 def _origin() -> tuple[str, str]:
-    """Return what pip was given (PEP 610), `.` if that is not known, and its options."""
+    """Return the requirement given to pip (PEP 610), `.` if unknown, and the options of pip."""
     try:
         record = json.loads(distribution("hearthlog").read_text("direct_url.json") or "{}")
         url = urlsplit(record["url"])

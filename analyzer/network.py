@@ -1,4 +1,4 @@
-"""Ports and addresses of this machine, and pings to a watchdog."""
+"""Ports and addresses of this machine, and pings to a remote watchdog."""
 
 import errno
 import secrets
@@ -19,9 +19,9 @@ HOST = "127.0.0.1"
 
 
 def listen(port: int | None = None, bind: str = HOST) -> socket.socket:
-    """Open a socket that waits for connections.
+    """Open a listening socket, on any free port by default.
 
-    Raise `DataError` if nothing can listen there.
+    Raise `DataError` if the address or port cannot be bound.
     """
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     try:
@@ -38,25 +38,25 @@ def listen(port: int | None = None, bind: str = HOST) -> socket.socket:
 
 
 def free_port(port: int | None = None, bind: str = HOST) -> int:
-    """Return a port on which this machine can listen.
+    """Return a port that is free to listen on.
 
-    Raise `DataError` if nothing can listen there.
+    Raise `DataError` if the address or port cannot be bound.
     """
     with listen(port, bind) as probe:
         return int(probe.getsockname()[1])
 
 
 def hidden_address() -> str:
-    """Return an address of this machine that no web page can guess.
+    """Return a random loopback address that no web page can guess.
 
-    Servers of viewers answer whoever reaches them. A page in a browser reaches all of this machine,
-    by a name that it lets point there, but it would have to try 16 million addresses times some ten
-    thousand ports. Programs of this machine can look the address up.
+    Viewer servers answer every client. By DNS rebinding a web page can reach any loopback address,
+    but it would have to try 16 million addresses times some ten thousand ports. Local programs can
+    look the address up.
 
     Returns
     -------
     str
-        In 127.0.0.0/8; 127.0.0.1 on a system that has no other one, such as macOS.
+        In 127.0.0.0/8; 127.0.0.1 on systems that bind no other loopback address, such as macOS.
     """
     address = ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
     with socket.socket() as probe:
@@ -68,10 +68,10 @@ def hidden_address() -> str:
 
 
 def is_asked_in_digits(bind: str, host: str) -> bool:
-    """Tell whether a request came for an address of this machine, and not for a name.
+    """Whether the `Host` of a request is a numeric address of this machine or `localhost`.
 
-    Whoever owns a name can let it point to any address, so that a page of that name may read what
-    is there. Nobody can do so with an address in digits, or with `localhost`.
+    This blocks DNS rebinding: the owner of a host name can point the name at any address, so that
+    a web page under that name could read this server. Numeric addresses and `localhost` are safe.
     """
     listening, named = ip_address(bind), host_name(f"//{host}")
     if named == "localhost":
@@ -84,7 +84,7 @@ def is_asked_in_digits(bind: str, host: str) -> bool:
 
 
 def host_name(url: str) -> str:
-    """Return the host of a URL in lower case, without port and final dot; empty if it has none."""
+    """Return the host of a URL in lower case, without port and final dot; empty if absent."""
     try:
         return (urlsplit(url).hostname or "").removesuffix(".")
     except ValueError:
@@ -92,7 +92,7 @@ def host_name(url: str) -> str:
 
 
 def ip_of(text: str) -> IPv4Address | IPv6Address | None:
-    """Return the address that a text is in digits; None if it is none."""
+    """Parse a numeric IP address; None if the text is not an IP address."""
     try:
         return ip_address(text)
     except ValueError:
@@ -104,7 +104,7 @@ _LONGEST = 1 << 12  # bytes of a file
 
 
 def is_ping_address(url: str) -> bool:
-    """Tell whether an address can be asked."""
+    """Whether a URL is a valid HTTP or HTTPS address to ping."""
     try:
         parts = urlsplit(url)
         is_whole = parts.scheme in {"http", "https"} and bool(parts.hostname)
@@ -115,14 +115,14 @@ def is_ping_address(url: str) -> bool:
 
 
 def has_password(url: str) -> bool:
-    """Return whether an address, as `is_ping_address` takes it, has a user or a password in it."""
+    """Whether a URL accepted by `is_ping_address` contains a user or password."""
     return "@" in urlsplit(url).netloc
 
 
 def read_ping_address(file: Path) -> str:
-    """Read a file of one line with an address: who knows it could ping in the place of the box.
+    """Read a one-line file with a ping URL, a secret: anyone with the URL could fake the pings.
 
-    Raise `HearthlogError` if it cannot be read, or has no such address.
+    Raise `HearthlogError` if the file cannot be read or has no valid URL.
     """
     data = read_whole(file, "file of a ping address", _LONGEST, HearthlogError)
     url = data.decode("utf-8-sig", "replace").strip()
@@ -135,12 +135,12 @@ def read_ping_address(file: Path) -> str:
 
 
 def ping(url: str, *, is_well: bool) -> str:
-    """Ask for an address, or for `/fail` below it if something is wrong; nothing is sent.
+    """Send a GET request to a URL, or to its `/fail` path on a problem, without any data.
 
     Returns
     -------
     str
-        Why nobody there has taken it; empty if somebody has.
+        Reason of the failure; empty on success.
     """
     problems = [f"no answer within {_SECONDS:.0f} s"]
 
@@ -154,7 +154,7 @@ def ping(url: str, *, is_well: bool) -> str:
             problems[:] = [f"status {error.code}"]
         except (OSError, ValueError, HTTPException) as error:
             reason = getattr(error, "reason", None) or error
-            # What others say may have the address in it, which is a secret.
+            # Other error messages may contain the URL, which is a secret.
             is_late = isinstance(reason, TimeoutError)
             what = "timed out" if is_late else getattr(reason, "strerror", None)
             problems[:] = [what or type(reason).__name__]

@@ -1,4 +1,4 @@
-"""Status of the recorders of a folder: process, microphones, disk, and remedies."""
+"""Status of the recorders of a folder: process, microphones, disk, and suggested fixes."""
 
 import json
 import os
@@ -20,14 +20,14 @@ from hearthlog.schemas.logs.files import check_allowed, find_logs, is_active, lo
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 
 Level = Literal["ok", "warning", "error"]
-_LEVELS: tuple[Level, ...] = ("ok", "warning", "error")  # by the levels of diagnostics
-_SPEAKS_SECONDS = 30.0  # it says something every ten
-_OTHERS = 0o077  # the rights of everybody but the owner
+_LEVELS: tuple[Level, ...] = ("ok", "warning", "error")  # index: level of diagnostics
+_SPEAKS_SECONDS = 30.0  # the recorder writes diagnostics every ten seconds
+_OTHERS = 0o077  # permission bits of group and others
 _NOT_SET = "clock_synchronized", "no"
 
 
 class _Status(NamedTuple):
-    """The last word of a recorder on one thing."""
+    """The latest diagnostics of a recorder on one subject."""
 
     subject: str
     time: int  # in nanoseconds of UTC
@@ -37,7 +37,7 @@ class _Status(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is to be said of one thing."""
+    """Status line of one subject."""
 
     level: Level
     subject: str
@@ -45,9 +45,9 @@ class State(NamedTuple):
 
 
 def examine_live(folder: Path) -> list[State]:
-    """Look at a folder of logs, at the disk, and at what its recorders say of themselves.
+    """Check a folder of logs, its disk, and the diagnostics of its recorders.
 
-    Raise `LogError` if there is no such folder.
+    Raise `LogError` if the folder does not exist.
     """
     check_allowed(folder)
     if not folder.is_dir():
@@ -70,7 +70,7 @@ def _recorder(
 ) -> Iterator[State]:
     node, own = lock.node, logs[lock.node]
     if not (lock.is_held or lock.process or own):
-        return  # no recorder has used it
+        return  # no recorder has used this name
     statuses = _last_statuses(own, node)
     newest = max((status.time for status in statuses), default=None)
     silent = None if newest is None else time.time() - newest / NANOSECONDS
@@ -90,7 +90,7 @@ def _recorder(
 
 
 def _networks(logs: Sequence[Path]) -> Iterator[State]:
-    """Say which networks the models of the newest log want, and whether they hear."""
+    """Yield which networks the models of the newest log need, and whether they are installed."""
     for log in logs[-1:]:
         with suppress(LogError, ValueError):
             for info in read_recorder_infos(log, "features"):
@@ -118,8 +118,8 @@ def _stopped(
 ) -> State:
     """Describe a recorder that does not run.
 
-    One that completed its last log, and after which another one of the folder has recorded, was
-    stopped or renamed: that is no alarm. One that was killed leaves its log unfinished.
+    A recorder that completed its last log, and after which another recorder wrote to the folder,
+    was stopped or renamed: a warning only. A killed recorder leaves an unfinished log.
     """
     since = "" if newest is None else f" since {_moment(newest)}"
     others = [other for other in locks if other.node != lock.node]
@@ -150,8 +150,8 @@ def _of_status(status: _Status) -> Iterator[State]:
 
 
 def _last_statuses(logs: Sequence[Path], node: str) -> list[_Status]:
-    """Return the last word on each thing in the newest log of a recorder that says anything."""
-    for log in reversed(logs[-3:]):  # the newest may have been begun this moment
+    """Return the latest status of each subject, from the newest log with diagnostics."""
+    for log in reversed(logs[-3:]):  # the newest may have no diagnostics yet
         with suppress(LogError):
             columns = read_columns([log], [DIAGNOSTICS], fields=["status"]).values()
             statuses = [status for each in columns for status in _statuses(each, node)]
@@ -191,7 +191,7 @@ def _moment(stamp: int) -> str:
 
 
 def _write_problem(folder: Path) -> str:
-    """Try the disk with a block; return what it says, empty if it takes it."""
+    """Write a test block to the disk; return the error, or an empty text."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))

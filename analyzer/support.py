@@ -1,4 +1,4 @@
-"""What somebody who helps needs to know of a box, and nothing of what was heard there."""
+"""Support bundle: health and configuration of recorders, without anything they heard."""
 
 import json
 import os
@@ -22,8 +22,8 @@ from hearthlog.schemas.messages.message_types import GAP
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 
 _LOGS = 48  # the newest ones
-_OF_SOUND = ("clips", "model")  # whose words may name what was heard
-# The values of diagnostics, but for those that follow the sound.
+_OF_SOUND = ("clips", "model")  # subjects whose texts may name sounds
+# Values of diagnostics that do not depend on the sound.
 _VALUES = {
     *("device", "frames_lost", "overruns", "clock_ppm", "block_age_seconds"),
     *("clock_synchronized", "temperature_celsius", "throttled", "memory_bytes"),
@@ -33,18 +33,19 @@ _RELEASE = Path("/etc/os-release")
 
 
 def support_bundle(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Collect what there is to know of the recorders of a folder.
+    """Collect the support bundle of a folder's recorders.
 
     Yields
     ------
+    name : str
     content : bytes
-        JSON. Times at which was recorded are in it, the configuration, gaps, the health of
-        microphones and machine, and what the doctor found; labels, features and levels are not.
+        JSON: recording times, configuration, gaps, health of microphones and machine, and findings
+        of the doctor, but no labels, features or levels.
 
     Raises
     ------
     LogError
-        If there is no such folder.
+        If the folder does not exist.
     """
     yield "machine.json", _json(_machine())
     states = [state for state in examine_live(folder) if _may_be_told(state.subject)]
@@ -78,7 +79,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _configuration(log: Path) -> bytes:
-    """Return the configuration that a log was recorded with, in which there are no passwords."""
+    """Return the configuration that a log was recorded with; it contains no passwords."""
     with suppress(LogError), LogFile(log) as file:
         found = [each.data for each in attachments_of(file) if each.name == CONFIGURATION]
         return bytes(found[0]) if found else b""
@@ -122,7 +123,7 @@ def _gaps(columns: Columns) -> Iterator[dict[str, Any]]:
 
 
 def _health(columns: Columns, node: str) -> Iterator[dict[str, Any]]:
-    """Yield what was said of each thing, when it changed."""
+    """Yield the health of each subject whenever it changes."""
     before: dict[str, tuple[int, str]] = {}
     for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
         for status in statuses:

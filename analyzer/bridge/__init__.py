@@ -1,1 +1,1 @@
-"""The bridge: sounds of a home by MQTT, alerts, Prometheus and a page, from its log."""
+"""Bridge from the log of a recorder to MQTT, alerts, Prometheus and a web page."""

@@ -44,17 +44,17 @@ if TYPE_CHECKING:
 
 
 _ERROR = 2  # level of diagnostics
-_SOON = 10.0  # seconds after the start
-_JUDGED_SECONDS = 60.0  # after which what was known of the recorder counts no more
+_SOON = 10.0  # seconds from the start to the first ping
+_JUDGED_SECONDS = 60.0  # after which the last state of the recorder is too old for a ping
 
 
 class PingOutput:
-    """Asks for an address again and again, and for `/fail` below it while something is wrong.
+    """Pings a URL at intervals, or its `/fail` path while there is a problem.
 
-    All is well while the recorder writes and says of nothing that it fails. A bridge that hangs
-    pings no more.
+    There is no problem while the recorder writes and its diagnostics have no error. A bridge that
+    hangs stops pinging.
 
-    Raise `HearthlogError` if the file of the address cannot be used.
+    Raise `HearthlogError` if the file with the URL cannot be used.
     """
 
     def __init__(self, settings: PingSettings, say: Callable[[str], None]) -> None:
@@ -64,18 +64,18 @@ class PingOutput:
             self._url = read_ping_address(secret_path(settings.url_file))
         self._say = say
         self._is_well = False
-        self._judged = 0.0  # when, by CLOCK_MONOTONIC
+        self._judged = 0.0  # time of `_is_well`, by CLOCK_MONOTONIC
         self._stop = Flag()
         Thread(target=self._ping, daemon=True).start()
 
     def update(self, news: News) -> None:
-        """Note whether all is well."""
+        """Record whether the recorder works."""
         fails = any(health.level >= _ERROR for health in news.state.health.values())
         self._is_well = news.state.is_recording() and not fails
         self._judged = time.monotonic()
 
     def close(self) -> None:
-        """Ping no more."""
+        """Stop pinging."""
         self._stop.set()
 
     def _ping(self) -> None:
@@ -89,19 +89,19 @@ class PingOutput:
 
 
 _WATCHDOG_SECONDS = 10.0
-_MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of
-_AHEAD = 3600 * NANOSECONDS  # of now: so much later no event can begin
+_MOST_EARLY = 1000  # events before reading has caught up; only recent ones are reported
+_AHEAD = 3600 * NANOSECONDS  # from now: no event can begin later
 _FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
 
 
 @dataclass
 class Bridge:
-    """Follows one recorder.
+    """Follows one recorder and updates the outputs.
 
     Attributes
     ----------
     since : int
-        From when on events are to be known, in nanoseconds of UTC.
+        Log time from which events are read, in nanoseconds of UTC.
     """
 
     home: RecorderAddress
@@ -111,7 +111,7 @@ class Bridge:
     _watchdog_due: float = 0.0
 
     def run(self, stop: Flag) -> None:
-        """Tell what is heard until `stop` is set."""
+        """Update the outputs until `stop` is set."""
         keep_one_heap()
         notify(["READY=1"])
         early: deque[SoundEvent] = deque(maxlen=_MOST_EARLY)
@@ -130,7 +130,7 @@ class Bridge:
                 self._try(name, output.close)
 
     def _live(self) -> None:
-        """Tell systemd that the log is followed."""
+        """Notify the watchdog of systemd that the bridge is alive."""
         if time.monotonic() >= self._watchdog_due:
             self._watchdog_due = time.monotonic() + _WATCHDOG_SECONDS
             notify(["WATCHDOG=1"])
@@ -140,7 +140,7 @@ class Bridge:
         moment = today(now, self.home.zone)
         ended = [event for each in state.every() for event in each.ended_events()]
         if is_first:
-            give_back()  # what it took to read the log
+            give_back()  # memory used while reading the log
             ended = [event for event in ended if now - event.end <= RECENT]
         recent = [event for event in begun if now - event.end <= RECENT]
         news = News(state, recent, ended, moment, self.home.zone)
@@ -152,7 +152,7 @@ class Bridge:
     def _try(self, name: str, step: Callable[[], None]) -> None:
         try:
             step()
-        except Exception as error:  # noqa: BLE001  one that fails must not stop the others
+        except Exception as error:  # noqa: BLE001  a failing output must not stop the others
             self.say(f"{name}: {type(error).__name__}: {error}")
 
     def _damaged(self, error: Exception) -> None:
@@ -160,11 +160,11 @@ class Bridge:
 
 
 _REPEAT_SECONDS = 3600.0
-_MOST_TEXTS = 100  # texts that are remembered
+_MOST_TEXTS = 100  # remembered texts
 
 
 class ProblemReporter:
-    """Passes lines on, from any thread; the same one again an hour later at the earliest."""
+    """Passes on status lines from any thread; repeats a line after an hour at the earliest."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
@@ -172,7 +172,7 @@ class ProblemReporter:
         self._lock = Lock()
 
     def __call__(self, text: object) -> None:
-        """Say something, unless it was said of late."""
+        """Report a line, unless it was reported within the last hour."""
         line, now = str(text), time.monotonic()
         with self._lock:
             if now - self._said.get(line, -_REPEAT_SECONDS) < _REPEAT_SECONDS:
@@ -181,24 +181,24 @@ class ProblemReporter:
             self._said.move_to_end(line)
             if len(self._said) > _MOST_TEXTS:
                 self._said.popitem(last=False)
-        with suppress(OSError, ValueError):  # a full disk, or nobody who reads it
+        with suppress(OSError, ValueError):  # a full disk, or a closed stream
             self._say(line)
 
 
-_OLDEST = 7 * 24 * 3600 * NANOSECONDS  # how far back the log is read at most, at a start
-_EARLIER = 6 * 3600 * NANOSECONDS  # so much longer no event takes, so that those are known whole
+_OLDEST = 7 * 24 * 3600 * NANOSECONDS  # longest history read at a start
+_EARLIER = 6 * 3600 * NANOSECONDS  # longest event: read from this much earlier for complete events
 _AGAIN_SECONDS = 60.0
 
 _Output = TypeVar("_Output", bound=Output)
 
 
 class ReopenedOutput(Generic[_Output]):
-    """An output that is tried again every minute while it cannot be opened.
+    """An output that is retried every minute while it cannot be opened.
 
     Attributes
     ----------
     output : Output or None
-        None while it cannot be opened.
+        None while the output cannot be opened.
     """
 
     def __init__(self, make: Callable[[], _Output], say: Callable[[str], None]) -> None:
@@ -209,14 +209,14 @@ class ReopenedOutput(Generic[_Output]):
         self._open()
 
     def update(self, news: News) -> None:
-        """Tell what is new, if it is open."""
+        """Update the output if it is open; retry opening it once a minute."""
         if self.output is None and time.monotonic() >= self._due:
             self._open()
         if self.output is not None:
             self.output.update(news)
 
     def close(self) -> None:
-        """End, if it is open."""
+        """Close the output if it is open."""
         if self.output is not None:
             self.output.close()
 
@@ -228,24 +228,25 @@ class ReopenedOutput(Generic[_Output]):
             self._say(f"{error.name} is not installed; {remedy(error.name or '')}; trying again")
         except (HearthlogError, OSError) as error:
             self._say(f"{error}; trying again")
-        except Exception as error:  # noqa: BLE001  one that fails must not stop the others
+        except Exception as error:  # noqa: BLE001  a failing output must not stop the others
             self._say(f"{type(error).__name__}: {error}; trying again")
 
 
 def open_outputs(
     settings: BridgeSettings, home: RecorderAddress, state_folder: Path, say: ProblemReporter
 ) -> tuple[dict[str, Output], int]:
-    """Open the outputs that are configured.
+    """Open the configured outputs.
 
     Returns
     -------
+    outputs : dict of str to Output
     since : int
-        From when on they have to know the events, in nanoseconds of UTC.
+        Log time from which the outputs need events, in nanoseconds of UTC.
     """
     moment = today(time.time_ns(), home.zone)
     since = min(moment.midnight, moment.night) - _EARLIER
     outputs: dict[str, Output] = {}
-    # Imported here: who wants no broker needs no client of one.
+    # Imported here: without a broker no MQTT client need be installed.
     if (mqtt := settings.mqtt) is not None:
 
         def publish() -> "MqttPublisher":
@@ -287,7 +288,7 @@ def open_outputs(
 
 
 def needed_modules(settings: BridgeSettings) -> dict[str, bool]:
-    """Name the modules that outputs need, and tell which of them are installed."""
+    """Return the modules that the configured outputs need, and whether each is installed."""
     needed = {
         "paho": settings.mqtt,
         "prometheus_client": settings.prometheus,
@@ -297,17 +298,19 @@ def needed_modules(settings: BridgeSettings) -> dict[str, bool]:
 
 
 def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
-    """Look for what the outputs would refuse at their start, and open nothing.
+    """Find errors that the outputs would raise at their start, without opening anything.
 
     Returns
     -------
+    problems : list of str
+        Errors.
     warnings : list of str
-        Files that may be credentials of the service, which are not here, and figures that nobody
-        would read.
+        Missing files that may be credentials of the service, and a text file of figures that
+        node_exporter would not read.
     """
     problems: list[str] = []
     warnings: list[str] = []
-    there = needed_modules(settings) | {"apprise": True}  # whose absence is said below
+    there = needed_modules(settings) | {"apprise": True}  # its absence is reported below
     if lacking := [name for name, is_there in there.items() if not is_there]:
         problems.append(missing(*lacking))
     if (figures := settings.prometheus) is not None and (line := figures.unread_text_file()):
@@ -328,11 +331,11 @@ def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
     return problems, warnings
 
 
-_Step = tuple[Path | None, Callable[[], object]]  # the file of a secret, and what checks it
+_Step = tuple[Path | None, Callable[[], object]]  # the file of a secret, and its check
 
 
 def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_Step]:
-    """Yield how each file of secrets is read at the start."""
+    """Yield the checks of the files of secrets."""
     if (mqtt := settings.mqtt) is not None:
         yield mqtt.password_file, partial(_check_password, mqtt)
     if (page := settings.page) is not None and page.token_file is not None:
@@ -348,7 +351,7 @@ def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_St
 
 
 def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
-    """Yield how certificates, addresses and folders are checked."""
+    """Yield the checks of certificates, addresses and folders."""
     if (mqtt := settings.mqtt) is not None:
         yield None, mqtt.check_files
         if mqtt.tls:
@@ -383,7 +386,7 @@ def _check_text_file(file: Path) -> None:
         if stat.S_ISDIR(file.stat().st_mode):
             problem = "is a folder; name a file in it, as hearthlog.prom"
     except (FileNotFoundError, NotADirectoryError):
-        pass  # what is there is looked at below
+        pass  # `check_writable` checks the folder below
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
     if problem:
@@ -400,12 +403,14 @@ def _check_ports(page: PageSettings) -> None:
 
 
 def exposed_files(settings: BridgeSettings, file: Path | None, state: Path | None) -> list[str]:
-    """Return the lines that say which files of secrets everybody may read or change.
+    """Return a line for each file of secrets that other users may read or change.
 
     Parameters
     ----------
+    file : Path or None
+        The configuration file, a secret if it has a ping URL with a password.
     state : Path or None
-        The folder of what the bridge has to remember; None if it is not known.
+        The state folder of the bridge; None if unknown.
     """
     mqtt, page, figures, ping = settings.mqtt, settings.page, settings.prometheus, settings.ping
     files = [settings.delivery.urls_file]

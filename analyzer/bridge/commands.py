@@ -1,4 +1,4 @@
-"""Commands to the bridge: corrections of events as marks, pauses and muted classes."""
+"""Commands to the bridge: corrections of events, pauses, and muting of classes."""
 
 import errno
 import queue
@@ -25,14 +25,14 @@ from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, log_name, review_path, time_span
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, spelt
 
-_LATER = 60 * NANOSECONDS  # than its end a segment is written at most
+_LATER = 60 * NANOSECONDS  # longest delay from the end of a segment to its message
 _FIELDS = "header.stamp", "duration", "label"
 
 
 def correct_event(
     folder: Path, node: str, event: SoundEvent, label: str, reviewer: str
 ) -> list[Path]:
-    """Mark the segments of an event with another class, in the name of who says so.
+    """Mark the segments of an event with another class; return the review layers written.
 
     Raise `BridgeError` if no log has the event any more, or a layer cannot be written.
     """
@@ -58,7 +58,7 @@ def correct_event(
 
 
 def _logs_of(folder: Path, node: str, event: SoundEvent) -> dict[Path, tuple[int, int]]:
-    """Return the logs of the time of an event, and which part of that time each has."""
+    """Return the logs that cover an event, and the part of its time span in each."""
     begins = {}
     for log in reversed(find_logs(folder)):
         name = log_name(log)
@@ -74,7 +74,7 @@ def _logs_of(folder: Path, node: str, event: SoundEvent) -> dict[Path, tuple[int
 
 
 def _segments(logs: list[Path], event: SoundEvent) -> list[tuple[int, int]]:
-    """Return when the segments of an event begin and end."""
+    """Return the time spans of the segments of an event."""
     if not logs:
         return []
     segments = labelling_topic(event.microphone, LIVE, "segment")
@@ -94,13 +94,13 @@ READ_ONLY = (
     "It was not saved: the bridge may only read the logs, not write beside them. Whoever set up "
     "the box can change that."
 )
-_MOST_LOGS = 64  # whose marks are read: of more than a day and a half
+_MOST_LOGS = 64  # newest logs from which marks are read: more than a day and a half
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _BY_WORDS = {spelt(row.words): row.name for row in CLASSES}
 
 
 class EventCorrections:
-    """Corrections of the events of a recorder by people."""
+    """Corrections of a recorder's events by people."""
 
     def __init__(self, folder: Path, node: str) -> None:
         self._folder = folder
@@ -110,16 +110,16 @@ class EventCorrections:
         self._lock = Lock()
 
     def read_back(self) -> None:
-        """Read what the layers of the newest logs say.
+        """Read the marks in the review layers of the newest logs.
 
-        Raise `HearthlogError` if one of them is damaged.
+        Raise `HearthlogError` if a layer is damaged.
         """
         logs = [log for log in find_logs(self._folder) if self._is_of_node(log)]
         marked = [log for log in logs[-_MOST_LOGS:] if review_path(log).exists()]
         self._marks = [mark for log in marked for mark in read_marks(log)]
 
     def of(self, event: SoundEvent) -> str:
-        """Return what people said that an event was, in a few words; empty for nothing."""
+        """Return the correction of an event in a few words; empty if there is none."""
         label = self._own.get(event.id)
         if label is not None:
             return f"You said: {_in_words(label)}"
@@ -131,9 +131,9 @@ class EventCorrections:
         return f"{who}: {_in_words(mark.label)}"
 
     def add(self, event: SoundEvent, text: str) -> str:
-        """Mark what an event was, and return that in words.
+        """Correct the class of an event; return the correction in words.
 
-        Raise `BridgeError` if the text cannot be a class, or the event cannot be marked.
+        Raise `BridgeError` if the text is no valid class name, or the event cannot be marked.
         """
         label = class_of(text)
         with self._lock:
@@ -152,9 +152,9 @@ class EventCorrections:
 
 
 def class_of(text: str) -> str:
-    """Return the name of the class that somebody means: `Water tap` is `tap_water`.
+    """Convert text to a class name: `Water tap` to `tap_water`.
 
-    Raise `BridgeError` if no class can have this name.
+    Raise `BridgeError` if the text is no valid class name.
     """
     spelling = spelt(text.strip()).strip("_")
     label = class_name(_BY_WORDS.get(spelling, spelling))
@@ -181,7 +181,7 @@ def _over(event: SoundEvent, marks: list[Mark]) -> Iterator[Mark]:
 
 
 def _explained(error: BridgeError) -> HearthlogError:
-    """Say for people at home why something was not saved."""
+    """Convert an error to one with a message for people at home."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in _FORBIDDEN:
@@ -191,14 +191,14 @@ def _explained(error: BridgeError) -> HearthlogError:
 
 
 _WAITING = 20  # commands; more are refused
-_LONGEST = 4096  # bytes of one
+_LONGEST = 4096  # bytes of a command
 _MOST_MINUTES = 7 * 24 * 60
 
 FindEvent = Callable[[str], SoundEvent | None]
 
 
 class Answer(NamedTuple):
-    """What became of a command."""
+    """Result of a command."""
 
     done: bool
     text: str
@@ -217,7 +217,7 @@ class _Command(BaseModel):
     resume: bool = False
 
     def problem(self) -> str:
-        """Return what is wrong with the command; empty if nothing is."""
+        """Return the error in the command; empty if there is none."""
         of_class = self.correct is not None, self.told is not None
         if sum([*of_class, self.pause_minutes is not None, self.resume]) != 1:
             return "one of correct, told, pause_minutes and resume has to be there"
@@ -227,7 +227,7 @@ class _Command(BaseModel):
 
 
 class Commands:
-    """Carries commands out, one after the other, in a thread of its own."""
+    """Runs commands one after the other in a separate thread."""
 
     def __init__(
         self,
@@ -245,14 +245,14 @@ class Commands:
         self._thread.start()
 
     def add(self, payload: bytes, find_event: FindEvent) -> None:
-        """Have a command carried out."""
+        """Queue a command, or refuse it if the queue is full."""
         try:
             self._waiting.put_nowait((payload[: _LONGEST + 1], find_event))
         except queue.Full:
             self._answered(Answer(False, f"refused: {_WAITING} commands are waiting already"))
 
     def close(self) -> None:
-        """End when the command that is carried out is done."""
+        """Drop queued commands, and stop after the running one."""
         with suppress(queue.Empty):
             while True:
                 self._waiting.get_nowait()
@@ -262,7 +262,7 @@ class Commands:
         while (item := self._waiting.get()) is not None:
             try:
                 self._answered(Answer(True, self._carry_out(*item)))
-            except Exception as error:  # noqa: BLE001  the next one is to be carried out
+            except Exception as error:  # noqa: BLE001  a failing command must not stop the next
                 self._answered(Answer(False, f"refused: {error}"))
 
     def _carry_out(self, payload: bytes, find_event: FindEvent) -> str:

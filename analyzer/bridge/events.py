@@ -1,4 +1,4 @@
-"""Sound events of a microphone, and the classes that are active now."""
+"""Sound events of a microphone, and its currently active classes."""
 
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
@@ -11,10 +11,10 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
-PAUSE_SECONDS = 10  # between the segments of one event, at most: as in the report
+PAUSE_SECONDS = 10  # longest pause between the segments of one event, as in the report
 
 
-_MOST_AGAIN = 50  # segments that a recorder writes again after its disk was full
+_MOST_AGAIN = 50  # segments that a recorder may write twice after its disk was full
 
 
 class SoundEvent(NamedTuple):
@@ -23,7 +23,11 @@ class SoundEvent(NamedTuple):
     Attributes
     ----------
     start, end : int
-        In nanoseconds of UTC; the end as far as it is known.
+        In nanoseconds of UTC; the end may still grow.
+    confidence : float
+        Highest of the segments.
+    seconds : float
+        Total length of the segments.
     """
 
     microphone: str
@@ -35,17 +39,17 @@ class SoundEvent(NamedTuple):
 
     @property
     def id(self) -> str:
-        """What names the event wherever it is told of."""
+        """Identifier of the event in every output."""
         return f"{self.microphone}-{self.label}-{self.start}"
 
 
 class EventRecord:
-    """The events of one class of a microphone, since a time.
+    """Recent events of one class of a microphone.
 
     Attributes
     ----------
     current : SoundEvent or None
-        With which a segment may go on: the one that the last segment is of.
+        Event of the last segment, which the next segment may extend.
     """
 
     def __init__(self, microphone: str, label: str) -> None:
@@ -56,21 +60,21 @@ class EventRecord:
         self._segments: deque[tuple[int, int]] = deque(maxlen=_MOST_AGAIN)  # the last ones
 
     def push(self, start: int, end: int, confidence: float) -> bool:
-        """Add a segment; tell whether an event begins with it.
+        """Add a segment, in log order; return whether it begins a new event.
 
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC, in the order in which a log has segments.
+            In nanoseconds of UTC.
         """
-        if (start, end) in self._segments:  # written again, as the disk had refused it
+        if (start, end) in self._segments:  # written again after a failed write
             return False
         self._segments.append((start, end))
         seconds = (end - start) / NANOSECONDS
         current = self.current
         if current is None or not _goes_on(current, start):
             new = SoundEvent(self._microphone, self._label, start, end, confidence, seconds)
-            insort(self.events, new, key=_start)  # not the last one if the clock was set back
+            insort(self.events, new, key=_start)  # not the last if the clock was set back
             self.current = new
             return True
         self.current = current._replace(
@@ -87,7 +91,7 @@ class EventRecord:
         return self.events[bisect_left(self.events, time, key=_start) :]
 
     def forget(self, before: int, after: int) -> None:
-        """Forget the events that began before a time, except the last, and those after another."""
+        """Drop events that began before `before`, except the last one, or later than `after`."""
         first = bisect_left(self.events, before, key=_start)
         end = bisect_right(self.events, after, key=_start)
         kept = self.events[min(first, max(end - 1, 0)) : end]
@@ -105,29 +109,29 @@ def _goes_on(event: SoundEvent, start: int) -> bool:
     return event.start <= start <= event.end + PAUSE_SECONDS * NANOSECONDS
 
 
-ANY_SOUND = ""  # in place of a class: whatever is not silence
-HOLD_SECONDS = 10  # after the last frame of a class, it is over; as events are
+ANY_SOUND = ""  # in place of a class: everything except silence
+HOLD_SECONDS = 10  # from the last frame of a class to its end, like the pause of events
 _SECOND = 20  # frames
-_LEAST = 8  # of them: fewer flicker, more come late
+_LEAST = 8  # frames of a second: fewer flicker, more react late
 
 
 class ActiveClasses:
-    """The classes that are heard now: at least eight labels of a second name them.
+    """Currently active classes: those with at least eight labels in a second.
 
-    The result does not depend on how the labels are divided among calls, and of labels older
-    than a second and the hold nothing is left.
+    The result does not depend on how labels are split over calls. Labels older than a second plus
+    the hold time have no effect.
 
     Attributes
     ----------
     time : int
-        Of the newest label, in nanoseconds of UTC; 0 before the first.
+        Time of the newest label, in nanoseconds of UTC; 0 before the first.
     """
 
     def __init__(self, classes: Sequence[str]) -> None:
         self.time = 0
         self._classes = list(classes)
         self._last_heard = dict.fromkeys([*classes, ANY_SOUND], 0)
-        self._last_labels = np.empty(0, np.int64)  # of less than a second
+        self._last_labels = np.empty(0, np.int64)  # less than a second of them
 
     def push(self, labels: Sequence[str], times: Int64) -> None:
         """Add labels.
@@ -135,11 +139,11 @@ class ActiveClasses:
         Parameters
         ----------
         times : np.ndarray [shape=(n,)], int64
-            When they were known, in nanoseconds of UTC.
+            When the labels became available, in nanoseconds of UTC.
         """
         if not len(times):
             return
-        if times[0] < self.time:  # the clock was set back: what was heard then was not just now
+        if times[0] < self.time:  # the clock was set back: earlier labels are not recent
             self._last_heard = dict.fromkeys(self._last_heard, 0)
             self._last_labels = self._last_labels[:0]
         places = {name: place for place, name in enumerate(self._classes)}
@@ -156,6 +160,6 @@ class ActiveClasses:
         self.time = int(times[-1])
 
     def is_heard(self, name: str) -> bool:
-        """Tell whether a class was heard in the last ten seconds before the newest label."""
+        """Whether a class was active in the last ten seconds before the newest label."""
         last = self._last_heard.get(name, 0)
         return last > 0 and self.time - last <= HOLD_SECONDS * NANOSECONDS

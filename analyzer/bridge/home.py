@@ -1,4 +1,4 @@
-"""The home that a bridge follows: recorder, labelling sources, days, and names in words."""
+"""Addresses, labelling sources, days and texts for the home that a bridge follows."""
 
 from datetime import timedelta, tzinfo
 from pathlib import Path
@@ -20,15 +20,14 @@ class RecorderAddress(NamedTuple):
 
 
 class Today(NamedTuple):
-    """When the day began that a home is in, and its last night; in nanoseconds of UTC.
+    """The current local day and the last night, in nanoseconds of UTC.
 
     Attributes
     ----------
     midnight : int
-        When the day began.
+        Start of the day.
     night, morning : int
-        When the last night began, at 22:00 of this day or of the one before, and when it ends, at
-        7:00.
+        Start of the last night, at 22:00 of this day or the day before, and its end at 7:00.
     """
 
     now: int
@@ -38,7 +37,7 @@ class Today(NamedTuple):
 
 
 def today(now: int, zone: tzinfo) -> Today:
-    """Return the day and the night at a time."""
+    """Return the local day and the last night at a time, in nanoseconds of UTC."""
     day = local_time(now, zone).date()
     last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
     night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
@@ -46,13 +45,7 @@ def today(now: int, zone: tzinfo) -> Today:
 
 
 def iso_time(nanoseconds: int, zone: tzinfo) -> str:
-    """Write a time as ISO 8601, with the offset of the home and milliseconds.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        Of UTC.
-    """
+    """Format nanoseconds of UTC as ISO 8601 in local time, with offset and milliseconds."""
     moment = local_time(nanoseconds, zone)
     milliseconds = nanoseconds % NANOSECONDS // 1_000_000
     return moment.replace(microsecond=1000 * milliseconds).isoformat(timespec="milliseconds")
@@ -62,7 +55,7 @@ _BETWEEN = "-"
 
 
 def labelling_source(topic: TopicName) -> str | None:
-    """Return the labelling source of a topic; None for what no recorder labels live."""
+    """Return the labelling source of a topic; None if the topic is not labelled live."""
     if topic.labelling == LIVE:
         return topic.microphone
     if is_scenario(topic.labelling):
@@ -76,38 +69,38 @@ def source_name(microphone: str, scenario: str) -> str:
 
 
 def source_microphone(source: str) -> str:
-    """Return the name of the microphone."""
+    """Return the microphone of a labelling source."""
     return source.partition(_BETWEEN)[0]
 
 
 def source_scenario(source: str) -> str:
-    """Return the name of the scenario; empty for the model of the home."""
+    """Return the scenario of a labelling source; empty for the model of the home."""
     return source.partition(_BETWEEN)[2]
 
 
 def is_of_scenario(source: str) -> bool:
-    """Whether a source is the model of a scenario."""
+    """Whether a labelling source is the model of a scenario."""
     return _BETWEEN in source
 
 
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60
 _SURE, _FAIRLY_SURE = 0.9, 0.7
-_HEARD = {"listening", "reading"}  # what a recorder says of a microphone that it hears
+_HEARD = {"listening", "reading"}  # diagnostic texts of a working microphone
 
 
 def clock(time: int, zone: tzinfo) -> str:
-    """Write what the clock on the wall shows: `14:05`."""
+    """Format the local time of day: `14:05`."""
     return f"{local_time(time, zone):%H:%M}"
 
 
 def when(time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
-    """Say when something was: `14:05`, `yesterday 23:10`, `3 May 14:05`.
+    """Format a time relative to now: `14:05`, `yesterday 23:10`, `3 May 14:05`.
 
     Parameters
     ----------
     seconds : bool
-        Whether the seconds are said, too.
+        Whether to include seconds.
     """
     moment, today = local_time(time, zone), local_time(now, zone).date()
     shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
@@ -119,13 +112,13 @@ def when(time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
 
 
 def long_date(time: int, zone: tzinfo) -> str:
-    """Write a date: `Tuesday, 3 May`."""
+    """Format a date: `Tuesday, 3 May`."""
     moment = local_time(time, zone)
     return f"{moment:%A}, {moment.day} {moment:%B}"
 
 
 def length(seconds: float) -> str:
-    """Say how long something was: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
+    """Format a length of time: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
     if seconds < 1:
         return "less than a second"
     if seconds < 90:
@@ -138,7 +131,7 @@ def length(seconds: float) -> str:
 
 
 def sureness(confidence: float) -> str:
-    """Say how sure the model was: `sure (95 %)`."""
+    """Format the confidence of a model: `sure (95 %)`."""
     words = "not sure"
     if confidence >= _FAIRLY_SURE:
         words = "sure" if confidence >= _SURE else "fairly sure"
@@ -146,32 +139,32 @@ def sureness(confidence: float) -> str:
 
 
 def times(count: int) -> str:
-    """Say how often something was: `never`, `once`, `4 times`."""
+    """Format a count: `never`, `once`, `4 times`."""
     return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
 def class_words(label: str) -> str:
-    """Name a class of any log as people would, on one line and not too long."""
+    """Return the human-readable name of a class, on one line of limited length."""
     return shortened(in_words(label), _LONGEST_NAME)
 
 
 def room(microphone: str) -> str:
-    """Name the place of a microphone as people would."""
+    """Return the human-readable name of a microphone's room."""
     return shortened(microphone.replace("_", " ").capitalize(), _LONGEST_NAME)
 
 
 def told(text: str) -> str:
-    """Return a text of a log on one line, and not too long."""
+    """Return a text from a log on one line of limited length."""
     return shortened(" ".join(printable(text).split()), _LONGEST)
 
 
 def reason(text: str) -> str:
-    """Return why a microphone is not heard; empty if what was said of it last is no reason.
+    """Return why a microphone does not listen; empty if its last diagnostics give no reason.
 
     Parameters
     ----------
     text : str
-        What the recorder said; before it ended, or was killed, that it listens.
+        Last diagnostics of the microphone: `listening` if the recorder ended or was killed.
     """
     return "" if text in _HEARD else text
 

@@ -1,4 +1,4 @@
-"""State of the microphones of a home, followed in the log of its recorder."""
+"""State of a home's microphones, followed in the log of the recorder."""
 
 import json
 import math
@@ -33,44 +33,44 @@ FIELDS = {
     message_types.DIAGNOSTICS: ("status",),
     message_types.GAP: ("header.stamp", "duration"),
 }
-_AWAY_SECONDS = 15.0  # without a word
-_DECIDED = (PAUSE_SECONDS + 5) * NANOSECONDS  # after its end no segment is added to an event
+_AWAY_SECONDS = 15.0  # without messages
+_DECIDED = (PAUSE_SECONDS + 5) * NANOSECONDS  # after the end of an event, no segment extends it
 _MOST_CLASSES = 256
-MOST = 0.75  # of a night that has to be heard for a 0 to be said, as in the report
+MOST = 0.75  # least coverage of a night for a count of 0, as in the report
 
 
 class Health(NamedTuple):
-    """The last word of a recorder on one thing; `level` is that of diagnostics, 0 for well."""
+    """Latest diagnostics of one subject; `level` as in diagnostics, 0 for OK."""
 
     level: int
     text: str
 
 
 class EnoughHeard(NamedTuple):
-    """Whether enough was heard to say that there was nothing: today, and in the last night."""
+    """Whether coverage is sufficient for a count of 0: today, and in the last night."""
 
     day: bool
     night: bool
 
 
 class LiveMicrophone:
-    """What one microphone hears and heard, by one of its models.
+    """Current labels and recent events of one microphone, by one of its models.
 
     Parameters
     ----------
     unnamed : collection of str, optional
-        Classes of no events, of which none but silence is told.
+        Classes without events; except for silence they are left out of `classes`.
 
     Attributes
     ----------
     label, confidence : str, float
         The newest label; empty before the first.
     level_dbfs : float
-        Mean level of ten seconds; NaN where it is not known.
+        Mean level of ten seconds; NaN if unknown.
     gaps : list of (int, int)
-        When it was not heard, in nanoseconds of UTC, in the order in which a log has them.
+        Gaps in the audio, in nanoseconds of UTC, in log order.
     since : int
-        When the first that is known of it began, in nanoseconds of UTC; 0 before there is any.
+        Start of the first label or segment, in nanoseconds of UTC; 0 before there is any.
     """
 
     def __init__(self, name: str, unnamed: Collection[str] = (SILENCE,)) -> None:
@@ -83,14 +83,14 @@ class LiveMicrophone:
         self.level_dbfs = math.nan
         self.gaps: list[tuple[int, int]] = []
         self.since = 0
-        self.seen = -math.inf  # when a label came, by CLOCK_MONOTONIC
+        self.seen = -math.inf  # time of the last label, by CLOCK_MONOTONIC
         self._records: dict[str, EventRecord] = {}
         self._unended: set[str] = set()  # classes with an event that may go on
-        self._latest = 0  # when the last segment ended, in nanoseconds of UTC
-        self._replaced: list[SoundEvent] = []  # that are over, for another one of the class began
+        self._latest = 0  # end of the last segment, in nanoseconds of UTC
+        self._replaced: list[SoundEvent] = []  # ended by the start of another event of the class
 
     def is_listening(self) -> bool:
-        """Tell whether labels have come in the last fifteen seconds."""
+        """Whether labels have arrived in the last fifteen seconds."""
         return time.monotonic() - self.seen <= _AWAY_SECONDS
 
     def events(self, label: str, since: int) -> list[SoundEvent]:
@@ -99,11 +99,11 @@ class LiveMicrophone:
         return [] if record is None else record.since(since)
 
     def labels(self) -> list[str]:
-        """Return the classes of which events are known."""
+        """Return the classes with recorded events."""
         return list(self._records)
 
     def last_event(self, label: str) -> SoundEvent | None:
-        """Return the last event of a class; None if none is known."""
+        """Return the last event of a class; None if there is none."""
         record = self._records.get(label)
         return record.events[-1] if record is not None and record.events else None
 
@@ -120,7 +120,7 @@ class LiveMicrophone:
         self.confidence = float(columns["confidence"][-1])
 
     def push_segments(self, columns: Columns) -> list[SoundEvent]:
-        """Add segments, with the fields of `FIELDS`; return the events that begin with them."""
+        """Add segments, with the fields of `FIELDS`; return the events that they begin."""
         begun = []
         first = int(columns["header.stamp"][0])
         self.since = min(self.since or first, first)
@@ -155,19 +155,19 @@ class LiveMicrophone:
         Returns
         -------
         int or None, int or None
-            None in the place of a 0 where too little was heard to say that there was none.
+            None in place of 0 if coverage is too low for a count of 0.
         """
         day = len(self.events(label, today.midnight))
         night = sum(event.start < today.morning for event in self.events(label, today.night))
         return day if day or known.day else None, night if night or known.night else None
 
     def known_of(self, today: Today) -> EnoughHeard:
-        """Tell of which times up to now it is known that nothing was heard in them."""
+        """Return whether coverage of the day and the night is sufficient for a count of 0."""
         night = self._share_heard(today.night, min(today.morning, today.now))
         return EnoughHeard(self._share_heard(today.midnight, today.now) > 0, night >= MOST)
 
     def _share_heard(self, start: int, end: int) -> float:
-        """Return the share of a time, up to now, in which the microphone was heard."""
+        """Return the share of a time span, up to now, in which the microphone listened."""
         spans = [(start, self.since or end), *self.gaps]
         if not self.is_listening():
             spans.append((max(self.heard.time, self._latest), end))
@@ -176,11 +176,12 @@ class LiveMicrophone:
         return 1 - joined(starts, ends).length / max(end - start, 1)
 
     def ended_events(self) -> list[SoundEvent]:
-        """Return the events that are over, each once."""
+        """Return the events that have ended since the last call."""
         ended, self._replaced = self._replaced, []
         for label in sorted(self._unended):
             event = self._records[label].current
-            # Before it, if the clock was set back. What goes on has no segment yet.
+            # The label may precede the event if the clock was set back. Ongoing sound has no
+            # segment yet.
             is_quiet = event is None or abs(self.heard.time - event.end) > _DECIDED
             if not self.is_listening() or (is_quiet and not self.heard.is_heard(label)):
                 self._unended.remove(label)
@@ -188,7 +189,7 @@ class LiveMicrophone:
         return ended
 
     def forget(self, before: int, after: int) -> None:
-        """Forget the events that began before a time, but for the last one of each class."""
+        """Drop events before `before`, except the last of each class, and events after `after`."""
         for record in self._records.values():
             record.forget(before, after)
         if self.gaps and self.gaps[0][1] < before:
@@ -199,17 +200,16 @@ class LiveMicrophone:
 
 
 class HomeState:
-    """What the microphones of one recorder hear and heard.
+    """State of one recorder's microphones.
 
     Attributes
     ----------
     scenarios : dict of str to LiveMicrophone
-        The same by the models of scenarios: by `<microphone>-<scenario>`, which is no name of a
-        microphone.
+        States by scenario models; the key `<microphone>-<scenario>` is no valid microphone name.
     caught_up : bool
-        Whether all that was written before has been read, so that what comes is new.
+        Whether all earlier messages have been read, so that further ones are live.
     sources : collection of str or None
-        Names of the states that the newest log can add to; None while that is not known.
+        Labelling sources of the newest log; None while unknown.
     """
 
     def __init__(self) -> None:
@@ -218,33 +218,33 @@ class HomeState:
         self.health: dict[str, Health] = {}
         self.caught_up = False
         self.sources: Collection[str] | None = None
-        self._seen = -math.inf  # when anything came, by CLOCK_MONOTONIC
-        self._said: set[str] = set()  # subjects of the health in the log that is read
+        self._seen = -math.inf  # time of the last message, by CLOCK_MONOTONIC
+        self._said: set[str] = set()  # subjects with diagnostics in the current log
 
     def is_recording(self) -> bool:
-        """Tell whether anything was written in the last fifteen seconds."""
+        """Whether anything was written in the last fifteen seconds."""
         return time.monotonic() - self._seen <= _AWAY_SECONDS
 
     def every(self) -> list[LiveMicrophone]:
-        """Return the states of the microphones, and those of their scenarios."""
+        """Return the states of all microphones and scenarios."""
         return [*self.microphones.values(), *self.scenarios.values()]
 
     def present(self) -> list[LiveMicrophone]:
-        """Return the states of the microphones that the recorder has now."""
+        """Return the states of the microphones in the newest log."""
         return [each for each in self.microphones.values() if not self.is_left_out(each.name)]
 
     def is_left_out(self, name: str) -> bool:
-        """Return whether the recorder no longer has a microphone, or a scenario of it."""
+        """Whether the recorder no longer has a microphone or scenario."""
         return self.sources is not None and name not in self.sources
 
     def begin_log(self) -> None:
-        """Forget the health of what was spoken of in the log before the last one, and no more."""
+        """Begin a new log: drop the health of subjects without diagnostics in the last log."""
         self.health = {name: each for name, each in self.health.items() if name in self._said}
         self._said.clear()
 
     def find_event(self, identifier: str) -> SoundEvent | None:
-        """Return the event of an id; None if it is not known, or no more."""
-        for microphone in list(self.microphones.values()):  # it may be asked in another thread
+        """Return the event with an id; None if unknown or dropped."""
+        for microphone in list(self.microphones.values()):  # may run in another thread
             for label in microphone.labels():
                 for event in microphone.events(label, 0):
                     if event.id == identifier:
@@ -252,7 +252,7 @@ class HomeState:
         return None
 
     def push(self, columns: Sequence[Columns]) -> list[SoundEvent]:
-        """Add messages with the fields of `FIELDS`; return the events that begin with them."""
+        """Add messages, with the fields of `FIELDS`; return the events that they begin."""
         begun = []
         for part in (each for each in columns if len(each)):
             seen = self._time_seen(part)
@@ -280,10 +280,10 @@ class HomeState:
         return self.microphones.setdefault(name, LiveMicrophone(name))
 
     def _time_seen(self, columns: Columns) -> float:
-        """Tell when messages were written, by CLOCK_MONOTONIC.
+        """Return when messages were written, by CLOCK_MONOTONIC.
 
-        What was written before is as old as its log times say; what comes then was written now,
-        whatever the clock of the recorder says.
+        Messages read while catching up are as old as their log times; live messages were written
+        now, whatever the clock of the recorder shows.
         """
         if self.caught_up:
             return time.monotonic()
@@ -309,7 +309,7 @@ def _levels(status: Any) -> Iterator[float]:
 
 
 def _class_names(columns: Columns) -> list[str]:
-    """Return the names of a model's classes, which the channel of its labels has."""
+    """Return the class names of a model, from the metadata of its label channel."""
     with suppress(ValueError, RecursionError):
         names = json.loads(columns.metadata.get("probabilities_names", ""))
         if isinstance(names, list) and all(isinstance(name, str) for name in names):
@@ -317,7 +317,7 @@ def _class_names(columns: Columns) -> list[str]:
     return []
 
 
-_LATEST = 60 * NANOSECONDS  # of labels and diagnostics: of the older ones nothing is left
+_LATEST = 60 * NANOSECONDS  # older labels and diagnostics have no effect on the state
 _WAIT_SECONDS = 1.0
 _TICK_SECONDS = 0.5
 
@@ -336,19 +336,21 @@ def is_of_bridge(topic: str) -> bool:
 def follow_home(
     home: RecorderAddress, start: int, stop: Flag, damaged: Callable[[LogError], None]
 ) -> Iterator[tuple[HomeState, list[SoundEvent]]]:
-    """Follow the logs of a recorder, and keep the state of its home.
+    """Follow the logs of a recorder, and update the state of its home.
 
     Parameters
     ----------
     start : int
-        Log time from which on the events are to be known, in nanoseconds of UTC.
+        Log time from which events are read, in nanoseconds of UTC.
     damaged : callable
-        Told the error of a log of which no more can be read, and that there is no folder yet.
+        Called with the error of a log that can be read no further, or a missing folder.
 
     Yields
     ------
     state : HomeState
-        The same one each time: after whatever was written, and twice a second while nothing is.
+        Always the same object: after each batch of messages, and twice a second without any.
+    begun : list of SoundEvent
+        Events that began with the batch.
     """
     state, folder = HomeState(), home.folder
     while not folder.is_dir():
@@ -361,7 +363,7 @@ def follow_home(
     messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
     yielded, current, described = -math.inf, folder, folder
     for path, batch in messages:
-        if path == folder:  # all that was written has been read
+        if path == folder:  # a tick: everything written so far has been read
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
@@ -382,7 +384,7 @@ def follow_home(
 def _push(
     state: HomeState, log: Path, batch: list[RawMessages], damaged: Callable[[LogError], None]
 ) -> list[SoundEvent]:
-    """Add what was read of a log; return the events that begin with it."""
+    """Add a batch of messages from a log; return the events that they begin."""
     try:
         return state.push(_decode(batch))
     except LogError as error:
@@ -391,15 +393,15 @@ def _push(
 
 
 def _check_version(log: Path, damaged: Callable[[LogError], None]) -> None:
-    """Tell of a log of a later version, of which only what is known here is read."""
-    with suppress(LogError), LogFile(log) as file:  # it gets another name at this moment
+    """Report a log written by a later version, which is read only in part."""
+    with suppress(LogError), LogFile(log) as file:  # the file may be renamed at this moment
         for record in provenance_records(file):
             if text := unknown_version(record):
                 damaged(LogError(f"{log}: {text}"))
 
 
 def _labelling_sources(log: Path) -> set[str] | None:
-    """Return the labelling sources of a log; None if it cannot be read at this moment."""
+    """Return the labelling sources of a log; None if the log cannot be read at this moment."""
     with suppress(LogError), LogFile(log) as file:
         read_definitions(file)
         topics = [channel.topic for channel in file.channels.values()]

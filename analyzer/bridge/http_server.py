@@ -1,4 +1,4 @@
-"""HTTP server with limits: few connections, each with a deadline."""
+"""HTTP server with limits on connections, and a deadline for each."""
 
 import select
 import socket
@@ -13,10 +13,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from time import monotonic
 from typing import Any, BinaryIO, cast
 
-MOST_ASKING = 64  # connections that have not shown yet that they may read
+MOST_ASKING = 64  # connections that are not admitted yet
 MOST_ADMITTED = 32
 _MOST_THREADS = 4 * MOST_ASKING
-SECONDS = 10.0  # for a request, and for each part of an answer
+SECONDS = 10.0  # for a request, and for each part of a response
 _HEAD_LIMIT = 16 << 10  # bytes
 TEXT = "text/plain; charset=utf-8"
 
@@ -24,17 +24,17 @@ TEXT = "text/plain; charset=utf-8"
 @dataclass
 class _Connection:
     host: str
-    end: float  # by CLOCK_MONOTONIC: when it has to be done
+    end: float  # deadline, by CLOCK_MONOTONIC
     is_admitted: bool = False
 
 
 class HttpServer(ThreadingHTTPServer):
-    """Listens in a thread of its own.
+    """HTTP server that listens in a separate thread.
 
-    Who has shown that he may read has a place that nobody else takes. The others have so many
-    together; when there are more, the oldest of the address that has most of them is ended.
+    Admitted connections have places of their own. All others share a limited number of places: if
+    these are full, the oldest connection of the address with the most connections is closed.
 
-    Raise `OSError` if nothing can listen there.
+    Raise `OSError` if the address or port cannot be bound.
     """
 
     daemon_threads = True
@@ -49,11 +49,11 @@ class HttpServer(ThreadingHTTPServer):
         self._lock = threading.Lock()
 
     def start(self) -> None:
-        """Answer from now on."""
+        """Start serving."""
         threading.Thread(target=self.serve_forever, daemon=True).start()
 
     def end(self) -> None:
-        """Answer nobody any more, and wait for nobody."""
+        """Stop serving, and close all connections at once."""
         self.shutdown()
         self.server_close()
         with self._lock:
@@ -62,14 +62,14 @@ class HttpServer(ThreadingHTTPServer):
             _shut(connection)
 
     def server_bind(self) -> None:
-        """Bind without asking the network for the name of this machine."""
+        """Bind without a name lookup of this machine on the network."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread, and make room for it."""
+        """Answer in a new thread, closing another connection if there is no room."""
         if not self._threads_free.acquire(blocking=False):
             self.shutdown_request(request)
             return
@@ -83,14 +83,14 @@ class HttpServer(ThreadingHTTPServer):
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer, and make room for the next one."""
+        """Answer, and free the place of the connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._forget(request)
 
     def admit(self, connection: socket.socket) -> bool:
-        """Give a connection that may read a place of its own; False if none is free."""
+        """Give an authorized connection a place of its own; return False if none is free."""
         with self._lock:
             if sum(each.is_admitted for each in self._connections.values()) >= MOST_ADMITTED:
                 return False
@@ -99,13 +99,13 @@ class HttpServer(ThreadingHTTPServer):
             return True
 
     def give_time(self, connection: socket.socket, seconds: float) -> None:
-        """Let a connection be for so many seconds from now on."""
+        """Set the deadline of a connection, in seconds from now."""
         with self._lock:
             if connection in self._connections:
                 self._connections[connection].end = monotonic() + seconds
 
     def service_actions(self) -> None:
-        """End connections that take too long, however busy they are."""
+        """Close connections past their deadline, even active ones."""
         now = monotonic()
         with self._lock:
             late = [each for each, about in self._connections.items() if about.end < now]
@@ -113,7 +113,7 @@ class HttpServer(ThreadingHTTPServer):
             _shut(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Pass over those who go away, or send what is no request."""
+        """Ignore clients that disconnect or send invalid requests."""
 
     def _make_room(self) -> None:
         asking = {each: a.host for each, a in self._connections.items() if not a.is_admitted}
@@ -121,8 +121,8 @@ class HttpServer(ThreadingHTTPServer):
             return
         ((most, _),) = Counter(asking.values()).most_common(1)
         those = [each for each, host in asking.items() if host == most]
-        with suppress(OSError, ValueError):  # one was closed meanwhile
-            waiting = select.select(those, [], [], 0)[0]  # what they sent is read at this moment
+        with suppress(OSError, ValueError):  # a connection was closed meanwhile
+            waiting = select.select(those, [], [], 0)[0]  # their data is about to be read
             those = [each for each in those if each not in waiting] or those
         self._connections.pop(those[0])
         _shut(those[0])
@@ -134,7 +134,7 @@ class HttpServer(ThreadingHTTPServer):
 
 
 class HttpHandler(BaseHTTPRequestHandler):
-    """Answers one request."""
+    """Handler of one request."""
 
     protocol_version = "HTTP/1.1"
     timeout = SECONDS
@@ -142,32 +142,32 @@ class HttpHandler(BaseHTTPRequestHandler):
     fields: Mapping[str, str] = {"Cache-Control": "no-store", "Connection": "close"}
 
     def get(self) -> None:
-        """Answer a request to read."""
+        """Answer a GET request."""
         raise NotImplementedError
 
     def post(self) -> None:
-        """Answer a request that changes something."""
+        """Answer a POST request; not found by default."""
         self.send_error(HTTPStatus.NOT_FOUND)
 
     def do_GET(self) -> None:
-        """Answer a request to read."""
+        """Answer a GET request."""
         self.get()
 
     def do_POST(self) -> None:
-        """Answer a request that changes something."""
+        """Answer a POST request."""
         self.post()
 
     def setup(self) -> None:
-        """Read no more than a head may have, and a body."""
+        """Limit the bytes read to a head and a body."""
         super().setup()
         self.rfile = cast(Any, _Limited(cast(BinaryIO, self.rfile), _HEAD_LIMIT + self.body_limit))
 
     def version_string(self) -> str:
-        """Return what names the server, without a version."""
+        """Return the name of the server, without a version."""
         return "hearthlog"
 
     def log_message(self, *_: object) -> None:
-        """Keep quiet."""
+        """Log nothing."""
 
     def send_error(
         self,
@@ -175,19 +175,19 @@ class HttpHandler(BaseHTTPRequestHandler):
         message: str | None = None,  # noqa: ARG002
         explain: str | None = None,  # noqa: ARG002
     ) -> None:
-        """Send what is wrong with a request, and nothing else."""
+        """Send the phrase of a status code as plain text."""
         self.send(code, f"{HTTPStatus(code).phrase}\n".encode(), TEXT)
 
     def send(
         self, code: int, content: bytes, kind: str, more: Mapping[str, str] | None = None
     ) -> None:
-        """Send an answer."""
+        """Send a response."""
         head = {"Content-Type": kind, "Content-Length": str(len(content)), **(more or {})}
         self.send_head(code, head)
         self.wfile.write(content)
 
     def send_head(self, code: int, fields: Mapping[str, str]) -> None:
-        """Send the head of an answer, after which the connection ends."""
+        """Send the head of a response; the connection closes after the body."""
         self.send_response(code)
         for name, value in {**fields, **self.fields}.items():
             self.send_header(name, value)
@@ -200,7 +200,7 @@ def _shut(connection: socket.socket) -> None:
 
 
 class _Limited:
-    """A stream of which only so many bytes can be read."""
+    """Input stream with a limit on the bytes read."""
 
     def __init__(self, stream: BinaryIO, limit: int) -> None:
         self._stream = stream

@@ -1,4 +1,4 @@
-"""Outputs of the bridge: their protocol, their news, and the totals of classes."""
+"""Protocol of the bridge's outputs, their updates, and totals by class."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -18,16 +18,22 @@ from hearthlog.schemas.files import read_whole
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import replaced_file
 
-RECENT = 60 * NANOSECONDS  # after its end an event is no news
+RECENT = 60 * NANOSECONDS  # after its end an event is no longer reported
 
 
 class News(NamedTuple):
-    """What there is to tell.
+    """An update for the outputs.
 
     Attributes
     ----------
+    state : HomeState
+        Current state of the home.
     begun, ended : sequence of SoundEvent
-        Those of the last minute that were not told of before, and those that are over since.
+        Events of the last minute not reported before, and events that ended since the last update.
+    today : Today
+        Current day and last night.
+    zone : tzinfo
+        Time zone of the home.
     """
 
     state: HomeState
@@ -38,21 +44,21 @@ class News(NamedTuple):
 
 
 class Output(Protocol):
-    """Tells somebody; never waits, for the others wait for it."""
+    """Output of the bridge; its methods must not block, as all outputs share a thread."""
 
     def update(self, news: News) -> None:
-        """Tell what is new, several times a second."""
+        """Process an update; called several times a second."""
 
     def close(self) -> None:
-        """End within seconds."""
+        """Stop within seconds."""
 
 
-TOTALS = "totals.json"  # in the folder of the state
+TOTALS = "totals.json"  # in the state folder
 _LIMIT = 1 << 20  # bytes
 
 
 class Total(NamedTuple):
-    """What was heard of a class by a microphone, or by a scenario of it."""
+    """Totals of a class by microphone or scenario."""
 
     microphone: str  # as `LiveMicrophone.name`
     label: str
@@ -68,14 +74,14 @@ class _Kept(BaseModel):
 
 
 class Totals:
-    """Events and seconds by microphone and class, which no restart takes back.
+    """Totals of events and seconds by microphone and class, kept across restarts.
 
-    What began before a time is kept in a file; the rest is counted from the state of the home.
+    Events before a time are saved in a file; later ones are counted from the state of the home.
 
     Parameters
     ----------
     time : int
-        When the first event that counts may begin if there is no file; in nanoseconds of UTC.
+        Start of the count if there is no file, in nanoseconds of UTC.
 
     Raises
     ------
@@ -90,12 +96,12 @@ class Totals:
             self.time, self._kept = kept.time, kept.totals
 
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
-        """Return what was heard, by who heard it and class; 0 of a class that was not yet.
+        """Return the totals, sorted by microphone and class; 0 for classes without events.
 
         Parameters
         ----------
         end : int, optional
-            Before which events begin that count, in nanoseconds of UTC; by default all do.
+            Count events that begin before this time, in nanoseconds of UTC; all by default.
         """
         sums = {total[:2]: total for total in self._kept}
         for microphone in state.every():
@@ -114,7 +120,7 @@ class Totals:
         return [sums[key] for key in sorted(sums)]
 
     def keep(self, state: HomeState, time: int) -> None:
-        """Put what began before a time into the file, unless it is there already.
+        """Save the totals of events that began before a time, unless saved already.
 
         Raise `BridgeError` if the file cannot be written.
         """
@@ -130,13 +136,7 @@ class Totals:
 
 
 def kept_until(path: Path, default: int) -> int:
-    """Return before which time events are in a file, in nanoseconds of UTC.
-
-    Parameters
-    ----------
-    default : int
-        What is returned if there is none of use.
-    """
+    """Return the end of the totals in a file, in nanoseconds of UTC; `default` without a file."""
     with suppress(HearthlogError):
         kept = _read(path)
         return default if kept is None else kept.time

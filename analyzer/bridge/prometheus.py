@@ -1,4 +1,4 @@
-"""Figures for Prometheus: in a text file of node_exporter, or on a port of loopback."""
+"""Prometheus metrics: in a text file for node_exporter, or on a loopback port."""
 
 import math
 import shutil
@@ -32,7 +32,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import create_file, replaced_file
 
 _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
-_LATER = 12 * 3600 * NANOSECONDS  # than its beginning an event may be known
+_LATER = 12 * 3600 * NANOSECONDS  # longest delay from the start of an event to its message
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 _READERS = {"owner": 0, "group": 0o040, "all": 0o044}
 _LABELS = ("node", "microphone", "label")
@@ -40,18 +40,18 @@ _LABELS_OF_SCENARIOS = ("node", "microphone", "scenario", "label")
 
 
 class PrometheusOutput:
-    """Gives figures of a home to whoever asks, or writes them down every ten seconds.
+    """Serves the metrics of a home on a port, or writes them to a text file every ten seconds.
 
     Parameters
     ----------
     since : int
-        From when on events count the first time, in nanoseconds of UTC.
+        Start of the count of events if no totals are saved, in nanoseconds of UTC.
 
     Raises
     ------
     BridgeError
-        If nobody is given the figures, if the port cannot be had or has no token and there is no
-        text file, which goes on without it, or if what is remembered is damaged.
+        If neither port nor text file is configured, if the port cannot be opened or has no token
+        and there is no text file, or if the saved totals are damaged.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class PrometheusOutput:
         self._home = home
         self._say = say
         self.totals = Totals(state_folder / TOTALS, since)
-        self._text, self._made = b"", -math.inf  # and when, by CLOCK_MONOTONIC
+        self._text, self._made = b"", -math.inf  # the second by CLOCK_MONOTONIC
         self._lock = Lock()
         self._due = 0.0  # by CLOCK_MONOTONIC
         if settings.text_file is not None and settings.readable_by is None:
@@ -82,7 +82,7 @@ class PrometheusOutput:
         self._open_port()
 
     def update(self, news: News) -> None:
-        """Work the figures out anew, if they are ten seconds old."""
+        """Compute the metrics again if they are ten seconds old."""
         if time.monotonic() < self._due:
             return
         self._due = time.monotonic() + _EVERY_SECONDS
@@ -97,7 +97,7 @@ class PrometheusOutput:
             self._write(self._settings.text_file, text)
 
     def close(self) -> None:
-        """Answer no more; the text file goes, so that nobody takes it for today's."""
+        """Stop the server, and delete the text file, which would otherwise be read when stale."""
         if self._server is not None:
             self._server.end()
         if (file := self._settings.text_file) is not None:
@@ -115,7 +115,7 @@ class PrometheusOutput:
             self._say(f"bridge.prometheus: text_file: {error}; trying again")
 
     def _open_port(self) -> None:
-        """Open the port that is configured; a text file goes on without it."""
+        """Open the configured port; with a text file, a failure is only reported."""
         if self._settings.port is None or self._server is not None:
             return
         try:
@@ -135,14 +135,14 @@ class PrometheusOutput:
             ) from error
 
     def _current(self) -> bytes | None:
-        """Return the figures; None if they are old."""
+        """Return the metrics; None if they are stale."""
         with self._lock:
             is_stale = time.monotonic() - self._made > _STALE_SECONDS
             return None if is_stale else self._text
 
 
 class _Server(HttpServer):
-    """Gives figures to who has the token."""
+    """Server of the metrics for clients with the token."""
 
     def __init__(self, port: int, token: str, current: Callable[[], bytes | None]) -> None:
         super().__init__(HOST, port, _Handler)
@@ -152,10 +152,10 @@ class _Server(HttpServer):
 
 
 class _Handler(HttpHandler):
-    """Answers one request; a page of a browser is refused, whatever name it came by."""
+    """Handler of one request; requests from web pages are refused, whatever the host name."""
 
     def get(self) -> None:
-        """Send the figures."""
+        """Send the metrics."""
         server = cast(_Server, self.server)
         hosts = self.headers.get_all("Host", [])
         is_here = len(hosts) == 1 and is_asked_in_digits(HOST, hosts[0])
@@ -184,7 +184,7 @@ class _Handler(HttpHandler):
 
 
 class _Figures(Collector):
-    """The figures of one moment."""
+    """Metrics at one moment."""
 
     def __init__(self, news: News, home: RecorderAddress, totals: Sequence[Total]) -> None:
         self._news = news
@@ -192,7 +192,7 @@ class _Figures(Collector):
         self._totals = totals
 
     def collect(self) -> Iterator[Metric]:
-        """Yield each figure, by microphone and class."""
+        """Yield each metric, by microphone and class."""
         node, state = self._home.node, self._news.state
         of_home = [total for total in self._totals if not is_of_scenario(total.microphone)]
         yield from _counters("", _LABELS, [((node, *one[:2]), one) for one in of_home])
@@ -211,7 +211,7 @@ class _Figures(Collector):
             [((node, subject), health.level) for subject, health in state.health.items()],
             "subject",
         )
-        with suppress(OSError):  # it is away
+        with suppress(OSError):  # the disk is missing
             free = shutil.disk_usage(self._home.folder).free
             yield _gauge("free_bytes", "Of the disk of the logs.", [((node,), free)])
 

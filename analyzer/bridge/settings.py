@@ -1,4 +1,4 @@
-"""The table `bridge` of the configuration: outputs, alerts and their delivery."""
+"""Settings of the table `bridge`: outputs, alerts and their delivery."""
 
 import json
 import os
@@ -37,7 +37,7 @@ NO_RECIPIENT = (
 
 
 def _check_secret_file(value: Any) -> Any:
-    if "://" in str(value):  # a secret, which no message may repeat
+    if "://" in str(value):  # a secret, which must not appear in messages
         raise ValueError("names a file; write the address into that file, on a line of its own")
     return value
 
@@ -58,7 +58,7 @@ class DeliverySettings(BaseModel):
 
 
 _MOST_OF_TOPIC = 200  # characters
-_COLLECTED = ".prom"  # ends the names that the textfile collector of node_exporter reads
+_COLLECTED = ".prom"  # suffix of the files that the textfile collector of node_exporter reads
 
 
 def _check_topic(topic: str) -> str:
@@ -83,7 +83,7 @@ def _check_ping_address(url: str) -> str:
 
 
 def _check_host(name: str) -> str:
-    if "/" in name or "@" in name:  # it may have a password in it
+    if "/" in name or "@" in name:  # the text may contain a password
         raise ValueError("is an address; write the name of the host alone, as broker.lan")
     try:
         encoded = name.encode("idna")
@@ -158,11 +158,11 @@ class MqttSettings(_Table):
     )
 
     def check_files(self) -> None:
-        """Check whether the files belong to what else is configured, before anything is sent.
+        """Check that the files fit the other settings, before any connection.
 
-        No validator, which would refuse the other outputs, too.
+        This is no validator, which would reject the other outputs, too.
 
-        Raise `BridgeError` if they do not.
+        Raise `BridgeError` if the files do not fit.
         """
         files = ("ca_file", "certificate_file", "key_file")
         if not self.tls and (name := next((name for name in files if getattr(self, name)), "")):
@@ -197,9 +197,9 @@ class PrometheusSettings(_Table):
     )
 
     def check_readers(self) -> None:
-        """Check whether anybody is given the figures; no validator, as `MqttSettings.check_files`.
+        """Check that a text file or port is configured; no validator, see `check_files` of MQTT.
 
-        Raise `BridgeError` if nobody is.
+        Raise `BridgeError` if both are missing.
         """
         if self.text_file is None and self.port is None:
             raise BridgeError(
@@ -207,7 +207,7 @@ class PrometheusSettings(_Table):
             )
 
     def unread_text_file(self) -> str:
-        """Say that nobody reads the text file, by its name; empty if somebody may."""
+        """Return a warning if the name of the text file keeps node_exporter from reading it."""
         file = self.text_file
         if file is None or file.suffix == _COLLECTED or os.path.isdir(file):  # noqa: PTH112  raises nothing
             return ""
@@ -276,12 +276,12 @@ class BridgeSettings(_Table):
     delivery: DeliverySettings = DeliverySettings()
 
     def has_outputs(self) -> bool:
-        """Tell whether anybody is told anything."""
+        """Whether any output is configured."""
         outputs = self.mqtt, self.prometheus, self.page, self.ping
         return any(output is not None for output in outputs) or bool(self.alert)
 
 
-_OTHERS: dict[str, type[BaseModel]] = {  # tables whose keys may have been meant
+_OTHERS: dict[str, type[BaseModel]] = {  # other tables in which a misplaced key may be valid
     "above the first table": Settings,
     "below [[microphone]]": MicrophoneSettings,
     "below [bridge.mqtt]": MqttSettings,
@@ -292,17 +292,17 @@ _OTHERS: dict[str, type[BaseModel]] = {  # tables whose keys may have been meant
 
 
 def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
-    """Load the configuration of a recorder, and of the bridge that follows its log.
+    """Load the configuration of a recorder and of its bridge.
 
     Parameters
     ----------
     file : Path or None
-        The TOML file; None for no file.
+        The TOML file; None for the defaults.
 
     Raises
     ------
     ConfigurationError
-        As `load_settings`, also for what is in the table `bridge`.
+        As `load_settings`, also for the table `bridge`.
     """
     problems: list[str] = []
     settings = Settings.model_construct()
@@ -326,16 +326,16 @@ def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
 
 
 def configured_microphones(settings: Settings) -> list[str]:
-    """Return the names of the microphones that a configuration has; none if it has no table of one.
+    """Return the names of the configured microphones; none if only the default is in force.
 
-    The recorder may then have another configuration, and the default is no statement of it.
+    Without a table `microphone`, the recorder may have another configuration.
     """
     is_given = "microphone" in settings.model_fields_set
     return [each.name for each in settings.microphone] if is_given else []
 
 
 def file_schema() -> dict[str, Any]:
-    """Return the JSON schema of a configuration: of the recorder and of the bridge."""
+    """Return the JSON schema of a configuration file, for recorder and bridge."""
     schema = Settings.model_json_schema()
     bridge = BridgeSettings.model_json_schema()
     schema["$defs"] |= bridge.pop("$defs", {})

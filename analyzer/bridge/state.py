@@ -1,4 +1,4 @@
-"""Files of the bridge: the folder of its state, secrets, and tokens of its servers."""
+"""State folder, secrets, and server tokens of the bridge."""
 
 import os
 import re
@@ -11,24 +11,24 @@ from hearthlog.schemas.new_files import create_file, private_folder, replaced_fi
 
 
 class BridgeError(HearthlogError):
-    """The bridge cannot do what it is configured for."""
+    """Error in the configuration or operation of the bridge."""
 
 
 _OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between them
 
 
 def state_folder(configured: Path | None, logs: Path) -> Path:
-    """Return the folder of the state, which is made where it is missing.
+    """Return the state folder, created if missing.
 
     Returns
     -------
     Path
-        The configured one; else that of systemd; else `bridge` beside the logs.
+        The configured folder; else the state directory of systemd; else `bridge` next to the logs.
 
     Raises
     ------
     BridgeError
-        If it cannot be made.
+        If the folder cannot be created.
     """
     given = os.environ.get(_OF_SYSTEMD, "").partition(":")[0]
     folder = configured or (Path(given) if given else logs.absolute().parent / "bridge")
@@ -45,12 +45,12 @@ _CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
 
 
 def secret_path(path: Path) -> Path:
-    """Return where a file of a secret is."""
+    """Return the path of a secret, relative to the systemd credentials folder if there is one."""
     return Path(os.environ.get(_CREDENTIALS, "")) / path
 
 
 _TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
-_FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # what an address can have as it is
+_FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # characters that URLs need not escape
 
 
 def page_token(file: Path | None, state: Path) -> str:
@@ -59,34 +59,34 @@ def page_token(file: Path | None, state: Path) -> str:
     Parameters
     ----------
     file : Path or None
-        That has it in one line, as `secret_path` finds it; by default one is made in the folder of
-        the state, and kept.
+        One-line token file, resolved by `secret_path`; None to create a token in the state folder
+        and keep it.
 
     Raises
     ------
     BridgeError
-        If the file cannot be used, or none can be made.
+        If the file cannot be used or created.
     """
     return read_token(file) if file is not None else _kept(state / _TOKEN)
 
 
 def cookie_key(state: Path) -> bytes:
-    """Return what the cookies of the page are made with; without its file there will be another.
+    """Return the key that signs the page's cookies; a new key is created if its file is missing.
 
-    Raise `BridgeError` if it cannot be read or made.
+    Raise `BridgeError` if the key cannot be read or created.
     """
     return _kept(state / _COOKIES).encode()
 
 
 def page_secrets(state: Path) -> list[Path]:
-    """Name the files of secrets that the page keeps in a folder."""
+    """Return the paths of the page's secrets in the state folder."""
     return [state / name for name in (_TOKEN, _COOKIES, _ADDRESS)]
 
 
 def keep_address(address: str, state: Path) -> Path:
-    """Write the whole address of the page into a file that only its owner may read.
+    """Write the page's address with its token to a file that only the owner may read.
 
-    Raise `BridgeError` if it cannot be written.
+    Raise `BridgeError` if the file cannot be written.
     """
     path = state / _ADDRESS
     _write(path, address)
@@ -94,9 +94,9 @@ def keep_address(address: str, state: Path) -> Path:
 
 
 def read_token(file: Path) -> str:
-    """Read a file of a token, as `secret_path` finds it.
+    """Read a token file, resolved by `secret_path`.
 
-    Raise `BridgeError` if it cannot be used.
+    Raise `BridgeError` if the file cannot be used.
     """
     file = secret_path(file)
     data = read_whole(file, "file of a token", 1 << 12, BridgeError)
@@ -111,8 +111,8 @@ def read_token(file: Path) -> str:
 def figures_token(port: int, file: Path | None) -> str:
     """Return the token of the port for Prometheus.
 
-    Raise `BridgeError` if there is none: every account of the machine can reach a port of
-    loopback.
+    Raise `BridgeError` if no token is configured: every account of the machine can reach a loopback
+    port.
     """
     if file is None:
         raise BridgeError(

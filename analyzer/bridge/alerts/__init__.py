@@ -1,1 +1,1 @@
-"""Alerts: rules that are evaluated from the log, and delivery of their notifications."""
+"""Alerts: evaluation of rules on the log, and delivery of notifications."""

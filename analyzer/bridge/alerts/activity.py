@@ -1,4 +1,4 @@
-"""Activity of a home: segments, coverage and classes, collected from its logs."""
+"""Activity of a home: segments, coverage and classes, read from its logs."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -27,15 +27,7 @@ from hearthlog.schemas.messages.topics import labelling_topic, parse_topic
 
 @dataclass(frozen=True)
 class Sounds:
-    """Segments of one class, or of several.
-
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, in the order of the starts.
-    confidences : np.ndarray [shape=(n,)], float32
-    microphones : np.ndarray [shape=(n,)] of str
-    """
+    """Segments of one or several classes as columns, sorted by start, in nanoseconds of UTC."""
 
     starts: Int64
     ends: Int64
@@ -43,23 +35,18 @@ class Sounds:
     microphones: NDArray[np.object_]
 
     def rows(self, rows: Bool) -> "Sounds":
-        """Return some of the segments.
-
-        Parameters
-        ----------
-        rows : np.ndarray [shape=(n,)], bool
-        """
+        """Return the segments that a boolean mask selects."""
         return Sounds(
             self.starts[rows], self.ends[rows], self.confidences[rows], self.microphones[rows]
         )
 
     def between(self, start: int, end: int, pause: int) -> "Sounds":
-        """Return what was heard in a span of time, with all of the events that go on in it.
+        """Return the segments in a time span, with the complete events ongoing at its start.
 
         Parameters
         ----------
         pause : int
-            Within an event, at most.
+            Longest pause within an event, in nanoseconds.
         """
         own = self.rows(self.starts < end)
         own = Sounds(own.starts, np.minimum(own.ends, end), own.confidences, own.microphones)
@@ -73,7 +60,7 @@ NO_SOUNDS = Sounds(NONE.starts, NONE.ends, np.empty(0, np.float32), np.empty(0, 
 
 
 def sounds_of(parts: Iterable[Sounds]) -> Sounds:
-    """Put segments together, in the order of time."""
+    """Merge segments, sorted by start."""
     parts = list(parts)
     if not parts:
         return NO_SOUNDS
@@ -87,14 +74,20 @@ def sounds_of(parts: Iterable[Sounds]) -> Sounds:
 
 @dataclass(frozen=True)
 class HomeActivity:
-    """Activity of a home in a span of time.
+    """Activity of a home in a time span.
 
     Attributes
     ----------
     sounds : mapping of str to Sounds
-        By class, of the models of the home; silence is none.
+        Segments by class, of the home's models, without silence.
+    scenario_sounds : mapping of str to Sounds
+        Segments by class, of scenario models.
+    coverage : mapping of str to Spans
+        Listening time by labelling source.
+    classes : mapping of str to frozenset of str
+        Classes of the model by labelling source; sources with unknown classes are absent.
     written : Spans
-        When the recorder wrote; no more than a minute apart is one span.
+        When the recorder wrote; writes at most a minute apart form one span.
     """
 
     sounds: Mapping[str, Sounds]
@@ -104,7 +97,7 @@ class HomeActivity:
     written: Spans
 
     def of(self, label: str) -> Sounds:
-        """Return the segments of a class, or of any sound."""
+        """Return the segments of a class, or of all classes for `ANY_SOUND`."""
         return sounds_of(self.sounds.values()) if label == ANY_SOUND else self._of(label)
 
     def _of(self, label: str) -> Sounds:
@@ -113,12 +106,12 @@ class HomeActivity:
         return own if others is None else sounds_of([own, others])
 
     def listened(self, label: str, microphone: str) -> Spans:
-        """Return when a class would have been heard.
+        """Return the time spans in which a class could have been detected.
 
         Parameters
         ----------
         microphone : str
-            Empty: any of those whose models know the class.
+            Empty for any microphone with a model that has the class.
         """
         knowing = [
             spans
@@ -134,12 +127,12 @@ class HomeActivity:
         return known is None or label == ANY_SOUND or label in known
 
     def between(self, start: int, end: int, pause: int) -> "HomeActivity":
-        """Return what was heard in a span of time, with all of the events that go on in it.
+        """Return the activity in a time span, with the complete events ongoing at its start.
 
         Parameters
         ----------
         pause : int
-            Within an event, at most.
+            Longest pause within an event, in nanoseconds.
         """
         return HomeActivity(
             {label: sounds.between(start, end, pause) for label, sounds in self.sounds.items()},
@@ -158,12 +151,12 @@ def _either(a: Spans, b: Spans) -> Spans:
 
 
 SEGMENT_FIELDS = "header.stamp", "duration", "label", "confidence"
-_PAUSE = 60 * NANOSECONDS  # between what the recorder writes, as one span
+_PAUSE = 60 * NANOSECONDS  # longest pause between writes of one span
 
 
 @dataclass
 class _Rows:
-    """Segments of one class, of which more come."""
+    """Growing segments of one class, with a cache of the columns."""
 
     starts: list[int] = field(default_factory=list)
     ends: list[int] = field(default_factory=list)
@@ -189,13 +182,13 @@ class _Rows:
 
 
 class _GrowingSpans:
-    """Spans of time that come one after the other, for the most part in order."""
+    """Growing list of time spans, added mostly in order."""
 
     def __init__(self) -> None:
         self._spans: list[list[int]] = []
 
     def add(self, start: int, end: int, pause: int) -> None:
-        """Add a span, which goes on with the last one after no more than a pause."""
+        """Add a span, or extend the last span if the pause between is short enough."""
         last = self._spans[-1] if self._spans else None
         if last is not None and last[0] <= start <= last[1] + pause:
             last[1] = max(last[1], end)
@@ -210,12 +203,12 @@ class _GrowingSpans:
         return joined(starts, ends, pause)
 
     def forget_before(self, time: int) -> None:
-        """Forget the spans that end before a time."""
+        """Drop the spans that end before a time."""
         self._spans = [span for span in self._spans if span[1] >= time]
 
     @property
     def last_start(self) -> int | None:
-        """When the last span begins."""
+        """Start of the last span."""
         return self._spans[-1][0] if self._spans else None
 
 
@@ -240,7 +233,7 @@ class SegmentCollector:
         """Add a segment."""
         covered = self._coverage.setdefault(source, _GrowingSpans())
         covered.add(start, end, FRAME_NANOSECONDS)
-        self._written.add(start, end, _PAUSE)  # a long one has a message at its end alone
+        self._written.add(start, end, _PAUSE)  # a long segment has one message, at its end
         name = class_name(label)
         if not _is_told(source, name):
             return
@@ -255,13 +248,7 @@ class SegmentCollector:
             self.classes[source].add(name)
 
     def add_classes(self, source: str, names: Iterable[str]) -> None:
-        """Add the classes that the model of a source knows.
-
-        Parameters
-        ----------
-        names : iterable of str
-            None: nothing is known of them.
-        """
+        """Add the classes of a source's model; without names the classes stay unknown."""
         own = {class_name(name) for name in names}
         if is_of_scenario(source):
             own -= OF_EVERY_SCENARIO
@@ -269,28 +256,28 @@ class SegmentCollector:
             self.classes.setdefault(source, set()).update(own)
 
     def add_written(self, times: Int64) -> None:
-        """Add times at which the recorder wrote.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            Ascending, in nanoseconds of UTC.
-        """
+        """Add times at which the recorder wrote, ascending, in nanoseconds of UTC."""
         spans = joined(times, times, _PAUSE)
         for start, end in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True):
             self.add_written_span(start, end)
 
     def add_written_span(self, start: int, end: int) -> None:
-        """Add a span of time in which the recorder wrote at least once a minute."""
+        """Add a time span in which the recorder wrote at least once a minute."""
         self._written.add(start, end, _PAUSE)
 
     @property
     def recorder_began(self) -> int | None:
-        """When the recorder last began to write; None if it never did."""
+        """Start of the recorder's last uninterrupted writing; None if it never wrote."""
         return self._written.last_start
 
     def heard(self, others: Sequence[tuple[str, int, int, str, float]] = ()) -> HomeActivity:
-        """Return what was heard."""
+        """Return the activity so far, with open segments.
+
+        Parameters
+        ----------
+        others : sequence of (str, int, int, str, float), optional
+            Source, start, end, label and confidence of open segments.
+        """
         sounds = {label: rows.sounds() for label, rows in self._rows.items()}
         of_scenarios = {label: rows.sounds() for label, rows in self._scenario_rows.items()}
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
@@ -313,12 +300,12 @@ class SegmentCollector:
         return HomeActivity(sounds, of_scenarios, coverage, classes, written)
 
     def forget_before(self, time: int, pause: int) -> None:
-        """Forget the events that were over before a time.
+        """Drop the events that ended before a time.
 
         Parameters
         ----------
         pause : int
-            Within an event, at most.
+            Longest pause within an event, in nanoseconds.
         """
         for rows in (*self._rows.values(), *self._scenario_rows.values()):
             if rows.starts:
@@ -328,7 +315,7 @@ class SegmentCollector:
 
 
 def _is_told(source: str, name: str) -> bool:
-    """Tell whether a class is one that a rule may be about."""
+    """Whether a rule may apply to a class."""
     return name not in (OF_EVERY_SCENARIO if is_of_scenario(source) else {SILENCE})
 
 
@@ -336,7 +323,7 @@ def _with(spans: Spans, start: int, end: int, pause: int) -> Spans:
     return joined(np.append(spans.starts, start), np.append(spans.ends, end), pause)
 
 
-_LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
+_LATE = 12 * 3600 * NANOSECONDS  # a segment is logged at its end: a long silence hours late
 
 
 def read_activity(  # noqa: PLR0913, PLR0917
@@ -348,16 +335,18 @@ def read_activity(  # noqa: PLR0913, PLR0917
     progress: Progress = ignore_progress,
     others: Sequence[tuple[str, int, int, str, float]] = (),
 ) -> HomeActivity:
-    """Read what was heard in a span of time.
+    """Read the activity of a time span from logs.
 
     Parameters
     ----------
     start, end : int
-        In nanoseconds of UTC; of what ends later, the beginning is there, too.
+        In nanoseconds of UTC; segments that end up to twelve hours later are included.
+    lose : callable
+        Called with a message for each log that is damaged or unfinished.
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Called with the share of the logs read so far, 0 to 1.
     others : sequence of (str, int, int, str, float), optional
-        Segments that go on and are in no log yet, as `SegmentCollector.heard` takes them.
+        Open segments that are in no log yet, as for `SegmentCollector.heard`.
     """
     collector = SegmentCollector()
     entries = [entry.path for entry in logs.between(start, end + _LATE) if entry.node == node]
@@ -400,15 +389,15 @@ def _add_classes(collector: SegmentCollector, source: str, channels: Sequence[De
 
 
 def nodes_of(logs: HomeLogs) -> list[str]:
-    """List the names of the recorders of some logs."""
+    """List the recorder names of logs."""
     entries: Sequence[str] = [entry.node for entry in logs.entries if not entry.layer]
     return sorted(set(entries))
 
 
 def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
-    """Return when the logs of a recorder begin and end, in nanoseconds of UTC.
+    """Return the start and end of a recorder's logs, in nanoseconds of UTC.
 
-    Raise `LogError` if none of them has a message that can be read.
+    Raise `LogError` if no log has a readable message.
     """
     own = [entry.path for entry in logs.entries if entry.node == node and not entry.layer]
     first, last = _first_span(own), _first_span(reversed(own))

@@ -26,8 +26,8 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import private_folder, replaced_file
 
 MOST = 1000
-UNREAD = "?"  # who is meant by a line that cannot be read, in the place of the name of a target
-_UNREAD_LONGEST = 24 * 3600 * NANOSECONDS  # that a notification waits for such a line to be mended
+UNREAD = "?"  # stands for the target of an unreadable line, in place of a target name
+_UNREAD_LONGEST = 24 * 3600 * NANOSECONDS  # how long notifications wait for a fix of such a line
 _SUFFIX = ".json"
 _LONGEST = 1 << 16  # bytes of a notification
 _DAMAGED = (ValueError, TypeError, KeyError, RecursionError, HearthlogError)
@@ -35,24 +35,24 @@ _DAMAGED = (ValueError, TypeError, KeyError, RecursionError, HearthlogError)
 
 @dataclass
 class Waiting:
-    """A notification, and who was told of it."""
+    """A queued notification, and the names of targets that have received it."""
 
     notification: Notification
     told: set[str] = field(default_factory=set)
 
 
 class Outbox:
-    """Keeps notifications until each target was told; other threads may look into it.
+    """Persistent queue of notifications until each target has received them; thread-safe.
 
     Parameters
     ----------
     most : int, optional
-        Rings, at most: beyond them the oldest are dropped.
+        Most notifications kept; beyond that the oldest are dropped.
 
     Raises
     ------
     OSError
-        If the folder cannot be made or read.
+        If the folder cannot be created or read.
     """
 
     def __init__(
@@ -67,25 +67,25 @@ class Outbox:
         private_folder(folder)
         for path in sorted(folder.glob(f"*{_SUFFIX}")):
             self._load(path)
-        self._early = frozenset(self._waiting)  # what was there may be evaluated once more
+        self._early = frozenset(self._waiting)  # these may be evaluated again after a restart
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def set_targets(self, targets: Iterable[str], now: int) -> None:
-        """Name those who are to be told from now on; what waits for nobody else is removed.
+        """Set the names of the targets; notifications that every target has are removed.
 
         Parameters
         ----------
         targets : iterable of str
-            With `UNREAD` notifications wait for a day, and are there for a target that comes.
+            If `UNREAD` is among them, notifications are kept for a day for a target added later.
         """
         with self._lock:
             self._targets = frozenset(targets)
             self._remove_done(now)
 
     def replace_targets(self, former: Mapping[str, str]) -> None:
-        """Take targets for those whose place they have now: they know what those were told."""
+        """Copy the delivery state of replaced targets to the new targets (new name to former)."""
         with self._lock:
             for waiting in self._waiting.values():
                 told = {now for now, before in former.items() if before in waiting.told}
@@ -103,7 +103,7 @@ class Outbox:
         return not missing or (is_old and missing == {UNREAD})
 
     def put(self, notifications: Iterable[Notification]) -> None:
-        """Keep notifications, unless they are known; they are on the disk on return."""
+        """Queue notifications that are not queued yet; they are on disk on return."""
         with self._lock:
             self._remove_done(time.time_ns())
             for notification in notifications:
@@ -113,7 +113,7 @@ class Outbox:
             self._drop_oldest()
 
     def waiting_for(self, target: str, now: int) -> list[Notification]:
-        """Return the notifications of which a target is to be told now, the oldest first."""
+        """Return the notifications due for a target, oldest first."""
         with self._lock:
             notifications = [
                 each.notification for each in self._waiting.values() if target not in each.told
@@ -124,7 +124,7 @@ class Outbox:
         )
 
     def note_told(self, target: str, notification: Notification) -> None:
-        """Note that a target was told of a notification, which is removed when all of them were."""
+        """Record a delivery; a notification that all targets have is removed."""
         with self._lock:
             waiting = self._waiting.get(notification.id)
             if waiting is None:
@@ -136,7 +136,7 @@ class Outbox:
                 self._write(waiting)
 
     def forget_after(self, time: int) -> None:
-        """Forget the notifications of a time to come, which rang while the clock was ahead."""
+        """Drop notifications later than a time: they were created while the clock was ahead."""
         with self._lock:
             for name in [n for n, each in self._waiting.items() if each.notification.time > time]:
                 self._remove(name)
@@ -200,27 +200,28 @@ def _waiting(content: Any) -> Waiting:
 
 _LIMIT = 1 << 16  # bytes of the file
 _HOST = re.compile(r"localhost|\[[0-9a-f:.]+\]|[\w-]+(\.[\w-]+)+", re.ASCII | re.IGNORECASE)
-_FORM = "%(thread)d %(message)s"  # other targets are told at the same time
+_FORM = "%(thread)d %(message)s"  # other threads deliver at the same time
 _CODE = re.compile(r"\berror=(\d{3})\b")
 
 
 class Target(Protocol):
-    """Somebody who is told."""
+    """Recipient of notifications."""
 
     @property
     def name(self) -> str:
-        """What names the target from one start to the next, and gives nothing away."""
+        """Identifier that is stable across restarts and reveals no secret."""
 
     @property
     def place(self) -> str:
-        """What people call the target; it gives nothing away either."""
+        """Human-readable name without secrets, for messages."""
 
     def deliver(self, title: str, text: str) -> str:
-        """Tell; return why it could not be told, or an empty text.
+        """Deliver a notification; return the reason of a failure, or an empty text.
 
         Parameters
         ----------
         title, text : str
+            Title and body of the notification.
         """
 
 
@@ -233,7 +234,7 @@ class AppriseTarget:
         self.place = f"line {line}, {_scheme_and_host(plugin, address)}"
 
     def deliver(self, title: str, text: str) -> str:
-        """Tell, within the seconds that the address allows; return why it could not be told."""
+        """Deliver within the timeout of the address; return the reason of a failure."""
         import apprise  # noqa: PLC0415  takes half a second, and few need it
 
         with apprise.LogCapture(level=logging.WARNING, fmt=_FORM) as said:
@@ -248,15 +249,15 @@ class AppriseTarget:
 
 def _scheme_and_host(plugin: Any, address: str) -> str:
     scheme, host = address.partition("://")[0], plugin.host or ""
-    # Many services have a token in the place of the host, or a topic, in which there is no dot.
+    # Many services have a token or a topic in place of the host; neither has a dot.
     is_host = "host" in (plugin.template_tokens or {}) and _HOST.fullmatch(host)
-    # In a password that is not escaped, what follows an @ or precedes a / is taken for a host.
+    # In an unescaped password, the text after an @ or before a / is parsed as the host.
     is_sure = "@" not in address or (address.count("@") == 1 and f"@{host}" in address)
     return f"{scheme}://{host}" if is_host and is_sure else scheme
 
 
 def _reason(said: str) -> str:
-    """Say what is known of a failure, without what Apprise says: it has topics and paths in it."""
+    """Summarize a failure without Apprise's own words, which contain topics and paths."""
     code = _CODE.search(said)
     if code:
         return f"error {code[1]}"
@@ -265,14 +266,16 @@ def _reason(said: str) -> str:
 
 
 class Addresses(NamedTuple):
-    """Addresses of a file, and its problems.
+    """Result of reading a file of addresses.
 
     Attributes
     ----------
     problems : list of str
-        Why somebody who was meant cannot be told, a line each, without any address.
+        One line for each target that cannot be used, without its address.
     names : list of str
-        What names the target of each line, whether it can be read or not.
+        Identifier of the target of each line, readable or not.
+    lacks_package : bool
+        Whether Apprise, or a package that it needs, is not installed.
     """
 
     targets: list[AppriseTarget]
@@ -282,10 +285,10 @@ class Addresses(NamedTuple):
 
 
 def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
-    """Read a file of addresses, one a line; `#` begins a line that is none.
+    """Read a file of addresses, one per line; `#` begins a comment line.
 
-    Raise `BridgeError` if the file cannot be read, a line is no address that Apprise knows, or
-    none is there.
+    Raise `BridgeError` if the file cannot be read, has a line that Apprise does not accept, or has
+    no address.
     """
     found = find_targets(file, say)
     if found.problems:
@@ -294,10 +297,10 @@ def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
 
 
 def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
-    """Read a file of addresses as `read_targets` does, as far as it can be read."""
+    """Read a file of addresses like `read_targets`, collecting problems instead of raising."""
     file = secret_path(file)
     try:
-        importlib.invalidate_caches()  # it may have been installed since the last time
+        importlib.invalidate_caches()  # Apprise may have been installed since the last call
         import apprise  # noqa: PLC0415
 
         text = _text(read_whole(file, "file of addresses", _LIMIT, BridgeError))
@@ -308,7 +311,7 @@ def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
         return Addresses([], [problem], [], lacks_package=True)
     if line := exposed_secret(file):
         say(line)
-    # Nothing is loaded from the disk, and nothing written there.
+    # Keep Apprise from loading plugins from disk and from writing to disk.
     asset = apprise.AppriseAsset(
         plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False
     )
@@ -332,7 +335,7 @@ def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
 
 
 def replaced_names(before: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Return which lines of a file of addresses were edited: the name of each now, and before."""
+    """Return the edited lines of a file of addresses, as new name to former name."""
     matcher = SequenceMatcher(None, before, names, autojunk=False)
     edited = [
         pair
@@ -348,17 +351,17 @@ def _name(address: str) -> str:
 
 
 def _plugin(address: str, asset: Any) -> Any:
-    """Return an address as Apprise reads it; None if it cannot."""
+    """Parse an address with Apprise; None if Apprise does not accept the address."""
     import apprise  # noqa: PLC0415
 
     try:
         return apprise.Apprise.instantiate(address, asset=asset, suppress_exceptions=True)
-    except Exception:  # noqa: BLE001  hundreds of services, each with its own
+    except Exception:  # noqa: BLE001  hundreds of services, each with its own errors
         return None
 
 
 def _text(data: bytes) -> str:
-    """Decode a file as editors write it: UTF-8, or what begins with a mark."""
+    """Decode text as editors write it: UTF-8 with or without a BOM, or UTF-16 with one."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", "replace")
     return data.decode("utf-8-sig", "replace")
@@ -370,12 +373,12 @@ _LATE = 5 * 60 * NANOSECONDS
 
 
 class Delivery:
-    """Tells each target of the notifications that wait for it; none of them waits for another.
+    """Delivers queued notifications, with one thread per target.
 
     Parameters
     ----------
     first_pause, longest_pause : float, optional
-        Seconds after the first failure, and at most; each pause is twice the one before.
+        Seconds to wait after the first failure, doubled after each further one, up to the longest.
     """
 
     def __init__(  # noqa: PLR0913
@@ -398,7 +401,7 @@ class Delivery:
         self.set_targets(targets)
 
     def set_targets(self, targets: Sequence[Target]) -> None:
-        """Tell these from now on; who was told before goes on as he was."""
+        """Replace the targets; threads of targets that stay are not interrupted."""
         names = {target.name for target in targets}
         for name in self._threads.keys() - names:
             self._threads.pop(name)[1].set()
@@ -412,7 +415,7 @@ class Delivery:
                 thread.start()
 
     def close(self) -> None:
-        """End within seconds, whatever a target does; the rest waits for the next start."""
+        """Stop within seconds, whatever a target does; the rest is delivered after a restart."""
         until = time.monotonic() + _CLOSE_SECONDS
         for _, stop in self._threads.values():
             stop.set()
@@ -431,7 +434,7 @@ class Delivery:
                 pause = min(2 * pause, longest)
 
     def _tell(self, target: Target, stop: Flag) -> tuple[int, bool]:
-        """Tell a target of all that waits for it; return of how much, and whether it failed."""
+        """Deliver all due notifications to a target; return their number and whether one failed."""
         told = 0
         for notification in self._outbox.waiting_for(target.name, time.time_ns()):
             if stop.is_set():
@@ -440,7 +443,7 @@ class Delivery:
                 reason = target.deliver(
                     f"{self._node}: {notification.rule}", message(notification, self._zone)
                 )
-            except Exception as error:  # noqa: BLE001  hundreds of services, each with its own
+            except Exception as error:  # noqa: BLE001  many services, each with its own errors
                 reason = type(error).__name__
             if reason:
                 self._say(
@@ -454,12 +457,12 @@ class Delivery:
 
 
 def message(notification: Notification, zone: tzinfo, now: int | None = None) -> str:
-    """Write the text of a notification: its time, what was the case, and whether it comes late.
+    """Format a notification: local time, text, and a remark if delivered late.
 
     Parameters
     ----------
     now : int, optional
-        In nanoseconds of UTC; by default it is now.
+        In nanoseconds of UTC; the current time by default.
     """
     late = (time.time_ns() if now is None else now) - notification.due > _LATE
     moment = f"{local_time(notification.time, zone):%Y-%m-%d %H:%M}"

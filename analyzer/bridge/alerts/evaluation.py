@@ -1,4 +1,4 @@
-"""Evaluation of rules on the activity of a home: conditions, and notifications of them."""
+"""Evaluation of alert rules on the activity of a home: conditions and notifications."""
 
 from collections.abc import Sequence
 from datetime import UTC, date, datetime, timedelta, tzinfo
@@ -48,14 +48,14 @@ from hearthlog.schemas.frames import NANOSECONDS
 
 
 class SoundEvents(NamedTuple):
-    """Events of the segments that a rule counts: those with short pauses between them.
+    """Events of a rule: segments joined over short pauses; times in nanoseconds of UTC.
 
     Attributes
     ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
     counted : np.ndarray [shape=(n,)], int64
-        When each had lasted as long as it must: from then on it counts.
+        When each event reached the minimum length of the rule, and so counts.
+    heard : Spans
+        Joined segments, including those of too short events.
     """
 
     starts: Int64
@@ -64,7 +64,7 @@ class SoundEvents(NamedTuple):
     heard: Spans
 
     def heard_counted(self) -> Spans:
-        """Return what was heard of each event from when on it counts."""
+        """Return the heard spans of each event from the time at which the event counts."""
         if self.counted is self.starts:
             return self.heard
         parts = [
@@ -78,13 +78,10 @@ class SoundEvents(NamedTuple):
 
 
 def events_of_rule(rule: SoundRule, heard: HomeActivity) -> SoundEvents:
-    """Find the events that a rule counts.
+    """Find the events that a rule counts, without too short ones.
 
-    Returns
-    -------
-    SoundEvents
-        Without those that are too short. Segments of all microphones that are at most ten seconds
-        apart are one event, unless the rule says otherwise.
+    Segments of all microphones that are at most ten seconds apart form one event, unless the rule
+    sets a microphone or pause.
     """
     sounds = heard.of(rule.label)
     rows = sounds.confidences >= np.float32(rule.confidence)
@@ -102,7 +99,7 @@ def events_of_rule(rule: SoundRule, heard: HomeActivity) -> SoundEvents:
 
 
 def _times_heard(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int64]:
-    """Return when each group of spans has so much in it, and which ones ever have."""
+    """Return when each group of spans reaches a total length, and the groups that reach it."""
     lengths = spans.ends - spans.starts
     sums = np.cumsum(lengths)
     before = sums[firsts] - lengths[firsts]
@@ -113,14 +110,14 @@ def _times_heard(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int64]
 
 
 def more_than_conditions(rule: MoreThan, heard: HomeActivity, until: int) -> list[Condition]:
-    """Find when there was more of a class in the window before than a rule allows.
+    """Find when a class exceeded the limit of a rule in the preceding window.
 
     Parameters
     ----------
     heard : HomeActivity
-        From the length of the window before the first time that matters.
+        Must begin one window before the first evaluated time.
     until : int
-        Time up to which it is known, in nanoseconds of UTC.
+        End of the recorded activity, in nanoseconds of UTC.
     """
     events = events_of_rule(rule, heard)
     spans = _too_many(rule, events) if rule.minutes is None else _too_long(rule, events, until)
@@ -130,7 +127,7 @@ def more_than_conditions(rule: MoreThan, heard: HomeActivity, until: int) -> lis
 
 
 def more_than_text(rule: MoreThan, heard: HomeActivity, time: int) -> str:
-    """Say how much there was in the window that ends with a time."""
+    """Format the amount in the window that ends at a time."""
     window = duration_words(rule.window)
     if rule.minutes is not None:
         return f"{rule.words}: more than {rule.minutes:g} min in the last {window}"
@@ -141,7 +138,7 @@ def more_than_text(rule: MoreThan, heard: HomeActivity, time: int) -> str:
 
 
 def _too_many(rule: MoreThan, events: SoundEvents) -> Spans:
-    """Each event counts for the length of the window."""
+    """Find when the window has too many events; each event counts for one window length."""
     assert rule.count is not None
     times = np.concatenate([events.counted, events.counted + rule.window])
     steps = np.repeat([1, -1], len(events.counted))
@@ -152,7 +149,10 @@ def _too_many(rule: MoreThan, events: SoundEvents) -> Spans:
 
 
 def _too_long(rule: MoreThan, events: SoundEvents, until: int) -> Spans:
-    """Measure the window at every time at which the measure may begin to grow or to shrink."""
+    """Find when the window has too many minutes.
+
+    The total is piecewise linear, so it is measured at every time at which its slope may change.
+    """
     assert rule.minutes is not None
     most = round(rule.minutes * MINUTE)
     spans, lump = events.heard_counted(), round(rule.least_seconds * NANOSECONDS)
@@ -175,17 +175,17 @@ def _too_long(rule: MoreThan, events: SoundEvents, until: int) -> Spans:
 
 
 def _sum_to(spans: Spans, times: Int64) -> Int64:
-    """Measure spans up to each of some ascending times."""
+    """Return the total length of spans up to each of several ascending times."""
     first = min(int(times[0]), int(spans.starts[0]) if len(spans.starts) else 0)
     return np.cumsum(lengths(spans, np.concatenate([[first], times])))
 
 
 def longer_than_conditions(rule: LongerThan, heard: HomeActivity) -> list[Condition]:
-    """Find when a class had gone on for too long, until its pause is longer than one may be."""
+    """Find when a class lasted too long, until a pause ends the event."""
     events = events_of_rule(rule, heard)
     limits = events.starts + rule.longer_than
     rows = np.flatnonzero(limits < events.ends)
-    # In a pause it is not known whether the event goes on.
+    # During a pause it is unknown whether the event continues.
     spans = np.searchsorted(events.heard.ends, limits[rows], side="right")
     times = np.maximum(events.heard.starts[spans], limits[rows])
     over = events.ends[rows] + rule.pause + 1
@@ -193,25 +193,13 @@ def longer_than_conditions(rule: LongerThan, heard: HomeActivity) -> list[Condit
 
 
 def longer_than_start(rule: LongerThan, heard: HomeActivity, time: int) -> int:
-    """Return when the sound began that goes on at a time, in nanoseconds of UTC.
-
-    Parameters
-    ----------
-    time : int
-        In nanoseconds of UTC, at which one does.
-    """
+    """Return the start of the event that is ongoing at a time, both in nanoseconds of UTC."""
     starts = events_of_rule(rule, heard).starts
     return int(starts[np.searchsorted(starts, time, side="right") - 1])
 
 
 def longer_than_text(rule: LongerThan, since: str) -> str:
-    """Say what went on for too long.
-
-    Parameters
-    ----------
-    since : str
-        Time of day.
-    """
+    """Format the text of a sound that lasted too long; `since` is its start as a time of day."""
     return f"{rule.words} for longer than {duration_words(rule.longer_than)}, since {since}"
 
 
@@ -223,10 +211,10 @@ def silent_conditions(
     Parameters
     ----------
     start, end : int
-        In nanoseconds of UTC; where nothing was written in as long before the start, nothing was
-        from ever on.
+        In nanoseconds of UTC. A recorder that wrote nothing within `silent_for` before the start
+        counts as silent at the start.
     since : int
-        From when on the rule is in force, in nanoseconds of UTC: earlier silence does not count.
+        When the rule came into force, in nanoseconds of UTC: earlier silence does not count.
     """
     starts, ends = heard.written
     before = start - 1 - rule.silent_for
@@ -240,33 +228,33 @@ def silent_conditions(
 
 
 def silent_text(rule: RecorderSilent) -> str:
-    """Say that the recorder is silent."""
+    """Format the text of a silent recorder."""
     return f"Nothing from the recorder for {duration_words(rule.silent_for)}"
 
 
 def wall_times(day: date, minute: int, zone: tzinfo) -> tuple[int, int]:
-    """Return when a clock on the wall shows a minute of a day, the first and the last time.
+    """Return the first and last time at which local clocks show a minute of a day.
 
     Parameters
     ----------
     minute : int
-        0 to 1439.
+        Minute of the day, 0 to 1439.
 
     Returns
     -------
     first, last : int
-        In nanoseconds of UTC. They differ where the clock is set back past the minute; where it is
-        set forward past it, both are the moment of the change.
+        In nanoseconds of UTC. The two differ if the clock is set back past the minute; both are the
+        moment of the change if the clock is set forward past the minute.
     """
     shown = datetime(day.year, day.month, day.day, *divmod(minute, 60), tzinfo=zone)
     first, last = (int(shown.replace(fold=fold).timestamp()) for fold in (0, 1))
-    if first > last:  # the offset before the change gives a time after it, and the other way round
+    if first > last:  # skipped minute: the old offset gives the later time, the new the earlier
         first = last = _change_between(last, first, zone)
     return first * NANOSECONDS, last * NANOSECONDS
 
 
 def _change_between(before: int, after: int, zone: tzinfo) -> int:
-    """Return the second at which the clock is changed between two times, in seconds of UTC."""
+    """Return the time of the clock change between two times, all in seconds of UTC."""
     offset = datetime.fromtimestamp(before, UTC).astimezone(zone).utcoffset()
     while after - before > 1:
         middle = (before + after) // 2
@@ -278,22 +266,22 @@ def _change_between(before: int, after: int, zone: tzinfo) -> int:
 
 
 def days_around(start: int, end: int, zone: tzinfo) -> list[date]:
-    """List the days of the home from the one before a time to the one of a later time."""
+    """List the local days from the day before `start` to the day of `end`."""
     first = local_time(start, zone).date() - timedelta(days=1)
     last = local_time(end, zone).date()
     return [first + timedelta(days=number) for number in range((last - first).days + 1)]
 
 
 def end_of_quiet(hours: list[QuietHours], time: int, zone: tzinfo) -> int:
-    """Return when quiet hours are over; the time itself outside of them.
+    """Return the end of the quiet hours at a time; the time itself outside of quiet hours.
 
     Returns
     -------
     int
-        In nanoseconds of UTC; where all of the day is quiet, no later than a day from the time.
+        In nanoseconds of UTC; at most a day after the time, even if the complete day is quiet.
     """
     until = time
-    for _ in hours:  # one may begin where another ends
+    for _ in hours:  # adjoining quiet hours
         moment = local_time(until, zone)
         left = max(each.minutes_left(60 * moment.hour + moment.minute) for each in hours)
         if not left:
@@ -310,7 +298,7 @@ _MINUTE = 60 * NANOSECONDS
 def none_by_conditions(
     rule: NoneBy, heard: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
-    """Find the days on which nothing of a class was heard by a time, or too little to tell."""
+    """Find the days without a class by the time of a rule, or with too little coverage to tell."""
     windows = [
         (first, last)
         for day in days_around(start, end, zone)
@@ -334,7 +322,7 @@ def none_by_conditions(
 
 
 def _window(rule: NoneBy, day: date, zone: tzinfo) -> tuple[int, int]:
-    """Return the window that ends on a day: the longest one that the clock may mean."""
+    """Return the window that ends on a day; the longest one if a clock time occurs twice."""
     began = day if rule.since < rule.by else day - timedelta(days=1)
     return wall_times(began, rule.since, zone)[0], wall_times(day, rule.by, zone)[1]
 
@@ -355,12 +343,12 @@ def _clock(minute: int) -> str:
 def unlike_conditions(
     rule: UnlikeUsual, heard: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
-    """Find the days, or nights, that were outside of what the four weeks before them had.
+    """Find the days or nights outside the range of the four weeks before.
 
     Parameters
     ----------
     heard : HomeActivity
-        From 31 days before the start on.
+        Must begin 31 days before the start.
     """
     days = judged_days(rule, start, end, zone)
     if not days:
@@ -378,19 +366,13 @@ def unlike_conditions(
 
 
 def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tuple[date, int]]:
-    """List the days on which a rule is to be evaluated in a span of time, and when.
-
-    Returns
-    -------
-    list of (date, int)
-        The times are in nanoseconds of UTC.
-    """
+    """List the days on which a rule is evaluated in a time span, with times in ns of UTC."""
     times = [(day, wall_times(day, rule.at, zone)[1]) for day in days_around(start, end, zone)]
     return [(day, time) for day, time in times if start <= time < end]
 
 
 class _Figures:
-    """The figure that is compared, of each day that was heard for the most part."""
+    """Compared figures by day; None for days with too little coverage."""
 
     def __init__(self, rule: UnlikeUsual, heard: HomeActivity, zone: tzinfo) -> None:
         self._rule = rule
@@ -401,7 +383,7 @@ class _Figures:
         self._known: dict[date, Count | Duration | None] = {}
 
     def of(self, day: date) -> Count | Duration | None:
-        """Return the figure that is judged on a day."""
+        """Return the figure that is evaluated on a day."""
         if day not in self._known:
             self._known[day] = self._figure(*_part(self._rule, day, self._zone))
         return self._known[day]
@@ -441,12 +423,12 @@ def _unlike_text(rule: UnlikeUsual, day: date, own: Count | Duration, baseline: 
 def unusual_conditions(
     rule: UnusualDay, heard: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
-    """Find the days that were unlike the four weeks before them, each in the morning after it.
+    """Find the days unlike the four weeks before, each reported on the next morning.
 
     Parameters
     ----------
     heard : HomeActivity
-        From 34 days before the start on.
+        Must begin 34 days before the start.
     """
     mornings = judged_days(rule, start, end, zone)
     if not mornings:
@@ -464,7 +446,7 @@ def unusual_conditions(
 
 
 def home_sound(heard: HomeActivity) -> HomeSegments:
-    """Return what routines are learned from."""
+    """Return the segments and coverage from which routines are fitted."""
     coverage = heard.listened(ANY_SOUND, "")
     parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
     parts += [_labelled(name, own.starts, own.ends) for name, own in heard.sounds.items()]
@@ -496,18 +478,18 @@ def notifications(  # noqa: PLR0913, PLR0917
     zone: tzinfo,
     state: RuleState = NEW,
 ) -> tuple[list[Notification], RuleState]:
-    """Find the notifications of a rule in a span of time.
+    """Find the notifications of a rule in a time span, and the new state of the rule.
 
-    There is one when its condition begins, and no other while it lasts. Where it begins within
-    the cooldown of the one before, the notification comes at the cooldown's end, if the condition
-    still lasts then.
+    A condition gives one notification, at its start. If the condition starts within the cooldown of
+    the previous notification, the notification is delayed to the end of the cooldown, and omitted
+    if the condition has ended by then.
 
     Parameters
     ----------
     start, end : int
-        In nanoseconds of UTC: from the start on, before the end.
+        In nanoseconds of UTC, the end exclusive.
     state : RuleState, optional
-        What an evaluation up to the start has returned; by default there was none.
+        State returned by the evaluation up to the start.
     """
     found: list[Notification] = []
     last, has_rung = state.last, False
@@ -527,7 +509,7 @@ def notifications(  # noqa: PLR0913, PLR0917
 def _conditions(  # noqa: PLR0913, PLR0917
     rule: AlertRule, heard: HomeActivity, start: int, end: int, zone: tzinfo, since: int
 ) -> Sequence[Condition]:
-    """Find when what a rule looks for is the case; ascending, and apart from each other."""
+    """Find the conditions of a rule, in ascending order and disjoint."""
     if isinstance(rule, MoreThan):
         return more_than_conditions(rule, heard, end)
     if isinstance(rule, LongerThan):

@@ -1,4 +1,4 @@
-"""Activity of a home up to now, with segments that are still open."""
+"""Activity of a home up to now, including segments that are still open."""
 
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
@@ -16,15 +16,15 @@ from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
 
-_UNDECIDED = 5 * NANOSECONDS  # of the newest labels: a segment may still begin among them
-_SETTLED = 5 * NANOSECONDS  # of a run, before it is taken for one
-_SURE = 30 * NANOSECONDS  # after which most labels decide, few as they may be
-_FEWEST, _MOST = 5, 0.6  # labels of a run, and the share of one class
+_UNDECIDED = 5 * NANOSECONDS  # span of the newest labels, in which a segment may still begin
+_SETTLED = 5 * NANOSECONDS  # shortest open segment
+_SURE = 30 * NANOSECONDS  # length from which the most frequent label decides, whatever its share
+_FEWEST, _MOST = 5, 0.6  # fewest labels of an open segment, and least share of its class
 _REMEMBERED = 100
 
 
 class LiveLabel(NamedTuple):
-    """A label: when it was known, in nanoseconds of UTC, the class and how sure it is."""
+    """A live label; `time` is when it became available, in nanoseconds of UTC."""
 
     time: int
     label: str
@@ -32,7 +32,7 @@ class LiveLabel(NamedTuple):
 
 
 class SegmentEstimate(NamedTuple):
-    """A segment that goes on: of one class, as far as it is decided, in nanoseconds of UTC."""
+    """An open segment up to its decided part, in nanoseconds of UTC."""
 
     start: int
     end: int
@@ -41,17 +41,17 @@ class SegmentEstimate(NamedTuple):
 
 
 class PendingSegment:
-    """The time of a microphone after its last segment: one segment, which is not yet written.
+    """The open segment of a microphone, after its last written segment.
 
-    A segment is written when another class follows, so that in what is after the last one there
-    is one class, whatever single labels say. Most of them say which.
+    A segment is written when another class follows, so the time after the last written segment has
+    a single class, whatever individual labels are. The most frequent label gives the class.
 
     Attributes
     ----------
     start : int
-        End of the last segment, or of a gap after it, in nanoseconds of UTC; 0 before the first.
+        End of the last segment, or of a later gap, in nanoseconds of UTC; 0 before the first.
     last : int
-        Time of the newest label; 0 before the first.
+        Time of the newest label, in nanoseconds of UTC; 0 before the first.
     """
 
     def __init__(self) -> None:
@@ -61,14 +61,14 @@ class PendingSegment:
         self._sums: Counter[str] = Counter()  # of confidences, in millionths
 
     def add(self, label: LiveLabel) -> None:
-        """Add a label; older ones than the newest are left out."""
+        """Add a label; labels not newer than the last are ignored."""
         if label.time > self.last:
             self.last = label.time
             self._recent.append(label)
             self._count(label)
 
     def begin(self, time: int) -> None:
-        """Let the segment begin at a time, in nanoseconds of UTC, unless it began later."""
+        """Move the start of the segment forward to a time, in nanoseconds of UTC."""
         if time > self.start:
             self.start = time
             self._counts.clear()
@@ -77,7 +77,7 @@ class PendingSegment:
                 self._count(label)
 
     def estimate(self) -> SegmentEstimate | None:
-        """Return the segment so far; None while its class is not known."""
+        """Return the segment so far; None while its class is undecided."""
         length = self.last - _UNDECIDED - self.start
         number = sum(self._counts.values())
         if length < _SETTLED or number < _FEWEST or not self.start:
@@ -99,8 +99,8 @@ FIELDS = {
     message_types.GAP: ("header.stamp", "duration"),
     message_types.DIAGNOSTICS: (),
 }
-_GONE = 600_000_000_000  # ns without a label of a scenario, which another configuration has not
-_CUT = 1_000_000_000  # ns of a run that no segment has, where a gap follows
+_GONE = 600_000_000_000  # ns without labels after which a scenario counts as removed
+_CUT = 1_000_000_000  # ns: longer open segments are kept when a gap follows
 
 
 def is_of_alerts(topic: str) -> bool:
@@ -114,14 +114,14 @@ def is_of_alerts(topic: str) -> bool:
 
 
 class LiveActivity:
-    """What the microphones of one recorder have heard up to now.
+    """Activity of one recorder's microphones up to now.
 
     Parameters
     ----------
     start : int
-        From when on it is known, in nanoseconds of UTC.
+        Start of the activity, in nanoseconds of UTC.
     patience : int
-        How late what a recorder writes may be read, in nanoseconds.
+        Longest delay between writing and reading of a message, in nanoseconds.
     """
 
     def __init__(self, start: int, patience: int) -> None:
@@ -157,7 +157,7 @@ class LiveActivity:
             run.begin(max(self._start, self._collector.recorder_began or 0))
 
     def known_until(self, now: int) -> int:
-        """Return up to when everything is known that can have been heard."""
+        """Return the time up to which the activity is complete, in nanoseconds of UTC."""
         until = now
         for source, pending in self._pending.items():
             run = pending.estimate()
@@ -171,28 +171,28 @@ class LiveActivity:
         return until if self._pending else now - self._patience
 
     def heard(self) -> HomeActivity:
-        """Return what was heard, with what goes on."""
+        """Return the activity, with open segments."""
         return self._collector.heard(self.open_segments())
 
     @property
     def classes(self) -> Mapping[str, Collection[str]]:
-        """By source, the classes that its model knows."""
+        """Classes of the model by labelling source."""
         return self._collector.classes
 
     def open_segments(self) -> list[tuple[str, int, int, str, float]]:
-        """Return what goes on and has no segment yet, as `SegmentCollector.heard` takes it."""
+        """Return the open segments, as input of `SegmentCollector.heard`."""
         runs = ((name, each.estimate()) for name, each in self._pending.items())
         return [(name, *run) for name, run in runs if run is not None]
 
     def forget_before(self, time: int) -> None:
-        """Forget what was over before a time, in nanoseconds of UTC."""
+        """Drop the events that ended before a time, in nanoseconds of UTC."""
         self._collector.forget_before(time, LONGEST_PAUSE)
 
     def _segment(self, source: str) -> PendingSegment:
         return self._pending.setdefault(source, PendingSegment())
 
     def _add_gap(self, microphone: str, start: int, end: int) -> None:
-        """Let all that listen by a microphone begin anew after a gap."""
+        """Restart the open segments of all sources of a microphone after a gap."""
         self._segment(microphone)
         for source, run in self._pending.items():
             if source_microphone(source) == microphone:
@@ -200,7 +200,7 @@ class LiveActivity:
                 run.begin(end)
 
     def _cut(self, source: str, start: int) -> None:
-        """Keep what was heard before a gap although its segment was never written."""
+        """Add the open segment before a gap as a segment: the recorder never writes it."""
         run = self._segment(source).estimate()
         if run is not None and start - run.start > _CUT:
             end = min(run.end, start)

@@ -1,4 +1,4 @@
-"""The output of alerts: evaluates rules live, and keeps their progress between starts."""
+"""Alerts output: live evaluation of rules, with progress kept across restarts."""
 
 import json
 import math
@@ -62,12 +62,12 @@ _DAMAGED = (ValueError, TypeError, KeyError, AttributeError, RecursionError, Hea
 
 @dataclass
 class RuleProgress:
-    """How far a rule is evaluated.
+    """Evaluation progress of a rule.
 
     Attributes
     ----------
     until : int
-        Log time, in nanoseconds of UTC; 0 for one that is new.
+        Log time, in nanoseconds of UTC; 0 for a new rule.
     """
 
     until: int = 0
@@ -75,14 +75,14 @@ class RuleProgress:
 
 
 class RuleProgressStore:
-    """Keeps how far each rule is evaluated; one that was changed begins anew."""
+    """Persistent evaluation progress of each rule; a changed rule starts over."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self._path = path
         self._say = say
 
     def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleProgress]:
-        """Return how far rules are evaluated, by name."""
+        """Return the progress of rules by name."""
         known = {}
         try:
             if self._path.exists():
@@ -93,7 +93,7 @@ class RuleProgressStore:
         return {rule.name: known.get(rule.fingerprint, RuleProgress()) for rule in rules}
 
     def save(self, rules: Sequence[AlertRule], progress: dict[str, RuleProgress]) -> None:
-        """Keep how far rules are evaluated; it is on the disk on return."""
+        """Save the progress of rules; it is on disk on return."""
         content = {
             rule.fingerprint: {"until": own.until, **own.state._asdict()}
             for rule in rules
@@ -107,7 +107,7 @@ class RuleProgressStore:
 
 
 class KnownLines:
-    """Remembers the lines of the file of addresses, by the names of their targets."""
+    """Persistent target names of the lines in the file of addresses."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self._path = path
@@ -121,7 +121,7 @@ class KnownLines:
             say(f"{path}: cannot be read; whoever is on an edited line may be told twice")
 
     def keep(self, names: Sequence[str]) -> None:
-        """Remember the lines that there are now."""
+        """Save the current lines."""
         if names == self.names:
             return
         self.names = list(names)
@@ -137,19 +137,19 @@ def _progress(content: dict[str, int]) -> RuleProgress:
     return RuleProgress(int(content["until"]), state)
 
 
-_OLDEST = DAY  # what rang longer ago is not told any more
+_OLDEST = DAY  # notifications older than this are not delivered
 _EVERY = SECOND  # of the log
 _SAVE_EVERY = 5 * MINUTE
-AHEAD = 5 * SECOND  # that make a clock one that was set back
+AHEAD = 5 * SECOND  # jump from which the clock counts as set back
 
 
 class RuleWatch:
-    """Evaluates rules, keeps what rings, and remembers how far it is.
+    """Evaluates rules, queues their notifications, and saves the progress.
 
     Attributes
     ----------
     start : int
-        From when on what was heard has to be known, in nanoseconds of UTC.
+        Start of the activity that the rules need, in nanoseconds of UTC.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -172,7 +172,7 @@ class RuleWatch:
         self.start = self.needed_from(now)
 
     def set_right(self, now: int) -> None:
-        """Let rules begin anew that are evaluated up to a time to come, or up to long ago."""
+        """Restart rules whose progress is in the future, or more than a day old."""
         is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
         self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
         if is_ahead:
@@ -181,7 +181,7 @@ class RuleWatch:
             self.save(now)
 
     def needed_from(self, now: int) -> int:
-        """Return from when on what was heard has to be known, in nanoseconds of UTC."""
+        """Return the start of the activity that the rules need, in nanoseconds of UTC."""
         return min(
             (self._progress[rule.name].until - live_history(rule) for rule in self._rules),
             default=now,
@@ -194,12 +194,16 @@ class RuleWatch:
         until: int,
         now: int,
     ) -> list[Notification]:
-        """Evaluate the rules up to a time; what rings is on the disk on return.
+        """Evaluate the rules up to a time; their notifications are on disk on return.
 
         Parameters
         ----------
+        heard : callable
+            Returns the live activity; called only if a rule needs it.
+        weeks : callable
+            Returns the activity between two times, read from the logs.
         until : int
-            In nanoseconds of UTC: up to then all is known.
+            Time up to which the activity is complete, in nanoseconds of UTC.
         """
         self.set_right(now)
         found: list[Notification] = []
@@ -224,7 +228,7 @@ class RuleWatch:
         return found
 
     def save(self, now: int) -> None:
-        """Remember how far the rules are evaluated."""
+        """Save the progress of the rules."""
         self._memory.save(self._rules, self._progress)
         self._saved = now
 
@@ -237,32 +241,32 @@ def _as_of(own: RuleProgress, now: int) -> RuleProgress:
     return own
 
 
-# Takes the name of a rule, a text and a time; returns whether somebody has taken them.
+# Takes the name of a rule, a text and a time; returns whether they were delivered.
 OnNotification = Callable[[str, str, int], bool]
-BROKER = "mqtt"  # in the place of the name of a target
+BROKER = "mqtt"  # in place of a target name
 _PATIENCE = 30 * NANOSECONDS
-_TO_COME = 60 * NANOSECONDS  # from now: what is later was written while a clock was ahead
+_TO_COME = 60 * NANOSECONDS  # from now: later messages were written while a clock was ahead
 _LOOK_SECONDS = 1.0
 _FORGET_SECONDS = 300.0
 _CLOSE_SECONDS = 2.0
 _LABELS = 10_000
 _LOOK_AT_FILE_SECONDS = 5.0
-_WAIT_SECONDS = 60.0  # for news, where there is no recorder
+_WAIT_SECONDS = 60.0  # for news, without a recorder
 
 
 class AlertsOutput:
-    """Evaluates rules in a thread of its own, and delivers their notifications.
+    """Evaluates rules in a separate thread, and delivers their notifications.
 
     Parameters
     ----------
     on_notification : callable, optional
         Called with rule, text and time (nanoseconds of UTC) of a notification, in the thread of
-        `update`; with the same one at each update until it returns that it was taken.
+        `update`; repeated at each update until it returns True.
 
     Raises
     ------
     BridgeError
-        If nobody would be told, or the folder of the state cannot be written.
+        If there is no recipient, or the state folder cannot be written.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -283,7 +287,7 @@ class AlertsOutput:
         self._on_notification = on_notification
         folder = state_folder / "alerts"
         self._has_problems = False
-        self._read_file, self._looked_at_file = object(), -math.inf  # and when, CLOCK_MONOTONIC
+        self._read_file, self._looked_at_file = object(), -math.inf  # the second: CLOCK_MONOTONIC
         try:
             self._outbox = Outbox(folder / "outbox", [BROKER, UNREAD], say)
         except OSError as error:
@@ -294,9 +298,9 @@ class AlertsOutput:
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
         self._heard = LiveActivity(self._watch.start, _PATIENCE)
         self._began = time.monotonic()
-        self._has_news = Flag()  # what is heard now is known
+        self._has_news = Flag()  # set by the first update
         self._labels: deque[tuple[str, LiveLabel, Sequence[str]]] = deque(maxlen=_LABELS)
-        self._told_now: tuple[Notification, str] | None = None  # of which the broker is told
+        self._told_now: tuple[Notification, str] | None = None  # being delivered to the broker
         self._stop = Flag()
         self._delivery = Delivery(self._outbox, [], home.node, home.zone, say)
         self._find_targets()
@@ -304,7 +308,7 @@ class AlertsOutput:
         self._thread.start()
 
     def update(self, news: News) -> None:
-        """Note what is heard now, and tell the broker of what rang."""
+        """Queue the current labels, and deliver notifications to the broker."""
         for microphone in news.state.every():
             if microphone.label:
                 label = LiveLabel(microphone.heard.time, microphone.label, microphone.confidence)
@@ -315,18 +319,18 @@ class AlertsOutput:
                 pass
 
     def close(self) -> None:
-        """End within seconds; what was not told waits for the next start."""
+        """Stop within seconds; undelivered notifications wait for the next start."""
         self._stop.set()
         self._thread.join(_CLOSE_SECONDS)
         self._delivery.close()
 
     def _tell_broker(self, on_notification: OnNotification) -> bool:
-        """Tell of one notification, the same one until it is taken; return whether it was."""
+        """Offer one notification to the broker, repeatedly; return whether it was taken."""
         if self._told_now is None:
             waiting = self._outbox.waiting_for(BROKER, time.time_ns())
             if not waiting:
                 return False
-            # Written once: minutes later it would say that it is late, and be another message.
+            # Formatted once: minutes later the text would say "late" and be a different message.
             self._told_now = waiting[0], message(waiting[0], self._followed.zone)
         notification, text = self._told_now
         is_taken = on_notification(notification.rule, text, notification.time)
@@ -345,10 +349,10 @@ class AlertsOutput:
         self._watch.save(time.time_ns())
 
     def _find_targets(self) -> None:
-        """Find out who is to be told, if the file of addresses is another one than before.
+        """Reread the file of addresses if it has changed.
 
-        Who cannot be read in it does not keep the others from being told; what rings waits for
-        the line to be mended.
+        An unreadable line does not stop delivery to the others; notifications for its target wait
+        until the line is fixed.
         """
         if time.monotonic() - self._looked_at_file < _LOOK_AT_FILE_SECONDS:
             return
@@ -374,9 +378,9 @@ class AlertsOutput:
         self._delivery.set_targets(targets)
 
     def _follow(self) -> None:
-        """Read what is written, and evaluate the rules whenever all of it has been read.
+        """Follow the log, and evaluate the rules whenever reading has caught up.
 
-        Ends when the clock is set back: what was read may be of a time to come.
+        Returns when the clock is set back: messages read so far may be from the future.
         """
         logs, looked, forgot = self._followed.folder, 0.0, time.monotonic()
         now = self._latest = time.time_ns()
@@ -440,14 +444,14 @@ class AlertsOutput:
         return now
 
     def _weeks(self, start: int, end: int) -> HomeActivity:
-        """Read weeks from the logs, once a day; what cannot be read was not heard.
+        """Read weeks from the logs, once a day; unreadable logs are skipped.
 
-        A night that is still quiet in the morning has no segment yet.
+        Open segments are added: a silence since the night may have no segment in the log yet.
         """
         home = self._followed
         try:
             logs = find_home_logs([home.folder])
-        except LogError:  # there is none yet
+        except LogError:  # no log yet
             return SegmentCollector().heard()
         open_segments = self._heard.open_segments()
         return read_activity(logs, home.node, start, end, lambda _: None, others=open_segments)
@@ -457,7 +461,7 @@ class AlertsOutput:
 
 
 def _state_of(file: Path) -> tuple[int, ...] | None:
-    """Return what changes whenever a file does; None if it cannot be looked at."""
+    """Return a fingerprint of the state of a file; None if `stat` fails."""
     with suppress(OSError):
         state = secret_path(file).stat()
         return state.st_mtime_ns, state.st_size, state.st_ino, state.st_mode, state.st_ctime_ns

@@ -1,4 +1,4 @@
-"""Checks of rules against the configuration and its models, for rules that cannot ring."""
+"""Checks of rules against the configuration and models: rules that can never ring."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ from hearthlog.schemas.errors import listed
 
 
 def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> str:
-    """Say that no model knows the class of a rule; empty if one does, or if nothing is known."""
+    """Report that no model has the class of a rule; empty if one has, or no classes are known."""
     if not isinstance(rule, SoundRule) or rule.label == ANY_SOUND:
         return ""
     own = [
@@ -46,7 +46,7 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
 
 
 def _of_network(label: str) -> str:
-    """Say what the names of the network of sounds have of a class; empty if they have it not."""
+    """Format a hint if the embedding network has a name for a class; empty otherwise."""
     name = next((each for each in audioset_names() if each.name == label), None)
     if name is None:
         return ""
@@ -58,12 +58,12 @@ def _of_network(label: str) -> str:
 def unknown_microphone(
     rule: AlertRule, microphones: Collection[str], *, recorded: bool = False
 ) -> str:
-    """Say that there is no microphone of the name that a rule has; empty if there is.
+    """Report that the microphone of a rule does not exist; empty if it does.
 
     Parameters
     ----------
     recorded : bool, optional
-        Whether these are the ones that logs have something of, not those that are configured.
+        Whether `microphones` come from the logs instead of the configuration.
     """
     name = rule.microphone if isinstance(rule, SoundRule) else ""
     if not microphones or name in {"", *microphones}:
@@ -77,7 +77,7 @@ def unknown_microphone(
 
 
 def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
-    """Say that nothing labels what the microphone of a rule hears; empty if something does."""
+    """Report that the microphone of a rule has no model; empty if it has one."""
     if not isinstance(rule, SoundRule) or rule.microphone not in microphones:
         return ""
     return (
@@ -86,18 +86,18 @@ def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
     )
 
 
-_JUDGED_AND_TODAY = 2  # days, besides those that a day is compared with
+_JUDGED_AND_TODAY = 2  # days, in addition to the baseline
 
 
 def rule_doubts(
     rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
 ) -> Iterator[str]:
-    """Say which rules cannot ring, whatever sounds, by what the recorder is configured to do.
+    """Report the rules that can never ring with the configuration of the recorder.
 
     Parameters
     ----------
     microphones : sequence of str
-        The names of those that are configured; without any nothing is known of them.
+        Names of configured microphones; empty to skip the checks of names.
     """
     for rule in rules:
         lines = unknown_microphone(rule, microphones), impossible_amount(rule)
@@ -105,12 +105,12 @@ def rule_doubts(
 
 
 def impossible_amount(rule: AlertRule) -> str:
-    """Say that a window cannot hold what a rule asks for; empty if it can."""
+    """Report that the limit of a rule cannot be exceeded in its window; empty if it can."""
     if not isinstance(rule, MoreThan):
         return ""
     if rule.minutes is not None and rule.minutes * MINUTE >= rule.window:
         amount = f"{rule.minutes:g} minutes"
-    # Events have more than a pause between them, and the first one may end as the window begins.
+    # Events are more than a pause apart, and the first one may end as the window begins.
     elif rule.count is not None and rule.count > rule.window // pause_of(rule) + 1:
         amount = f"{rule.count} events"
     else:
@@ -122,7 +122,7 @@ def impossible_amount(rule: AlertRule) -> str:
 
 
 def unkept_days(rule: AlertRule, settings: Settings) -> str:
-    """Say that logs are deleted before there are enough days to compare with; empty if not."""
+    """Report that logs are deleted before a baseline has enough days; empty if not."""
     if isinstance(rule, UnlikeUsual):
         fewest = FEWEST_USUAL
     elif isinstance(rule, UnusualDay):
@@ -141,7 +141,7 @@ def unkept_days(rule: AlertRule, settings: Settings) -> str:
 def unheard_classes(
     rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
 ) -> Iterator[str]:
-    """Say which rules have a class that no model knows, or a microphone without a model."""
+    """Report rules with a class that no model has, or with a microphone without a model."""
     models = {
         each.name: (each.model or settings.model or NO_MODEL, settings.scenarios_of(each))
         for each in settings.microphone
@@ -166,12 +166,12 @@ def _classes_of(path: Path, network: str) -> set[str]:
     model = starter_for(Path(GENERAL) if is_none_yet else path, network)
     try:
         return set(map(class_name, load_model(model).classes))
-    except ModelError:  # which is said where models are checked
+    except ModelError:  # reported by the check of models
         return set()
 
 
 def _beside(path: Path) -> list[Path]:
-    """Return the models of the same folder, any of which may be promoted."""
+    """Return the models in the folder of a model, any of which may be promoted."""
     folder = path.parent if path.suffix == SUFFIX else DEFAULT_FOLDER
     try:
         entries = list_models(folder)

@@ -1,4 +1,4 @@
-"""Rules of alerts and their durations, with the notifications that rules give."""
+"""Alert rules, their durations, and their notifications."""
 
 import hashlib
 import re
@@ -21,9 +21,9 @@ _FORM = re.compile(r"(?:(\d{1,3})d)?(?:(\d{1,4})h)?(?:(\d{1,5})m)?(?:(\d{1,6})s)
 
 
 def read_duration(text: object) -> int:
-    """Read a duration, in nanoseconds.
+    """Parse a duration such as `1h30m` into nanoseconds.
 
-    Raise `ValueError` if it is written otherwise.
+    Raise `ValueError` if the text has another form.
     """
     found = _FORM.fullmatch(text) if isinstance(text, str) else None
     if found is None or not any(found.groups()):
@@ -33,13 +33,7 @@ def read_duration(text: object) -> int:
 
 
 def duration_words(nanoseconds: int) -> str:
-    """Write a duration: `1 h 30 min`.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        Whole seconds.
-    """
+    """Format a duration, a multiple of a second in nanoseconds: `1 h 30 min`."""
     parts = []
     rest = nanoseconds
     for key, unit in _UNITS.items():
@@ -50,13 +44,13 @@ def duration_words(nanoseconds: int) -> str:
 
 
 _LONGEST_WINDOW = 7 * DAY
-LONGEST_PAUSE = 10 * MINUTE  # within an event
+LONGEST_PAUSE = 10 * MINUTE  # longest pause of an event that a rule may set
 _MARGIN = 5 * MINUTE
-_PAUSE = 10 * SECOND  # between the segments of one event, as in the report
+_PAUSE = 10 * SECOND  # default pause between segments of one event, as in the report
 _NIGHT_ENDS = 7 * 60
 _LONGEST_NAME = 60  # characters
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
-_TWO_DAYS = 50 * 3600 * SECOND  # with what a change of the clock adds
+_TWO_DAYS = 50 * 3600 * SECOND  # with a margin for clock changes
 
 
 def _within(least: int, most: int, words: str) -> BeforeValidator:
@@ -113,12 +107,12 @@ class _Rule(BaseModel):
     urgent: bool = Field(default=False, description="Whether it rings in quiet hours, too.")
 
     def hours(self) -> list[QuietHours]:
-        """Return the quiet hours in which a notification waits."""
+        """Return the quiet hours that delay notifications; none for an urgent rule."""
         return [] if self.urgent else [quiet_hours(text) for text in self.quiet_hours]
 
     @property
     def fingerprint(self) -> str:
-        """Tells whether a rule is still the one that was evaluated before."""
+        """Hash of the rule, to detect changes since the last evaluation."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 
@@ -148,7 +142,7 @@ class _SoundRule(_Rule):
 
     @property
     def words(self) -> str:
-        """What people call the class."""
+        """Human-readable name of the class."""
         return "Any sound" if self.label == ANY_SOUND else in_words(self.label)
 
 
@@ -240,7 +234,7 @@ class UnusualDay(_Rule):
 
 
 SoundRule = MoreThan | NoneBy | LongerThan | UnlikeUsual
-DailyRule = UnlikeUsual | UnusualDay  # by weeks of logs, once a day
+DailyRule = UnlikeUsual | UnusualDay  # evaluated once a day on weeks of logs
 AlertRule = Annotated[
     MoreThan | NoneBy | LongerThan | RecorderSilent | UnlikeUsual | UnusualDay,
     Field(discriminator="rule"),
@@ -264,12 +258,9 @@ def pause_of(rule: SoundRule) -> int:
 
 
 def history(rule: AlertRule) -> int:
-    """Return how long before a time the sound has to be known that a rule judges it by.
+    """Return the length of activity before a time that a rule needs, in nanoseconds.
 
-    Returns
-    -------
-    int
-        Nanoseconds. Events that begin earlier and go on have to be known in whole.
+    Events that begin earlier and reach into this history must be complete.
     """
     if isinstance(rule, MoreThan):
         return rule.window + _MARGIN
@@ -281,12 +272,10 @@ def history(rule: AlertRule) -> int:
 
 
 def live_history(rule: AlertRule) -> int:
-    """Return how long before a time a rule needs what is followed, and not read from the logs.
+    """Return the length of live activity before a time that a rule needs, in nanoseconds.
 
-    Returns
-    -------
-    int
-        Nanoseconds. Of weeks, the day that is judged: a silence may have gone on since it began.
+    Daily rules read weeks from the logs, but the evaluated day live: a silence since the start of
+    that day may have no segment in the logs yet.
     """
     return _TWO_DAYS if isinstance(rule, DailyRule) else history(rule)
 
@@ -300,9 +289,11 @@ class Notification(NamedTuple):
     Attributes
     ----------
     time : int
-        When it rang, by the time of the log, in nanoseconds of UTC.
+        Log time of the notification, in nanoseconds of UTC.
+    is_known : bool
+        False if the recorder heard too little to tell.
     due : int
-        From when on it is told: the time, or the end of quiet hours.
+        Earliest delivery, in nanoseconds of UTC: the time, or the end of quiet hours.
     """
 
     rule: str
@@ -318,15 +309,17 @@ class Notification(NamedTuple):
 
 
 class RuleState(NamedTuple):
-    """What a rule remembers.
+    """State of a rule between two evaluations.
 
     Attributes
     ----------
     last : int
-        When it rang last, in nanoseconds of UTC.
+        Time of the last notification, in nanoseconds of UTC.
+    has_rung : bool
+        Whether the condition at the end of the evaluation has given its notification.
     since : int
-        From when on it is in force, in nanoseconds of UTC: of the time before nobody knows whether
-        there was a recorder.
+        When the rule came into force, in nanoseconds of UTC: whether there was a recorder before is
+        unknown.
     """
 
     last: int = _NEVER
@@ -335,14 +328,16 @@ class RuleState(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """A span of time in which what a rule looks for is the case.
+    """Time span in which the condition of a rule holds.
 
     Attributes
     ----------
     start, end : int
-        In nanoseconds of UTC; the end is not part of it.
+        In nanoseconds of UTC, the end exclusive.
     text : str
-        In words; empty where they depend on when it rings.
+        Text of the notification; empty if it depends on the time of the notification.
+    is_known : bool
+        False if the recorder heard too little to tell.
     """
 
     start: int

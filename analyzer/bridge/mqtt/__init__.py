@@ -1,1 +1,1 @@
-"""Output to a broker of MQTT, and to Home Assistant."""
+"""Output to an MQTT broker and Home Assistant."""

@@ -1,4 +1,4 @@
-"""Connection to a broker that may be away: values are repeated, events expire."""
+"""Connection to a broker that may be unavailable: values are repeated, events expire."""
 
 import math
 import ssl
@@ -19,29 +19,29 @@ from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.bridge.state import BridgeError, secret_path
 from hearthlog.schemas.files import read_whole
 
-_KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
-_QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection
-_KEPT_SECONDS = 0.5  # for a broker that sends what it kept behind what comes later
-_MOST_KEPT_SECONDS = 10.0  # for a broker that keeps very much, or lets a bridge read no `online`
-_ANSWER_SECONDS = 2.0  # in which a broker has taken an event
-_TIMELY_SECONDS = 60.0  # after which an event is no news
-_FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
+_KEEPALIVE = 20  # seconds: the broker drops a client that is silent for 1.5 times as long
+_QUEUED = 1000  # messages waiting for the broker, and events waiting for a connection
+_KEPT_SECONDS = 0.5  # for a broker that sends retained messages after later ones
+_MOST_KEPT_SECONDS = 10.0  # for a broker that retains a lot, or does not send `online` back
+_ANSWER_SECONDS = 2.0  # for the broker to acknowledge an event
+_TIMELY_SECONDS = 60.0  # after which an event expires
+_FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds before the next attempt
 _CLOSE_SECONDS = 2.0
 _QOS = 1
-_SHORT_SECONDS = 15.0  # so short a connection is no good one
+_SHORT_SECONDS = 15.0  # a shorter connection counts as failed
 _TAKEN_OVER = 0x8E
 _LONGEST_PASSWORD = 4096  # bytes
-_LARGEST_CERTIFICATE = 8 << 20  # bytes; the list of a machine has half a megabyte
+_LARGEST_CERTIFICATE = 8 << 20  # bytes; the CA bundle of a machine has half a megabyte
 
 Say = Callable[[str], None]
 Received = Callable[[mqtt.MQTTMessage], None]
 
 
 class Connection:
-    """Publishes values that are kept, and events that are not.
+    """MQTT connection that publishes retained values and transient events.
 
-    The broker never holds up who publishes: a value is remembered, the newest of each topic, and
-    said when there is a connection; an event is dropped when it is a minute old.
+    Publishing never blocks: the newest value of each topic is stored and published once there is a
+    connection; an event is dropped when it is a minute old.
 
     Raise `BridgeError` if a file of the settings cannot be used.
     """
@@ -63,40 +63,40 @@ class Connection:
         self._client_id = client_id
         self._place = place_of(settings)
         self._hint = ""
-        self._connected: float | None = None  # since when, by CLOCK_MONOTONIC
-        self._is_refused = False  # by the broker, which then ends the connection
-        self._short = 0  # connections in a row that were
-        self._values: dict[str, str] = {}  # the newest of each topic that the broker keeps
+        self._connected: float | None = None  # time of connection, by CLOCK_MONOTONIC
+        self._is_refused = False  # by the broker, which then closes the connection
+        self._short = 0  # consecutive short connections
+        self._values: dict[str, str] = {}  # newest retained value of each topic
         self._unsent: dict[str, None] = {}  # topics, in order
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_QUEUED)
-        self._sent: tuple[float, mqtt.MQTTMessageInfo] | None = None  # the last event, and when
-        self._last_kept: mqtt.MQTTMessageInfo | None = None  # the last value that was published
+        self._sent: tuple[float, mqtt.MQTTMessageInfo] | None = None  # time and last event
+        self._last_kept: mqtt.MQTTMessageInfo | None = None  # the last published value
         self._delivering: dict[tuple[str, str], mqtt.MQTTMessageInfo] = {}
-        self._ready_at = math.inf  # by CLOCK_MONOTONIC: when the broker has sent what it kept
-        self._has_mark = False  # the broker has sent `online` back, behind what it kept
-        self._is_new = False  # a connection to which nothing was said yet
+        self._ready_at = math.inf  # by CLOCK_MONOTONIC: when retained messages have arrived
+        self._has_mark = False  # the broker has sent `online` back, after retained messages
+        self._is_new = False  # nothing has been published on this connection yet
         self._client = self._make_client(settings)
 
     def is_ready(self) -> bool:
-        """Tell whether the broker is connected, and has sent what it kept."""
+        """Whether the broker is connected, and has sent its retained messages."""
         return self._client.is_connected() and time.monotonic() >= self._ready_at
 
     def keep(self, topic: str, value: str) -> None:
-        """Publish a value that the broker keeps, unless it is the one that was published last."""
+        """Publish a retained value, unless it equals the last value of the topic."""
         if self._values.get(topic) != value:
             self._values[topic] = value
             self._unsent[topic] = None
 
     def forget(self, topic: str) -> None:
-        """Have the broker forget the value of a topic."""
+        """Clear the retained value of a topic."""
         self.keep(topic, "")
 
     def send(self, topic: str, payload: str) -> None:
-        """Publish an event, now or within a minute."""
+        """Publish an event now or within a minute; drop the event after that."""
         self._events.append((time.monotonic(), topic, payload))
 
     def deliver(self, topic: str, payload: str) -> bool:
-        """Publish what must arrive; to be called again until the broker has it, which it tells."""
+        """Publish a message that must arrive; call again until it returns True (acknowledged)."""
         key = topic, payload
         info = self._delivering.get(key)
         try:
@@ -105,17 +105,17 @@ class Connection:
                 return True
             if info is None and self.is_ready():
                 self._delivering[key] = self._client.publish(topic, payload, _QOS)
-        except (RuntimeError, ValueError):  # the queue was full
+        except (RuntimeError, ValueError):  # full queue
             del self._delivering[key]
         return False
 
     def repeat(self) -> None:
-        """Say all values again at the next `flush`; what was forgotten stays so."""
+        """Publish all values again at the next `flush`, except cleared ones."""
         values = (topic for topic, value in self._values.items() if value)
         self._unsent = dict.fromkeys([*self._unsent, *values])
 
     def is_taken(self) -> bool:
-        """Return whether the broker has all values."""
+        """Whether the broker has acknowledged all values."""
         if self._unsent or self._last_kept is None:
             return not self._unsent
         with suppress(RuntimeError, ValueError):
@@ -123,7 +123,7 @@ class Connection:
         return False
 
     def flush(self) -> None:
-        """Hand what there is to say to the connection, if there is one."""
+        """Publish all waiting values and events, if the connection is ready."""
         if not self.is_ready():
             return
         if self._is_new:
@@ -141,7 +141,7 @@ class Connection:
             self._events.popleft()
 
     def _is_answering(self) -> bool:
-        """Tell whether the broker takes events: what it does not, it would get late."""
+        """Whether the broker acknowledges events in time; if not, further ones would be late."""
         if self._sent is None:
             return True
         when, info = self._sent
@@ -150,15 +150,15 @@ class Connection:
         return False
 
     def close(self) -> None:
-        """Say `offline`, and end."""
+        """Publish `offline`, and disconnect."""
         if self._client.is_connected():
             info = self._client.publish(self._alive, "offline", _QOS, retain=True)
-            with suppress(RuntimeError, ValueError):  # it is lost: then the broker says it
+            with suppress(RuntimeError, ValueError):  # connection lost: the broker sends the will
                 info.wait_for_publish(_CLOSE_SECONDS)
         self._client.disconnect()
         self._client.loop_stop()
-        # The pair that wakes its loop is else left to the garbage collector, which warns of it
-        # where it finalises the pair before the client.
+        # Otherwise the socket pair that wakes the loop is left to the garbage collector, which
+        # warns if it finalises the pair before the client.
         self._client._reset_sockets()  # noqa: SLF001  no public call does only this
 
     def _make_client(self, settings: MqttSettings) -> mqtt.Client:
@@ -189,7 +189,7 @@ class Connection:
             self._hint = "; does it want a client certificate? see certificate_file and key_file"
 
     def _publish(self, topic: str, payload: str, *, retain: bool) -> bool:
-        """Hand a message over; False if it has to wait."""
+        """Pass a message to the client; return False if the message has to wait."""
         properties = Properties(PacketTypes.PUBLISH)
         if not retain:
             properties.MessageExpiryInterval = round(_TIMELY_SECONDS)
@@ -198,7 +198,7 @@ class Connection:
             self._last_kept = info
         else:
             self._sent = time.monotonic(), info
-        return info.rc in {mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_NO_CONN}  # the second is queued
+        return info.rc in {mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_NO_CONN}  # NO_CONN: queued
 
     def _on_connect(
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
@@ -221,7 +221,7 @@ class Connection:
             self._ready_at += _MOST_KEPT_SECONDS
 
     def _on_connect_fail(self, _client: mqtt.Client, _data: Any) -> None:
-        error = sys.exc_info()[1]  # called while it is handled
+        error = sys.exc_info()[1]  # paho calls this while handling the exception
         if isinstance(error, ssl.SSLCertVerificationError):
             what = f"its certificate is refused: {error.verify_message}; see ca_file"
         else:
@@ -234,13 +234,13 @@ class Connection:
         since, self._connected = self._connected, None
         self._ready_at = math.inf
         if since is None:
-            if reason.is_failure and not self._is_refused:  # else that was said
+            if reason.is_failure and not self._is_refused:  # a refusal is reported already
                 self._say(f"{self._place}: no connection: {reason}{self._hint}; trying again")
             self._is_refused = False
             return
         is_short = reason.is_failure and time.monotonic() - since < _SHORT_SECONDS
         self._short = self._short + 1 if is_short else 0
-        # The client itself begins with the first pause again, whenever it was let in.
+        # The client resets its own pause to the first one after each successful connection.
         pause = min(_FIRST_PAUSE << self._short, _LONGEST_PAUSE)
         client.reconnect_delay_set(pause, max(pause, _LONGEST_PAUSE))
         if reason.value == _TAKEN_OVER or self._short > 1:
@@ -264,7 +264,7 @@ class Connection:
     def _on_subscribe(
         self, _client: mqtt.Client, _data: Any, _number: int, reasons: list[ReasonCode], _more: Any
     ) -> None:
-        if reasons[-1].is_failure:  # it will send no `online` back
+        if reasons[-1].is_failure:  # the broker will not send `online` back
             self._has_mark = True
             self._wait_for_kept()
         for topic, reason in zip(self._subscriptions, reasons, strict=False):
@@ -280,14 +280,14 @@ class Connection:
             self._wait_for_kept()
 
     def _wait_for_kept(self) -> None:
-        """Be ready a while from now, if the broker has sent what it kept before `online`."""
+        """Become ready shortly, once `online` has come back after the retained messages."""
         since = self._connected
         if since is not None and self._has_mark:
             self._ready_at = min(time.monotonic() + _KEPT_SECONDS, since + _MOST_KEPT_SECONDS)
 
 
 def place_of(settings: MqttSettings) -> str:
-    """Return host and port of a broker."""
+    """Return the host and port of a broker as text."""
     return f"{settings.host}:{_port(settings)}"
 
 
@@ -296,9 +296,9 @@ def _port(settings: MqttSettings) -> int:
 
 
 def tls_context(settings: MqttSettings) -> ssl.SSLContext:
-    """Load the certificates of a connection.
+    """Return the TLS context of a connection, with the configured certificates.
 
-    Raise `BridgeError` if one of the files cannot be used.
+    Raise `BridgeError` if a file cannot be used.
     """
     names = "ca_file", "certificate_file", "key_file"
     ca, certificate, key = paths = [getattr(settings, name) for name in names]
@@ -308,8 +308,8 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=ca)
         if ca is not None:
-            # Python 3.13 wants extensions that an authority made by hand, as the manual of
-            # Mosquitto does it, leaves out.
+            # Python 3.13 requires extensions that hand-made authorities lack, such as those made
+            # by the Mosquitto manual.
             context.verify_flags &= ~ssl.VERIFY_X509_STRICT
         if certificate is not None:
             context.load_cert_chain(certificate, key, password=_no_password)
@@ -325,9 +325,9 @@ def _no_password() -> str:
 
 
 def read_password(settings: MqttSettings) -> str | None:
-    """Read the password of the user of a broker; None if none is configured.
+    """Read the password of the broker's user; None if not configured.
 
-    Raise `BridgeError` if its file cannot be used.
+    Raise `BridgeError` if the password file cannot be used.
     """
     if settings.password_file is None:
         return None

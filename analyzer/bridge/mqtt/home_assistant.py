@@ -1,4 +1,4 @@
-"""Discovery by Home Assistant: a device for each microphone, and one for commands."""
+"""Home Assistant discovery: a device for each microphone, and one for commands."""
 
 import json
 from collections import Counter
@@ -11,33 +11,35 @@ from hearthlog.models.classes import SILENCE, in_words
 
 _BY = "Home Assistant"
 _PAUSE_MINUTES = 60
-_OF_SOUND = {"level", "recorder", "problem"}  # whichever model labels it
+_OF_SOUND = {"level", "recorder", "problem"}  # of the microphone, not of a model
 
 
 def device_id(node: str, microphone: str) -> str:
-    """Return what names the device of a microphone in Home Assistant: no other has this name."""
+    """Return the unique Home Assistant identifier of a microphone's device."""
     return f"{home_id(node)}-{microphone}"
 
 
 def home_id(node: str) -> str:
-    """Return what names the device of a recorder in Home Assistant."""
+    """Return the Home Assistant identifier of a recorder's device."""
     return f"hearthlog-{identifier(node)}"
 
 
 def discovery(
     topics: Topics, microphone: str, classes: Sequence[str], gone: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Describe the device of a microphone, as Home Assistant 2024.11 and later read it.
+    """Return the discovery payload of a microphone, for Home Assistant 2024.11 and later.
 
     Parameters
     ----------
     microphone : str
-        Its name, or `<microphone>-<scenario>`, whose device has no level and no health.
+        Name of a microphone, or `<microphone>-<scenario>`: its device has no level or health.
+    gone : sequence of str
+        Former classes, whose entities are removed.
     """
     own = device_id(topics.node, microphone)
     sounds = [name for name in classes if name != SILENCE]
     components = _of_microphone(topics, microphone, sounds)
-    if "-" in microphone:  # which no name of a microphone has
+    if "-" in microphone:  # a scenario: names of microphones have no hyphen
         components = {kind: each for kind, each in components.items() if kind not in _OF_SOUND}
     for name, words in _words(sounds).items():
         components |= _of_class(topics, microphone, name, words)
@@ -60,7 +62,13 @@ def discovery(
 def command_discovery(
     topics: Topics, classes: Sequence[str], gone: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Describe the device of a recorder, by which Home Assistant commands the bridge."""
+    """Return the discovery payload of a recorder's device, with the commands to the bridge.
+
+    Parameters
+    ----------
+    gone : sequence of str
+        Former classes, whose switches are removed.
+    """
     own = home_id(topics.node)
     command = {"command_topic": topics.of_home("command")}
     components: dict[str, dict[str, Any]] = {
@@ -102,7 +110,7 @@ def command_discovery(
 
 
 def described(topics: Topics, payload: bytes) -> list[Place]:
-    """Return the places of a device that a bridge of this recorder described; of others none."""
+    """Return the places in a discovery payload of this recorder; empty for other payloads."""
     try:
         content = json.loads(payload)
         (own,) = content["device"]["identifiers"]
@@ -153,8 +161,8 @@ def _of_microphone(
         "heard": {
             "p": "sensor",
             "name": "Heard",
-            # No `options`: when a model comes that has not the class which is shown, Home Assistant
-            # would fail, and take no discovery any more. No confidence: it would keep each change.
+            # No `options`: if a new model lacks the displayed class, Home Assistant would fail and
+            # accept no further discovery. No confidence: every change would be stored.
             "state_topic": at("heard"),
             "value_template": "{{ value_json.label }}",
             "icon": "mdi:ear-hearing",
@@ -215,7 +223,7 @@ def _of_microphone(
 
 
 def _words(names: Sequence[str]) -> dict[str, str]:
-    """Return what people call classes; Home Assistant refuses two triggers of one name."""
+    """Return unique readable names of classes; Home Assistant rejects triggers of equal name."""
     words = {name: in_words(name) for name in names}
     times = Counter(words.values())
     return {name: said if times[said] == 1 else f"{said} ({name})" for name, said in words.items()}
@@ -264,5 +272,5 @@ def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[st
 
 
 def _untemplated(text: str) -> str:
-    """Write a text so that Home Assistant, which fills in templates, takes it as it is."""
+    """Escape a text so that Home Assistant's templates leave it unchanged."""
     return "{{ " + json.dumps(text, ensure_ascii=False) + " }}" if "{" in text else text

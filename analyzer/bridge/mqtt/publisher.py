@@ -1,4 +1,4 @@
-"""Publisher of states and events to a broker."""
+"""Publisher of states and events to an MQTT broker."""
 
 import json
 import math
@@ -37,17 +37,17 @@ if TYPE_CHECKING:
 _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
-_BORN = b"online"  # of Home Assistant
-_MOST_ASKED = 20  # commands that wait
-_MOST_OFF = 1000  # classes that the broker says it is not told of
+_BORN = b"online"  # birth message of Home Assistant
+_MOST_ASKED = 20  # waiting commands
+_MOST_OFF = 1000  # muted classes read back from the broker
 _MOST_BEGUN = 1000
-_LARGEST_FOUND = 1 << 20  # bytes of a description that is read back
-_MOST_FOUND, _MOST_FOUND_SIZE = 5000, 1 << 20  # topics that are taken over, and their characters
-_RESTART_SECONDS = 2.0  # so near to each other, two logs were not written at once
+_LARGEST_FOUND = 1 << 20  # bytes of a discovery payload that is read back
+_MOST_FOUND, _MOST_FOUND_SIZE = 5000, 1 << 20  # adopted topics, and their characters
+_RESTART_SECONDS = 2.0  # overlap up to which two logs do not count as simultaneous
 
 
 class MqttPublisher:
-    """Says everything that a broker is to know of a recorder.
+    """Output that publishes the states and events of a recorder to an MQTT broker.
 
     Raise `BridgeError` if a file of the settings cannot be used.
     """
@@ -62,10 +62,10 @@ class MqttPublisher:
         self._settings = settings
         self._home = home
         self._topics = topics = Topics(settings.topic, home.node)
-        self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
-        # Those that there are switches of, and those of which no more.
+        self._classes: dict[str, list[str]] = {}  # announced classes, by microphone
+        # Classes with a switch, and classes whose switch is removed.
         self._switches: tuple[list[str], list[str]] | None = None
-        # Events that were not told of yet.
+        # Events not published yet.
         self._begun: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
         self._ended: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
         self._is_born = False
@@ -76,13 +76,13 @@ class MqttPublisher:
         self._announced = RetainedTopics(
             state_folder, home.node, place_of(settings), partial(_is_renamed, home), say
         )
-        self._forgotten: set[str] = set()  # topics that the broker is just told to forget
+        self._forgotten: set[str] = set()  # topics being cleared at the broker
         self._has_said_muted = False
-        # Earlier versions left it to the broker to remember what it keeps, and is not told of.
+        # Earlier versions stored retained topics and muted classes only at the broker.
         self._is_new = self._announced.is_new
-        self._found, self._found_size = 0, 0  # topics that the broker says it was told of
+        self._found, self._found_size = 0, 0  # topics read back from the broker
         self._reads_back = settings.commands and self._is_new
-        self._off: set[str] = set()  # classes that the broker says it is not told of
+        self._off: set[str] = set()  # muted classes read back from the broker
         self._was_ready = False
         if settings.commands:
             subscriptions.append(self._command_topic)
@@ -107,7 +107,7 @@ class MqttPublisher:
         self._commands = self._take_commands() if settings.commands else None
 
     def update(self, news: News) -> None:
-        """Say what is new."""
+        """Publish an update."""
         self._keep(Place("recorder"), _ONLINE[news.state.is_recording()])
         for each in news.state.every():
             if news.state.is_left_out(each.name):
@@ -125,7 +125,7 @@ class MqttPublisher:
         self._ended += news.ended
         if self._connection.is_ready():
             self._was_ready = True
-            self._announced.save()  # before anything is published that is to be cleared one day
+            self._announced.save()  # before publishing retained values that must be cleared later
             self._say_muted()
             self._tell_begun(news)
             self._send_events("event_ended", self._recent(self._ended, news), news)
@@ -138,7 +138,7 @@ class MqttPublisher:
             self._announced.save()
 
     def _tell_begun(self, news: News) -> None:
-        """Tell of the events that began, but for those that an earlier bridge told of."""
+        """Publish the events that began, except those that an earlier bridge published."""
         events = self._announced.new_events(self._recent(self._begun, news))
         self._send_events("event", events, news)
         for event in events:
@@ -148,7 +148,7 @@ class MqttPublisher:
                 self._keep(place, json.dumps(event_fields(event, news)))
 
     def _recent(self, waiting: deque[SoundEvent], news: News) -> list[SoundEvent]:
-        """Take the events that waited for a broker, but for those that are no news any more."""
+        """Take the waiting events, without those that are too old."""
         recent = [event for event in waiting if news.today.now - event.end <= RECENT]
         waiting.clear()
         return recent
@@ -159,33 +159,33 @@ class MqttPublisher:
             self._connection.send(topic, json.dumps(event_fields(event, news)))
 
     def alert(self, name: str, text: str, time: int) -> bool:
-        """Say that an alert rings, at each call, until the broker has it, which it tells.
+        """Publish an alert; call again until the method returns True (acknowledged).
 
         Parameters
         ----------
         time : int
-            Since when, in nanoseconds of UTC.
+            Time of the notification, in nanoseconds of UTC.
         """
         since = iso_time(time, self._home.zone)
         fields = {"event_type": "alert", "name": name, "text": text, "time": since}
         return self._connection.deliver(self._topics.of_home("alert"), json.dumps(fields))
 
     def close(self) -> None:
-        """Say `offline`, and end."""
+        """Publish `offline`, and stop."""
         if self._commands is not None:
             self._commands.close()
         self._connection.close()
         self._announced.close()
 
     def _take_commands(self) -> "Commands":
-        # Imported here: who commands nothing needs nothing that corrects logs.
+        # Imported here: without commands, the code that corrects logs is not needed.
         from hearthlog.analyzer.bridge.commands import Commands  # noqa: PLC0415
 
         home = self._home
         return Commands(home.folder, home.node, self._announced.switch, self._answers.append)
 
     def _obey(self, state: HomeState) -> None:
-        """Have the commands carried out that came, and answer those that are."""
+        """Queue received commands, and publish the results of finished ones."""
         while self._commands is not None and self._asked:
             self._commands.add(self._asked.popleft(), state.find_event)
         while self._answers:
@@ -203,11 +203,11 @@ class MqttPublisher:
         return f"{self._settings.discovery_topic}/status"
 
     def _take(self, message: MQTTMessage) -> None:
-        """Note a message, in the thread of the connection."""
+        """Store a received message; runs in the thread of the connection."""
         if message.topic == self._birth_topic:
             self._is_born |= message.payload == _BORN and not message.retain
         elif message.topic == self._command_topic:
-            if not message.retain:  # else it was meant for whoever was there then
+            if not message.retain:  # a retained command was meant for an earlier time
                 self._asked.append(bytes(message.payload))
         elif self._reads_back and message.retain and message.payload == b"OFF":
             place = self._topics.parse(message.topic)
@@ -217,7 +217,7 @@ class MqttPublisher:
             self._take_found(bytes(message.payload))
 
     def _take_found(self, payload: bytes) -> None:
-        """Take over topics that an earlier bridge described, as many as one could have."""
+        """Adopt topics from the discovery payload of an earlier bridge, up to a limit."""
         places = described(self._topics, payload) if len(payload) <= _LARGEST_FOUND else []
         for place in places:
             topic = self._topic(place)
@@ -228,7 +228,7 @@ class MqttPublisher:
             self._announced.add(topic, place)
 
     def _leave_out_again(self, classes: Iterable[str]) -> None:
-        """Tell no more of the classes of a model that the broker was not told of before."""
+        """Mute the classes that an earlier bridge had muted."""
         for label in self._off.intersection(classes):
             self._off.discard(label)
             self._announced.switch(label, is_told=False)
@@ -238,7 +238,7 @@ class MqttPublisher:
         return f"{self._settings.discovery_topic}/device/{device}/config"
 
     def _say_muted(self) -> None:
-        """Say once which classes the broker is not told of, and how to change that."""
+        """Report the muted classes once, and how to unmute them."""
         muted = self._announced.muted()
         if muted and not self._has_said_muted:
             remedy = (
@@ -251,7 +251,7 @@ class MqttPublisher:
         self._has_said_muted = True
 
     def _topic(self, place: Place) -> str:
-        """Name the topic that is about something."""
+        """Return the topic of a place."""
         kind, microphone, _ = place
         node = self._topics.node
         if kind == CONFIG:
@@ -260,14 +260,14 @@ class MqttPublisher:
         return self._topics.name(place)
 
     def _keep(self, place: Place, value: str) -> None:
-        """Publish a value that the broker keeps, and remember that it does."""
+        """Publish a retained value, and record its topic."""
         topic = self._topic(place)
         self._announced.add(topic, place)
         self._forgotten.discard(topic)
         self._connection.keep(topic, value)
 
     def _describe(self, microphone: LiveMicrophone) -> None:
-        """Tell Home Assistant of the classes of a microphone, before the first value of one."""
+        """Announce the classes of a microphone to Home Assistant, before their first values."""
         name, classes = microphone.name, microphone.classes
         self._classes[name] = list(classes)
         if self._settings.home_assistant:
@@ -276,7 +276,7 @@ class MqttPublisher:
             self._keep(Place(CONFIG, name), json.dumps(config))
 
     def _describe_switches(self) -> None:
-        """Tell Home Assistant what it may command; nothing where it may not."""
+        """Announce the commands to Home Assistant, if both are enabled."""
         if not (self._settings.home_assistant and self._settings.commands):
             return
         classes = sorted({name for names in self._classes.values() for name in names})
@@ -287,7 +287,7 @@ class MqttPublisher:
             self._keep(Place(CONFIG), json.dumps(config))
 
     def _clear_gone(self, state: HomeState) -> None:
-        """Have the broker forget what this bridge, or an earlier one, gave it and is no more."""
+        """Clear retained topics of this or an earlier bridge that are obsolete."""
         if self._forgotten and self._connection.is_taken():
             self._announced.remove(self._forgotten)
             self._forgotten.clear()
@@ -297,11 +297,11 @@ class MqttPublisher:
                 self._connection.forget(topic)
                 self._forgotten.add(topic)
             elif place.kind == "listening" and place.microphone not in known:
-                self._connection.keep(topic, _ONLINE[False])  # nothing of late is known of it
+                self._connection.keep(topic, _ONLINE[False])  # no recent messages
 
     def _is_gone(self, topic: str, place: Place, state: HomeState) -> bool:
         kind, microphone, label = place
-        if topic != self._topic(place):  # the recorder, or a topic, has another name now
+        if topic != self._topic(place):  # the recorder or the topic was renamed
             return True
         if kind == CONFIG and not self._settings.home_assistant:
             return True
@@ -348,24 +348,18 @@ class MqttPublisher:
 def class_values(
     microphone: LiveMicrophone, label: str, news: News, known: EnoughHeard
 ) -> Iterator[tuple[str, str]]:
-    """Yield what the broker keeps of a class: the kind of topic, and its value.
-
-    Parameters
-    ----------
-    news : News
-        Of whose day and night events are counted.
-    """
+    """Yield the retained values of a class: the kind of topic, and the value."""
     yield "on", _ON[microphone.heard.is_heard(label)]
     counts = microphone.counts(label, news.today, known)
     for kind, count in zip(("count_today", "count_night"), counts, strict=True):
-        yield kind, str(count)  # `None`, which Home Assistant takes for unknown, where it is that
+        yield kind, str(count)  # Home Assistant reads `None` as unknown
     last = microphone.last_event(label)
-    if last is not None:  # else what the broker has from an earlier bridge is right
+    if last is not None:  # otherwise the retained value of an earlier bridge is right
         yield "last_heard", iso_time(last.end, news.zone)
 
 
 def event_fields(event: SoundEvent, news: News) -> dict[str, str | float]:
-    """Describe an event for JSON."""
+    """Return the JSON fields of an event."""
     return {
         "event_type": event.label,
         "id": event.id,
@@ -377,15 +371,16 @@ def event_fields(event: SoundEvent, news: News) -> dict[str, str | float]:
 
 
 def _is_renamed(home: RecorderAddress, former: str, *, is_first: bool) -> bool:
-    """Return whether another recorder of the folder has the name of this one now.
+    """Whether a former recorder of the folder was renamed to this one.
 
-    It wrote logs here, does not record, and this recorder wrote none of its logs while the other
-    wrote, but later ones, or writes now: two recorders of one folder write theirs side by side.
+    True if the former recorder wrote logs here and no longer records, and this recorder wrote no
+    log during that time, but later ones, or writes now. Two different recorders of one folder
+    would write at the same time.
 
     Parameters
     ----------
     is_first : bool
-        Whether no bridge of this recorder ran before: it may have no log yet.
+        Whether no bridge of this recorder ran before, so that it may have no log yet.
     """
     if former == home.node:
         return False
@@ -394,7 +389,7 @@ def _is_renamed(home: RecorderAddress, former: str, *, is_first: bool) -> bool:
         return False
     spans = _log_spans(home.folder, {home.node, former})
     own, theirs = spans[home.node], spans[former]
-    if not theirs:  # it may record to another folder
+    if not theirs:  # the former recorder may write to another folder
         return False
     if not own:
         return is_first
@@ -404,12 +399,12 @@ def _is_renamed(home: RecorderAddress, former: str, *, is_first: bool) -> bool:
 
 
 def _log_spans(folder: Path, nodes: Collection[str]) -> dict[str, list[tuple[str, str]]]:
-    """Return when the logs of nodes began and were last written to, as in the names of logs."""
+    """Return the start and last write time of nodes' logs, formatted as in log names."""
     spans: dict[str, list[tuple[str, str]]] = {node: [] for node in nodes}
     for entry in walk_logs(folder):
         name = log_name(Path(entry.name))
         if name.node in spans and not name.layer:
-            with suppress(OSError, ValueError, OverflowError):  # it is gone, or its time is none
+            with suppress(OSError, ValueError, OverflowError):  # deleted, or an invalid time
                 end = datetime.fromtimestamp(entry.stat().st_mtime - _RESTART_SECONDS, UTC)
                 spans[name.node].append((name.time, max(name.time, f"{end:%Y%m%dT%H%M%SZ}")))
     return spans

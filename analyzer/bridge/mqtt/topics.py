@@ -1,4 +1,4 @@
-"""Topics of a broker: their names, and those that it retains between two starts."""
+"""MQTT topics: names, and the record of topics that the broker retains."""
 
 import fcntl
 import os
@@ -38,46 +38,46 @@ class Place(NamedTuple):
 
 
 class Topics(NamedTuple):
-    """Names the topics of one recorder."""
+    """Topic names of one recorder."""
 
     base: str
     node: str
 
     @property
     def root(self) -> str:
-        """What all topics of the recorder begin with."""
+        """Common prefix of the recorder's topics."""
         return f"{self.base}/{self.node}"
 
     def of_home(self, kind: str) -> str:
-        """Name a topic of the recorder: `bridge` or `recorder`."""
+        """Return a topic of the recorder, such as `bridge` or `recorder`."""
         return f"{self.root}/{kind}"
 
     def of_microphone(self, microphone: str, kind: str) -> str:
-        """Name a topic of a microphone, such as `listening`, `heard` or `event`."""
+        """Return a topic of a microphone, such as `listening`, `heard` or `event`."""
         return f"{self.root}/{microphone}/{kind}"
 
     def of_class(self, microphone: str, label: str, kind: str) -> str:
-        """Name a topic of a class: `on`, `count_today`, `count_night` or `last_heard`.
+        """Return a topic of a class: `on`, `count_today`, `count_night` or `last_heard`.
 
         Parameters
         ----------
         label : str
-            The class; what a topic may not have, or what is no ASCII, is written `%2B`, as in
-            addresses.
+            The class; characters that are invalid in topics or not ASCII are percent-encoded, such
+            as `%2B`.
         """
         return f"{self.root}/{microphone}{_CLASS_PART}{_part(label)}/{kind}"
 
     def of_told(self, label: str) -> str:
-        """Name the topic that says whether a class is told of."""
+        """Return the topic that shows whether events of a class are published."""
         return f"{self.root}/told/{_part(label)}"
 
     @property
     def told_filter(self) -> str:
-        """The subscription that matches all names of `of_told`."""
+        """Subscription filter for all topics of `of_told`."""
         return f"{self.root}/told/+"
 
     def name(self, place: Place) -> str:
-        """Name the topic of a place of any kind but `config`, which has a topic of discovery."""
+        """Return the topic of a place of any kind but `config`, which uses discovery topics."""
         kind, microphone, label = place
         if kind == TOLD:
             return self.of_told(label)
@@ -86,7 +86,7 @@ class Topics(NamedTuple):
         return self.of_microphone(microphone, kind) if microphone else self.of_home(kind)
 
     def parse(self, topic: str) -> Place | None:
-        """Return the place of a topic that `name` gives; None of another one."""
+        """Return the place of a topic, the inverse of `name`; None for other topics."""
         parts = topic.removeprefix(f"{self.root}/").split("/")
         match parts:
             case [kind]:
@@ -107,7 +107,7 @@ def _part(label: str) -> str:
 
 
 def identifier(text: str) -> str:
-    """Make a text part of an identifier, which no other text gives."""
+    """Escape a text for an identifier; different texts give different results."""
     escaped = r"[^a-z0-9_]|_(?=[0-9a-f]+[^a-z0-9])"
     return re.sub(escaped, lambda match: f"_{ord(match[0]):x}_", text)
 
@@ -122,7 +122,7 @@ class _Content(BaseModel):
     broker: str = ""
     topics: dict[str, Place] = {}
     muted: list[str] = []
-    last_events: dict[str, str] = {}  # id of the last event that was told of, by microphone
+    last_events: dict[str, str] = {}  # id of the last published event, by microphone
 
 
 class _IsRenamed(Protocol):
@@ -130,7 +130,7 @@ class _IsRenamed(Protocol):
 
 
 class RetainedTopics:
-    """The topics that a broker keeps of this bridge, classes it is not told of, events it knows."""
+    """Persistent record of retained topics, muted classes and last published events."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class RetainedTopics:
         self._is_changed = False
         self._descriptor = self._take_lock(folder)
         has_own = self.path.exists()
-        # Of names that the recorder had: their files, and locks that no bridge of theirs can take.
+        # Files of former recorder names, with locks that keep other bridges from using them.
         self._former: dict[Path, int] = {}
         if self._descriptor is not None:
             for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}")):
@@ -159,7 +159,7 @@ class RetainedTopics:
         self._is_changed = bool(self._former)
         self._broker = broker
         self.topics: dict[str, Place] = {}
-        # Of another address of the broker, too: it may be the same one, and else has none of them.
+        # Kept if the broker's address changes: it may be the same broker; a new one has no topics.
         self._muted: set[str] = set()
         self._last_events: dict[str, str] = {}
         for each in contents:
@@ -168,51 +168,50 @@ class RetainedTopics:
             self._last_events |= each.last_events
 
     def add(self, topic: str, place: Place) -> None:
-        """Note a topic to which a value is published that the broker keeps."""
+        """Record a topic with a retained value."""
         with self._lock:
             if self.topics.get(topic) != place:
                 self.topics[topic] = place
                 self._is_changed = True
 
     def remove(self, topics: Iterable[str]) -> None:
-        """Note that the broker has forgotten topics."""
+        """Remove topics that were cleared at the broker."""
         with self._lock:
             for topic in topics:
                 self._is_changed |= self.topics.pop(topic, None) is not None
 
     def microphones(self) -> set[str]:
-        """Return the microphones that the broker knows."""
+        """Return the microphones with recorded topics."""
         return {place.microphone for place in self.topics.values() if place.microphone}
 
     def labels(self, microphone: str) -> set[str]:
-        """Return the classes of a microphone that the broker knows; of none, the switches."""
+        """Return the recorded classes of a microphone, or of the switches for an empty name."""
         places = list(self.topics.values())
         return {each.label for each in places if each.label and each.microphone == microphone}
 
     def muted(self) -> list[str]:
-        """Return the classes that the broker is not told of."""
+        """Return the muted classes, sorted."""
         with self._lock:
             return sorted(self._muted)
 
     def is_told(self, label: str) -> bool:
-        """Return whether events of a class are published."""
+        """Whether events of a class are published."""
         with self._lock:
             return label not in self._muted
 
-    def switch(self, label: str, is_told: bool) -> None:  # noqa: FBT001  it is handed over
-        """Have the broker told of a class or not."""
+    def switch(self, label: str, is_told: bool) -> None:  # noqa: FBT001  passed as a callback
+        """Unmute or mute a class."""
         with self._lock:
             (self._muted.discard if is_told else self._muted.add)(label)
             self._is_changed = True
 
     def new_events(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
-        """Return the events that no earlier bridge has told of.
+        """Return the events that no earlier bridge has published.
 
         Parameters
         ----------
         events : sequence of SoundEvent
-            In the order in which they began; those before the last one that was told of were told
-            of, too.
+            In order of start; all events up to the last published one count as published.
         """
         last = {
             event.microphone: number
@@ -222,13 +221,13 @@ class RetainedTopics:
         return [e for n, e in enumerate(events) if n > last.get(e.microphone, -1)]
 
     def note_event(self, event: SoundEvent) -> None:
-        """Note that an event was told of."""
+        """Record a published event."""
         with self._lock:
             self._last_events[event.microphone] = event.id
             self._is_changed = True
 
     def save(self) -> None:
-        """Write down what has changed; it is on the disk on return."""
+        """Save changes; they are on disk on return."""
         with self._lock:
             if self._descriptor is None or not (self._is_changed or self.is_new):
                 return
@@ -247,7 +246,7 @@ class RetainedTopics:
                 self._say(f"mqtt: {error}; topics that go are not cleared after the next start")
 
     def close(self) -> None:
-        """Write down what has changed, and let another bridge use the folder."""
+        """Save changes, and release the lock for other bridges."""
         self.save()
         for descriptor in [*self._former.values(), self._descriptor]:
             if descriptor is not None:
@@ -256,7 +255,7 @@ class RetainedTopics:
         self._descriptor = None
 
     def _take_over(self, path: Path) -> None:
-        """Lock the memory of a former name, unless a bridge runs that remembers there."""
+        """Lock the record of a former name, unless another bridge uses it."""
         with suppress(OSError):
             descriptor = open_lock(_lock_path(path))
             try:
@@ -267,7 +266,7 @@ class RetainedTopics:
             self._former[path] = descriptor
 
     def _remove_former(self) -> None:
-        """Remove the memories that were taken over, and only then let others have their names."""
+        """Delete the adopted records, and only then release their locks."""
         while self._former:
             path = next(iter(self._former))
             path.unlink(missing_ok=True)

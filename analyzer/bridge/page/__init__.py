@@ -1,1 +1,1 @@
-"""A page of the home, for the browsers of those who live with the box."""
+"""Web page of the home, for the people who live there."""

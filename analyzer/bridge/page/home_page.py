@@ -1,4 +1,4 @@
-"""The page of the home: its parts as JSON, updated once a second."""
+"""Page of the home: parts as JSON, updated once a second."""
 
 import json
 import math
@@ -42,24 +42,24 @@ from hearthlog.schemas.errors import HearthlogError, listed
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
 
-_QUIETEST = -80.0  # dBFS, the left end of the bar
-_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # behind the end of a segment
+_QUIETEST = -80.0  # dBFS at the left end of the bar
+_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # after the end of a segment
 _NOT_LISTENING = "Not listening"
 
 
 class _Heard(NamedTuple):
     words: str
-    since: int  # in nanoseconds of UTC; 0: not known
+    since: int  # in nanoseconds of UTC; 0: unknown
 
 
 class CurrentSounds:
-    """Says what each microphone hears, and remembers since when."""
+    """Current sounds of each microphone, with their start times."""
 
     def __init__(self) -> None:
         self._last: dict[str, _Heard] = {}
 
     def describe(self, news: News) -> Any:
-        """Describe what is heard for JSON."""
+        """Return the current sounds for JSON."""
         microphones = news.state.present()
         return {
             "is_recording": news.state.is_recording(),
@@ -96,7 +96,7 @@ def _sentence(microphone: LiveMicrophone) -> str:
 
 
 def heard_classes(microphone: LiveMicrophone) -> list[str]:
-    """Return the classes of sound that are heard now, in the order of the model."""
+    """Return the active classes except silence, in the order of the model."""
     return [
         label
         for label in microphone.classes
@@ -105,7 +105,7 @@ def heard_classes(microphone: LiveMicrophone) -> list[str]:
 
 
 def _known_since(microphone: LiveMicrophone) -> int:
-    """Return since when it has been so, as far as the log says; 0 if it does not."""
+    """Return the start of the microphone's current state, from the log; 0 if unknown."""
     if not microphone.is_listening():
         return microphone.heard.time
     heard = heard_classes(microphone)
@@ -125,7 +125,7 @@ def _last_events(microphone: LiveMicrophone) -> Iterator[SoundEvent]:
 
 
 def _level(microphone: LiveMicrophone) -> Any:
-    """Return the level as a share of the bar and in words; None where it is not known."""
+    """Return the level as a share of the bar and as text; None if unknown."""
     level = microphone.level_dbfs
     if not math.isfinite(level):
         return None
@@ -139,19 +139,19 @@ _DAY = 24 * 3600 * NANOSECONDS
 
 
 class LastEvents(NamedTuple):
-    """The last events: themselves, by their ids, and what is shown of them."""
+    """The last events by id, and their description for JSON."""
 
     events: dict[str, SoundEvent]
     shown: Any
 
 
 def last_events(news: News, said_of: Callable[[SoundEvent], str]) -> LastEvents:
-    """Find the last events, and describe them for JSON.
+    """Return the last events.
 
     Parameters
     ----------
     said_of : callable
-        Returns what people said that an event was, in words; empty for nothing.
+        Returns the correction of an event in words; empty if there is none.
     """
     microphones = news.state.microphones.values()
     found: list[SoundEvent] = []
@@ -191,7 +191,7 @@ _THINGS = {"disk": "Disk", "machine": "Clock and computer"}
 
 
 class HealthLine(NamedTuple):
-    """How one thing is: a level from 0, for well, to 2; and a text."""
+    """Health of one subject: a level from 0 (OK) to 2 (error), and a text."""
 
     what: str
     level: int
@@ -199,12 +199,14 @@ class HealthLine(NamedTuple):
 
 
 def health_list(news: News, node: str, started: int, recurring: str = "") -> list[Any]:
-    """Say how everything is, for JSON.
+    """Return the health of all subjects for JSON.
 
     Parameters
     ----------
     started : int
-        When the bridge was started, in nanoseconds of UTC.
+        Start of the bridge, in nanoseconds of UTC.
+    recurring : str, optional
+        Problem with the recurring sounds; empty for none.
     """
     lines = [*_lines(news, node, started)]
     if recurring:
@@ -249,7 +251,7 @@ def _thing(subject: str, node: str) -> str:
 
 
 def scenario_lines(news: News) -> list[Any]:
-    """Describe each scenario of each microphone for JSON, in a line."""
+    """Return a line for each scenario of each microphone, for JSON."""
     state, midnight = news.state, news.today.midnight
     lines = []
     for name in sorted(state.scenarios):
@@ -269,7 +271,7 @@ def _now(own: LiveMicrophone) -> str:
 
 
 def _today(own: LiveMicrophone, midnight: int) -> str:
-    """Say how often, and for how long, each class was heard; of the longest first."""
+    """Format count and total length of each class since midnight, longest first."""
     events = {label: own.events(label, midnight) for label in own.labels()}
     seconds = {label: sum(each.seconds for each in same) for label, same in events.items() if same}
     return ", ".join(
@@ -278,28 +280,28 @@ def _today(own: LiveMicrophone, midnight: int) -> str:
     )
 
 
-BIN = 120 * NANOSECONDS  # as wide as in the picture of the report
+BIN = 120 * NANOSECONDS  # as in the picture of the report
 _HOUR = 3600 * NANOSECONDS
-_LEAST = 3  # of nine: what is short has to be seen
-_SILENT = 60 * NANOSECONDS  # without a label: shorter is not seen
-_DIGITS = 4  # of a place in the day, which is from 0 to 1
+_LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
+_SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
+_DIGITS = 4  # decimals of a position in the day, 0 to 1
 
 
 class DaySpan(NamedTuple):
-    """A day of a home, from midnight to midnight, in nanoseconds of UTC."""
+    """A local day from midnight to midnight, in nanoseconds of UTC."""
 
     start: int
     end: int
     zone: tzinfo
 
     def place(self, time: int) -> float:
-        """Return where in the day a time is, from 0 to 1."""
+        """Return the position of a time in the day, 0 to 1."""
         inside = min(max(time, self.start), self.end)
         return round((inside - self.start) / (self.end - self.start), _DIGITS)
 
 
 def day_picture(microphones: Iterable[LiveMicrophone], today: Today, zone: tzinfo) -> Any:
-    """Describe the picture of a day for JSON."""
+    """Return the picture of a day for JSON."""
     date = local_time(today.midnight, zone).date()
     day = DaySpan(*day_span(date, zone), zone)
     hours = range(day.start, day.end, _HOUR)
@@ -351,12 +353,12 @@ def _lane(
 
 
 def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
-    """Return how much of each two minutes of a day events fill: a digit each, 9 for all of it.
+    """Return how much of each two minutes of a day events fill: one digit per bin, 9 for full.
 
     Returns
     -------
     str
-        Empty where there is none.
+        Empty without events.
     """
     filled = [0] * -(-(day.end - day.start) // BIN)
     for event in events:
@@ -372,7 +374,7 @@ def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
 
 
 def _unheard(microphone: LiveMicrophone, day: DaySpan, today: Today) -> list[tuple[int, int]]:
-    """Return when of a day, up to now, a microphone was not heard; what is short is left out."""
+    """Return the gaps of a microphone in a day, up to now, without short ones."""
     spans = [(day.start, microphone.since or today.now), *microphone.gaps]
     if not microphone.is_listening():
         spans.append((max(microphone.heard.time, day.start), today.now))
@@ -395,9 +397,9 @@ _EVERY_SECONDS = 1.0
 
 
 class HomePage:
-    """Shows a home to browsers, and takes what people say that its sounds were.
+    """Output that serves the page of a home, and accepts corrections of sounds.
 
-    Raise `BridgeError` if the token cannot be read or made, or nothing can listen there.
+    Raise `BridgeError` if the token cannot be read or created, or the port cannot be opened.
     """
 
     def __init__(
@@ -432,7 +434,7 @@ class HomePage:
         except BridgeError:
             self._server.end()
             raise
-        # Others may read the journal.
+        # Other users may read the journal, so it must not have the token.
         if writes_to_journal():
             whole = f"{address}; its whole address, which opens it, is in {file.absolute()}"
         say(f"the page of the home: {whole}")
@@ -443,7 +445,7 @@ class HomePage:
             )
 
     def update(self, news: News) -> None:
-        """Show what is new."""
+        """Update the page, at most once a second."""
         self._board.keep_fresh()
         if time.monotonic() - self._made < _EVERY_SECONDS:
             return
@@ -465,7 +467,7 @@ class HomePage:
             self._put("day", day_picture(news.state.microphones.values(), news.today, news.zone))
 
     def close(self) -> None:
-        """End, and let browsers know."""
+        """Stop the server and its streams."""
         self._server.end()
         self._recurring.close()
 
@@ -486,7 +488,7 @@ class HomePage:
 
 
 def _day_key(news: News) -> Any:
-    """Return what changes whenever the picture of the day does."""
+    """Return a key that changes whenever the picture of the day changes."""
     microphones = news.state.microphones.values()
     return news.today.now // BIN, [
         (

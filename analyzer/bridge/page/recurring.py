@@ -1,4 +1,4 @@
-"""Recurring sounds on the page: groups from `hearthlog discover`, and their naming."""
+"""Recurring sounds on the page: groups found by `hearthlog discover`, and their naming."""
 
 import os
 import subprocess
@@ -31,14 +31,14 @@ _SPACE = "\N{NO-BREAK SPACE}"
 
 
 class Moment(NamedTuple):
-    """When something is told, in nanoseconds of UTC, and in which time zone."""
+    """The current time in nanoseconds of UTC, with the time zone of the home."""
 
     now: int
     zone: tzinfo
 
 
 def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
-    """Choose the groups that are shown, by keys that no group of another file has."""
+    """Return the displayed groups, by keys that are unique across summary files."""
     unnamed = [each for each in summary.groups if not each.name][:_MOST_UNNAMED]
     named = [each for each in summary.groups if each.name][:_MOST_NAMED]
     return {f"{each.number} of {summary.id}": each for each in [*unnamed, *named]}
@@ -47,12 +47,14 @@ def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
 def recurring_list(
     summary: GroupsSummary, looked: int, said: Mapping[str, str], moment: Moment
 ) -> Any:
-    """Describe the sounds that recur for JSON.
+    """Return the recurring sounds for JSON.
 
     Parameters
     ----------
     looked : int
         When the summary was written, in nanoseconds of UTC.
+    said : mapping of str to str
+        Status of naming, by key of the group.
     """
     shown = shown_groups(summary)
     left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED
@@ -68,7 +70,7 @@ def recurring_list(
 
 
 def group_words(group: GroupSummary) -> str:
-    """Name a group as people do: `Door bell`, or `Sound 3` where it has no name."""
+    """Return the readable name of a group: `Door bell`, or `Sound 3` if unnamed."""
     return class_words(group.name) if group.name else f"Sound {group.number}"
 
 
@@ -117,9 +119,9 @@ _DONE_WITH_LOSSES = 3  # exit status
 
 
 class GroupNaming:
-    """Names groups of sounds, one at a time.
+    """Names groups of sounds, one at a time, in a child process.
 
-    All logs are read for that: too much for the bridge, which lives on a small box.
+    Naming reads all logs: too much for the bridge process on a small box.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -130,17 +132,17 @@ class GroupNaming:
         self._lock = Lock()
 
     def start(self, key: str, number: int, label: str) -> str:
-        """Begin to mark the sounds of a group, and say so.
+        """Start marking the sounds of a group; return a status text.
 
         Parameters
         ----------
         label : str
-            The class that they are; empty to take the marks back.
+            Class of the sounds; empty to remove the marks.
 
         Raises
         ------
         BridgeError
-            If another group is being named, or nothing can be written there.
+            If another group is being named, or the folder is not writable.
         """
         asked = ["--undo", str(number)]
         text = "The name is being taken back …"
@@ -162,13 +164,13 @@ class GroupNaming:
         return text
 
     def close(self) -> None:
-        """End what goes on; what has been marked stays, and is completed by naming again."""
+        """Terminate the process; marks made so far stay, and naming again completes them."""
         with self._lock:
             if self._process is not None:
                 self._process.terminate()
 
     def _follow(self, process: subprocess.Popen[str], key: str, number: int) -> None:
-        """Wait for the end, and keep what it says."""
+        """Wait for the process to end, and store its result."""
         timer = Timer(_LONGEST_SECONDS, process.kill)
         timer.daemon = True
         timer.start()
@@ -179,7 +181,7 @@ class GroupNaming:
 
 
 def _started(asked: list[str]) -> subprocess.Popen[str]:
-    """Start `hearthlog discover`, which lets others go first."""
+    """Start `hearthlog discover` with low priority."""
     try:
         process = subprocess.Popen(  # noqa: S603  a list of arguments, without a shell
             [*module_command("hearthlog.tools.cli.main"), "discover", *asked],
@@ -197,7 +199,7 @@ def _started(asked: list[str]) -> subprocess.Popen[str]:
 
 
 def _read(stream: IO[str], wanted: str) -> tuple[str, str]:
-    """Return the line that begins as wanted, and the last one, without what begins each."""
+    """Return the line that begins as wanted, and the last line, both without their prefix."""
     result = last = ""
     while line := stream.readline(_LONGEST_LINE):
         last = line.removeprefix(_PREFIX)
@@ -218,12 +220,12 @@ _NOTHING: dict[str, Any] = {"looked": "", "more": "", "groups": []}
 
 
 class RecurringSounds:
-    """The groups that `hearthlog discover` has found, if it has.
+    """The groups found by `hearthlog discover`, if any.
 
     Attributes
     ----------
     problem : str
-        Why they are not shown; empty if nothing is wrong.
+        Why the groups cannot be shown; empty if there is no problem.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -237,7 +239,7 @@ class RecurringSounds:
         self._described: Any = _NOTHING
 
     def describe(self, moment: Moment) -> Any:
-        """Describe the groups for JSON; there are none without a summary that can be read."""
+        """Return the groups for JSON; empty without a readable summary."""
         self._look()
         if self._summary is None:
             return _NOTHING
@@ -249,17 +251,17 @@ class RecurringSounds:
         return self._described
 
     def name(self, key: str, text: str) -> str:
-        """Begin to name a group, and say so.
+        """Start naming a group; return a status text.
 
         Parameters
         ----------
         text : str
-            A class, by its name or in words; empty to take the name back.
+            A class, by name or in words; empty to remove the name.
 
         Raises
         ------
         BridgeError
-            If there is no such group any more, the text cannot be a class, or it cannot be done.
+            If the group no longer exists, the text is no valid class name, or naming cannot start.
         """
         summary = self._summary
         group = None if summary is None else shown_groups(summary).get(key)
@@ -271,11 +273,11 @@ class RecurringSounds:
         return self._naming.start(key, group.number, label)
 
     def close(self) -> None:
-        """Name no more."""
+        """Stop naming."""
         self._naming.close()
 
     def _look(self) -> None:
-        """Read the summary if it is another file than before."""
+        """Reread the summary if its file has changed."""
         try:
             status = self._file.stat()
         except OSError:

@@ -1,4 +1,4 @@
-"""Server of the page: admission of requests, and streams of the page's parts."""
+"""Web server of the page: admission of requests, and streams of the page's parts."""
 
 import hmac
 import json
@@ -22,7 +22,7 @@ from hearthlog.analyzer.network import host_name, is_asked_in_digits
 from hearthlog.schemas.errors import HearthlogError
 
 _YEAR = 365 * 24 * 3600
-_PLAIN = re.compile(r"[a-z0-9.:-]{1,253}")  # a name, or an address, that can be said
+_PLAIN = re.compile(r"[a-z0-9.:-]{1,253}")  # a name or address that is safe in a message
 _WHOLE = (
     "This page opens with its whole address only: copy all of it, with what is behind `?token=`. "
     "`hearthlog bridge` says at its start in which file the address is."
@@ -31,16 +31,18 @@ _WHOLE = (
 
 @dataclass(frozen=True)
 class PageAdmission:
-    """What a request must say.
+    """Checks of requests: token or pass, `Origin`, and `Host`.
 
-    A page in a browser can send requests to every server of this machine. The token keeps out who
-    does not know the address, the origin other pages that came to know it, and the host those that
-    let a name of theirs point here.
+    Any web page in a browser can send requests to every server of this machine. The token excludes
+    clients that do not know the address, the check of `Origin` excludes other pages that know it,
+    and the check of `Host` excludes pages that use DNS rebinding.
 
     Attributes
     ----------
+    key : bytes
+        Key that signs passes.
     names : frozenset of str
-        Names by which the page may be asked for, with or without a port.
+        Host names under which the page may be requested, with or without a port.
     """
 
     bind: str
@@ -50,19 +52,19 @@ class PageAdmission:
     names: frozenset[str] = frozenset()
 
     def cookie(self) -> str:
-        """Return the field that has a browser remember for a year that it may read.
+        """Return the `Set-Cookie` value with a pass for a year.
 
-        It has no path: a browser takes that of the request, which a proxy may have changed.
+        The cookie has no path, so the browser uses that of the request, which a proxy may change.
         """
         rules = f"Max-Age={_YEAR}; HttpOnly; SameSite=Strict"
         return f"{self._cookie_name}={self.new_pass()}; {rules}"
 
     def new_pass(self) -> str:
-        """Return what shows for a year that somebody had the token; it does not give it away."""
+        """Return a pass valid for a year, which proves knowledge of the token without its value."""
         return self._pass(int(time.time()) + _YEAR)
 
     def is_pass(self, text: str) -> bool:
-        """Return whether a text is a pass that is valid now."""
+        """Whether a text is a currently valid pass."""
         until, _, _ = text.partition("-")
         if not (until.isascii() and until.isdecimal()) or len(until) > 12:
             return False
@@ -70,7 +72,7 @@ class PageAdmission:
         return is_ours and time.time() < int(until)
 
     def has_token(self, target: str) -> bool:
-        """Tell whether the target of a request is the page with the token."""
+        """Whether the target of a request is the page with the token."""
         return compare_digest(target.encode(), f"/?token={self.token}".encode())
 
     def refusal(
@@ -81,12 +83,12 @@ class PageAdmission:
         changes: bool,
         has_pass: bool = False,
     ) -> str:
-        """Judge a request.
+        """Check a request.
 
         Returns
         -------
         str
-            Why it is refused, and what to do; empty if it is not.
+            Reason of a refusal and its remedy; empty if the request is admitted.
         """
         hosts, origins = fields["Host"], fields["Origin"]
         host = hosts[0].lower() if len(hosts) == 1 else ""
@@ -111,13 +113,13 @@ class PageAdmission:
         return f"{reason}{_WHOLE}"
 
     def _is_named(self, host: str) -> bool:
-        """Return whether the page opens under the host of a request."""
+        """Whether the host of a request is allowed."""
         if host in self.names or host_name(f"//{host}") in self.names:
             return True
         return bool(host) and is_asked_in_digits(self.bind, host)
 
     def _is_own(self, origin: str, host: str) -> bool:
-        """Return whether an origin is that of the page itself."""
+        """Whether an origin is that of the page itself."""
         scheme, _, place = origin.partition("://")
         return scheme in {"http", "https"} and (place == host or place in self.names)
 
@@ -148,14 +150,14 @@ _STALE_SECONDS = 15.0
 
 
 class PagePart(NamedTuple):
-    """A part of the page: how often it has changed, and its content as JSON."""
+    """A part of the page: a number that grows with each change, and JSON content."""
 
     number: int
     content: bytes
 
 
 class Board:
-    """Parts of a page, each the newest; a reader who is slow misses those between."""
+    """Newest version of each part of a page; slow readers miss versions in between."""
 
     def __init__(self) -> None:
         self._parts: dict[str, PagePart] = {}
@@ -164,7 +166,7 @@ class Board:
         self.is_closed = False
 
     def put(self, name: str, content: bytes) -> None:
-        """Replace a part, if it is another one than before."""
+        """Replace a part, if its content has changed."""
         with self._changed:
             part = self._parts.get(name)
             if part is None or part.content != content:
@@ -172,25 +174,22 @@ class Board:
                 self._changed.notify_all()
 
     def keep_fresh(self) -> None:
-        """Note that the parts are right now."""
+        """Record that the parts are up to date."""
         self._seen = monotonic()
 
     def is_fresh(self) -> bool:
-        """Tell whether the parts were right in the last fifteen seconds."""
+        """Whether the parts were up to date within the last fifteen seconds."""
         return monotonic() - self._seen <= _STALE_SECONDS
 
     def wait(self, known: Mapping[str, int], seconds: float) -> dict[str, PagePart]:
-        """Wait for parts that a reader does not know.
+        """Wait for parts that differ from a reader's; empty on timeout or when closed.
 
         Parameters
         ----------
+        known : mapping of str to int
+            Numbers of the reader's parts.
         seconds : float
-            To wait, at most.
-
-        Returns
-        -------
-        dict of str to PagePart
-            Empty if there are none.
+            Timeout.
         """
 
         def newer() -> dict[str, PagePart]:
@@ -203,14 +202,14 @@ class Board:
             return newer()
 
     def close(self) -> None:
-        """Let no reader wait any more."""
+        """Wake all readers, which must stop."""
         with self._changed:
             self.is_closed = True
             self._changed.notify_all()
 
 
 _MOST_STREAMS = 16
-_MARK_SECONDS = 120.0  # for the logs of the event to be read, from a slow disk
+_MARK_SECONDS = 120.0  # to read the logs of the event from a slow disk
 _BEAT_SECONDS, _LOOK_SECONDS = 5.0, 1.0
 _BODY_LIMIT = 4 << 10  # bytes
 _FILES = {
@@ -218,7 +217,7 @@ _FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
 }
-_ASKED = {"/mark": "event", "/group": "group"}  # what a label is given to
+_ASKED = {"/mark": "event", "/group": "group"}  # JSON field of the labelled subject
 _JSON = "application/json"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
@@ -231,7 +230,7 @@ _PROTECTION = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-# A page and no redirection: to that, a browser that comes from a link sends no strict cookie.
+# Not a redirect: a browser that follows a link sends no strict cookie to the redirect's target.
 _ENTRANCE = (
     '<!doctype html><html lang="en"><meta charset="utf-8"><title>The home</title>'
     '<meta http-equiv="refresh" content="0; url=TO"><p><a href="TO">Open the page</a></p></html>\n'
@@ -239,24 +238,26 @@ _ENTRANCE = (
 
 
 def _protection(frames: Sequence[str]) -> dict[str, str]:
-    """Return the fields of each answer, by the pages that may show this one in a frame."""
+    """Return the headers of each response, for the origins that may frame the page."""
     ancestors = " ".join(frames) or "'none'"
     fields = {**_PROTECTION, "Content-Security-Policy": f"{_POLICY}; frame-ancestors {ancestors}"}
     return fields if frames else fields | {"X-Frame-Options": "DENY"}
 
 
 class PageServer(HttpServer):
-    """Serves the page from a thread of its own.
+    """Serves the page from a separate thread.
 
     Parameters
     ----------
+    actions : mapping of str to callable
+        By path of a POST request: takes the id of an event or group and a label, returns a text.
     frames : sequence of str, optional
-        Pages, by their origins, that may show this one in a frame.
+        Origins of pages that may show this page in a frame.
 
     Raises
     ------
     BridgeError
-        If nothing can listen there.
+        If the address or port cannot be bound.
     """
 
     def __init__(
@@ -281,13 +282,13 @@ class PageServer(HttpServer):
         self.start()
 
     def end(self) -> None:
-        """Send nobody anything any more."""
+        """Stop all streams and the server."""
         self.board.close()
         super().end()
 
 
 class _Handler(HttpHandler):
-    """Answers one request."""
+    """Handler of one request."""
 
     body_limit = _BODY_LIMIT
 
@@ -296,12 +297,12 @@ class _Handler(HttpHandler):
         return cast(PageServer, self.server)
 
     def setup(self) -> None:
-        """Send with each answer what protects the page."""
+        """Set the security headers of each response."""
         self.fields = self._server.fields
         super().setup()
 
     def get(self) -> None:
-        """Send the page, one of its files, or what is new from now on."""
+        """Send the page, one of its files, or the stream of changes."""
         if not self._is_admitted(changes=False):
             return
         if self._server.admission.has_token(self.path):
@@ -316,7 +317,7 @@ class _Handler(HttpHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def post(self) -> None:
-        """Take what somebody says that an event was, or the sounds of a group."""
+        """Accept a label for an event or for the sounds of a group."""
         if not self._is_admitted(changes=True):
             return
         if self._path not in _ASKED:
@@ -348,16 +349,16 @@ class _Handler(HttpHandler):
         return False
 
     def _without_pass(self) -> tuple[str, bool]:
-        """Return the path without the pass that begins it in frames, and whether one did."""
+        """Return the path without its leading pass (used in frames), and whether there was one."""
         first, slash, rest = self.path.removeprefix("/").partition("/")
         if self._server.has_frames and slash and self._server.admission.is_pass(first):
             return f"/{rest}", True
         return self.path, False
 
     def _send_entrance(self) -> None:
-        """Send what leads from the address with the token to the page.
+        """Send a page that leads from the address with the token to the page itself.
 
-        In a frame of another site a browser keeps no cookie of the page: the path has the pass.
+        In a frame of another site the browser stores no cookie, so the pass goes into the path.
         """
         admission = self._server.admission
         to = f"./{admission.new_pass()}/" if self._server.has_frames else "./"
@@ -365,7 +366,7 @@ class _Handler(HttpHandler):
         self.send(HTTPStatus.OK, _ENTRANCE.replace("TO", to).encode(), _FILES["/"][1], cookie)
 
     def _body(self, what: str) -> tuple[str, str] | HTTPStatus:
-        """Read what is labelled and its label, or return what is wrong."""
+        """Read the id and label from the body; return a status code on an invalid body."""
         length = self.headers.get("Content-Length", "")
         if self.headers.get_content_type() != _JSON:
             return HTTPStatus.UNSUPPORTED_MEDIA_TYPE
@@ -383,7 +384,7 @@ class _Handler(HttpHandler):
         return labelled, label
 
     def _stream(self) -> None:
-        """Send what the board has, and then what changes."""
+        """Send the parts of the board, and then their changes."""
         server = self._server
         if not server.streams.acquire(blocking=False):
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE)
@@ -408,12 +409,12 @@ class _Handler(HttpHandler):
             server.streams.release()
 
     def _is_gone(self) -> bool:
-        """Tell whether the browser has closed the connection."""
+        """Whether the browser has closed the connection."""
         readable, _, _ = select.select([self.connection], [], [], 0)
         return bool(readable) and not self.connection.recv(1, socket.MSG_PEEK)
 
 
 def _as_events(parts: Mapping[str, PagePart], *, is_fresh: bool) -> bytes:
-    """Write parts as server-sent events, and a beat: without it what the page shows may be old."""
+    """Format parts as server-sent events with a beat; without beats the page may be stale."""
     news = [b"event: %s\ndata: %s\n\n" % (n.encode(), part.content) for n, part in parts.items()]
     return b"".join([*news, b"event: beat\ndata:\n\n" if is_fresh else b":\n\n"])
