@@ -1,1 +1,1 @@
-"""What is heard, and what was, in Foxglove and Lichtblick: the log's bytes over a WebSocket."""
+"""Live and recorded logs in Foxglove and Lichtblick: the log's bytes over a WebSocket."""

@@ -1,4 +1,4 @@
-"""Publishing of messages to Foxglove: those of a growing log, and those of recorded ones."""
+"""Publishers of growing and of recorded logs to Foxglove."""
 
 import math
 import time
@@ -30,15 +30,15 @@ from hearthlog.schemas.messages.message_types import STREAM_INFO
 
 
 class Publisher:
-    """Publishes messages, and repeats the last description of each stream when it is asked to."""
+    """Publishes messages, and repeats the last description of each stream on request."""
 
     def __init__(self) -> None:
         self.context = Context()
         self._channels: dict[str, Channel] = {}
-        self._descriptions: dict[int, tuple[bytes, int]] = {}  # by the number of the channel
+        self._descriptions: dict[int, tuple[bytes, int]] = {}  # by channel number
 
     def advertise(self, channel: records.Channel, schema: records.Schema | None) -> bool:
-        """Tell viewers of a topic; one whose type grew is told anew."""
+        """Advertise a topic to viewers; again if its type grew."""
         known = self._channels.get(channel.topic)
         if known is not None:
             if _is_of(known, channel, schema):
@@ -55,18 +55,18 @@ class Publisher:
         return True
 
     def publish(self, messages: RawMessages, row: int) -> None:
-        """Send a message to those who subscribed to its topic."""
+        """Send a message to the subscribers of its topic."""
         self.advertise(messages.channel, messages.schema)
         channel = self._channels[messages.channel.topic]
         describes = messages.schema is not None and messages.schema.name == STREAM_INFO
         if describes or channel.has_sinks():
             payload, time = messages.payload(row), int(messages.log_times[row])
-            if describes:  # first, so that who subscribes meanwhile gets it one way or the other
+            if describes:  # first, so that a viewer that subscribes meanwhile gets it either way
                 self._descriptions[channel.id()] = payload, time
             channel.log(payload, log_time=time)
 
     def repeat(self, number: int, topic: str) -> None:
-        """Send the last description of a stream again, for one who came after it."""
+        """Send the last description of a stream again, for a later subscriber."""
         last = self._descriptions.get(number)
         channel = self._channels.get(topic)
         if last is not None and channel is not None:
@@ -74,7 +74,7 @@ class Publisher:
 
 
 def _is_of(known: Channel, channel: records.Channel, schema: records.Schema | None) -> bool:
-    """Tell whether a channel that viewers know has messages of this type."""
+    """Return whether an advertised channel has messages of this type."""
     theirs = known.schema()
     same = (theirs and (theirs.name, theirs.data)) == (schema and (schema.name, schema.data))
     return same and known.message_encoding == channel.message_encoding
@@ -84,8 +84,8 @@ def _of_sdk(schema: records.Schema) -> Schema:
     return Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
 
 
-_WINDOW = 3600 * NANOSECONDS  # whose logs are looked into at once
-_RECENT = NANOSECONDS  # what was said so long before a moment is still seen then
+_WINDOW = 3600 * NANOSECONDS  # logs of this span are read at once
+_RECENT = NANOSECONDS  # messages this long before a moment are still shown at it
 
 Damaged = Callable[[LogError], None]
 ChannelType = tuple[records.Channel, records.Schema | None]
@@ -102,12 +102,12 @@ def channels_of(log: Path) -> list[ChannelType]:
 
 
 class RecordedSpan:
-    """The messages of some logs between two times.
+    """Messages of some logs between two times.
 
     Parameters
     ----------
     start, end : int or None
-        Nanoseconds of UTC: from `start` on, before `end`; None for all there is.
+        Nanoseconds of UTC; `end` is excluded; None for no limit.
 
     Raises
     ------
@@ -155,22 +155,22 @@ class RecordedSpan:
         Yields
         ------
         list of RawMessages
-            Those of the next span of time; none is older than any that was yielded before.
+            Messages of the next span of time; none is older than any yielded before.
         """
         while start < self.end:
             end = min(start + _WINDOW, self.end)
             yield from self._between(start, end)
-            # Years may lie between two logs: a box without a clock begins in 1970.
+            # Years may lie between two logs: a recorder without a clock begins in 1970.
             later = (max(first, end) for first, last, _ in self._spans if last >= end)
             start = min(later, default=self.end)
 
     def before(self, moment: int) -> list[tuple[RawMessages, int]]:
-        """Read what is known at a moment.
+        """Read the state at a moment.
 
         Returns
         -------
         list of (RawMessages, int)
-            The last description of each stream in the logs that have the moment, and the last
+            The last description of each stream in the logs that contain the moment, and the last
             message of each topic in the second before, with their places.
         """
         known: dict[str, tuple[RawMessages, int]] = {}
@@ -189,7 +189,7 @@ class RecordedSpan:
     def _between(
         self, start: int, end: int, topics: Collection[str] | None = None
     ) -> Generator[list[RawMessages], None, None]:
-        """Read all logs together; without those that turn out to be damaged."""
+        """Read all logs together, except damaged ones."""
         spans = [path for a, b, path in self._spans if a < end and b >= start]
         logs = [path for path in spans if path not in self._passed_over]
         try:
@@ -213,17 +213,17 @@ def _is_sound(log: Path, start: int, end: int) -> bool:
     return True
 
 
-_SUBSCRIBE_SECONDS = 0.5  # that viewers have to ask for a new topic before it speaks
-_HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
+_SUBSCRIBE_SECONDS = 0.5  # time for viewers to subscribe to a new topic before its first message
+_HEARD = ("", AUDIO_LAYER)  # layers of current sound; the others are about earlier sound
 
 
 def publish_live(folder: Path, publisher: Publisher, stop: Event, damaged: Damaged) -> None:
-    """Publish what is written to the logs of a folder from now on.
+    """Publish new messages of the logs in a folder.
 
     Parameters
     ----------
     damaged : callable
-        Told the error of a log of which no more can be read.
+        Called with the error of a log that can no longer be read.
     """
     known: set[Path] = set()
     for path, parts in follow_messages(folder, stop=stop, damaged=damaged, infos=True):
@@ -239,22 +239,22 @@ def publish_live(folder: Path, publisher: Publisher, stop: Event, damaged: Damag
 
 
 def _advertise(log: Path, publisher: Publisher) -> bool:
-    """Tell of all topics of a log, also of those that speak rarely; tell whether one is new."""
-    with suppress(LogError):  # it gets another name at this moment
+    """Advertise all topics of a log, also rarely used ones; return whether one is new."""
+    with suppress(LogError):  # it is being renamed at this moment
         return sum(publisher.advertise(*channel) for channel in channels_of(log)) > 0
     return False
 
 
 _SLOWEST, _FASTEST = 0.01, 100.0
-_TICK_SECONDS = 0.05  # so often viewers are told the time
+_TICK_SECONDS = 0.05  # interval of time messages to viewers
 _IDLE_SECONDS = 0.2
-# The answer to a seek empties the views: what is to be seen then must come after it. Many seeks
-# follow each other while somebody drags the time, and only the last one is worth reading for.
+# The answer to a seek empties the views, so the current messages must come after it. Dragging
+# the time causes many seeks, and only the last one is worth reading for.
 _SETTLE_SECONDS = 0.1
 
 
 class Playback:
-    """Publishes a recording; all viewers share one state of it."""
+    """Publishes a recording; all viewers share one playback state."""
 
     def __init__(self, recording: RecordedSpan, publisher: Publisher, stop: Event) -> None:
         self._recording = recording
@@ -266,7 +266,7 @@ class Playback:
         self._position = recording.start  # at the moment `_since`
         self._since = time.monotonic()
         self._seeks = 0
-        self._told = self._since  # when the viewers were told the time
+        self._told = self._since  # last time message to viewers
 
     @property
     def span(self) -> tuple[int, int]:
@@ -274,7 +274,7 @@ class Playback:
         return self._recording.start, self._recording.end
 
     def obey(self, request: PlaybackControlRequest) -> PlaybackState:
-        """Do what a viewer asks for."""
+        """Apply a viewer's request."""
         with self._changed:
             self._position, self._since = self._now(), time.monotonic()
             if math.isfinite(request.playback_speed):
@@ -291,7 +291,7 @@ class Playback:
             return self._state(did_seek=request.seek_time is not None)
 
     def play(self, server: WebSocketServer) -> None:
-        """Publish what is to be seen, until `stop` is set."""
+        """Publish the recording until `stop` is set."""
         while not self._stop.is_set():
             with self._changed:
                 seeks, start = self._seeks, self._position
@@ -307,7 +307,7 @@ class Playback:
                 self._end(server, seeks)
 
     def _publish(self, parts: Sequence[RawMessages], server: WebSocketServer, seeks: int) -> bool:
-        """Publish messages at their times; tell whether nothing came in between."""
+        """Publish messages at their times; return False after a seek or stop."""
         for part, row in in_order_of_time(parts):
             if not self._wait_until(int(part.log_times[row]), server, seeks):
                 return False
@@ -315,7 +315,7 @@ class Playback:
         return True
 
     def _wait_until(self, moment: int, server: WebSocketServer, seeks: int) -> bool:
-        """Wait until a moment is played; tell whether nothing came in between."""
+        """Wait until a moment is played; return False after a seek or stop."""
         while True:
             with self._changed:
                 if self._stop.is_set() or self._seeks != seeks:
@@ -332,7 +332,7 @@ class Playback:
                 return True
 
     def _end(self, server: WebSocketServer, seeks: int) -> None:
-        """Tell that all was played, and wait until a viewer goes back."""
+        """Announce the end of the recording, and wait until a viewer seeks back."""
         with self._changed:
             if self._seeks != seeks:
                 return
@@ -344,7 +344,7 @@ class Playback:
                 self._changed.wait(_IDLE_SECONDS)
 
     def _now(self) -> int:
-        """Return the log time that is played now."""
+        """Return the current log time of the playback."""
         if self._status != PlaybackStatus.Playing:
             return self._position
         elapsed = (time.monotonic() - self._since) * self._speed

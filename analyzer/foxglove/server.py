@@ -1,4 +1,4 @@
-"""The server of Foxglove's SDK behind a gate that checks address, origin and token."""
+"""Server of Foxglove's SDK behind a gate that checks address, origin and token."""
 
 import asyncio
 import logging
@@ -32,26 +32,26 @@ from hearthlog.schemas.errors import HearthlogError
 _ORIGINS = frozenset({"https://app.foxglove.dev", "file://"})
 _FIELD = re.compile(r"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([\x20-\x7e]*?)[ \t]*")
 _HANDED_ON = ("Sec-WebSocket-Key", "Sec-WebSocket-Version", "Sec-WebSocket-Protocol")
-_LONGEST = 200  # characters of an origin that is told
+_LONGEST = 200  # maximum characters of a reported origin
 
 
 class RefusedError(HearthlogError):
-    """Somebody may not look; the message says why, to whoever runs the server."""
+    """A refused connection; the message gives the reason to the operator of the server."""
 
 
 @dataclass(frozen=True)
 class Admission:
-    """What a request must say.
+    """Requirements for a request.
 
-    A page in a browser can connect to every server of this machine. The token keeps out who does
-    not know the address, the origin other pages that came to know it, and the host those that let a
-    name of theirs point here.
+    A page in a browser can connect to every server of this machine. The token blocks clients that
+    do not know the address, the origin blocks other pages that learned it, and the host blocks
+    pages with a domain name that resolves to this machine.
 
     Attributes
     ----------
     origins : frozenset of str
-        Pages that may look, as `https://lichtblick.example`, beside Foxglove's own and those that
-        this machine serves. What is no page names none, and needs the token only.
+        Allowed pages, as `https://lichtblick.example`, in addition to Foxglove's own and to local
+        pages. A client that is no page sends no origin, and needs only the token.
     """
 
     bind: str
@@ -59,22 +59,22 @@ class Admission:
     origins: frozenset[str] = frozenset()
 
     def check(self, head: bytes) -> bytes:
-        """Judge a request.
+        """Check a request.
 
         Parameters
         ----------
         head : bytes
-            Up to the empty line, with it.
+            Up to and including the empty line.
 
         Returns
         -------
         bytes
-            Head of the request for the server behind: what this one is not about is left out.
+            Head of the request for the server behind the gate, without unneeded fields.
 
         Raises
         ------
         RefusedError
-            If the one who asks may not look.
+            If the client is not allowed.
         """
         target, fields = _parse(head)
         origin = fields.get("origin")
@@ -97,7 +97,7 @@ class Admission:
 
 
 def _parse(head: bytes) -> tuple[str, Mapping[str, str]]:
-    """Return the target and the fields, by their names in lower case."""
+    """Return the target, and the fields by lower-case name."""
     first, *lines = head.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
     method, _, rest = first.partition(" ")
     target, _, version = rest.partition(" ")
@@ -109,30 +109,28 @@ def _parse(head: bytes) -> tuple[str, Mapping[str, str]]:
 
 
 def _is_local(origin: str) -> bool:
-    """Tell whether a page is one that this machine serves."""
+    """Return whether a page is served by this machine."""
     address = ip_of(name := host_name(origin))
     is_here = name == "localhost" or (address is not None and address.is_loopback)
     return is_here and origin.startswith(("http://", "https://"))
 
 
 _HEAD_SECONDS, _CLOSE_SECONDS = 5, 1
-_LARGEST_HEAD = 16384  # bytes: the cookies of all servers of this machine are in it
-_MOST_ASKING, _MOST_LOOKING = 32, 8  # connections at once
+_LARGEST_HEAD = 16384  # bytes: includes the cookies of all servers of this machine
+_MOST_ASKING, _MOST_LOOKING = 32, 8  # maximum connections at once
 _BLOCK = 1 << 16  # bytes
-_BUFFER = (
-    1 << 17
-)  # bytes that the system holds of what is on its way: seconds of sound, not minutes
+_BUFFER = 1 << 17  # maximum bytes buffered by the system: seconds of sound, not minutes
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
-_GONE_SECONDS = 30  # after which a viewer that answers nothing is given up
+_GONE_SECONDS = 30  # timeout for a viewer that does not answer
 
 Refused = Callable[[RefusedError], None]
 
 
 class Gate:
-    """Takes connections in a thread of its own, and pipes those that are admitted.
+    """Accepts connections in its own thread, and pipes the admitted ones.
 
-    So many may ask at a time: another one takes the place of the oldest of the address that has
-    most of them, so that nobody keeps out who has the token by connections that say nothing.
+    The number of pending requests is limited: a new one replaces the oldest of the address with the
+    most of them, so that idle connections cannot block a client with the token.
     """
 
     def __init__(
@@ -146,7 +144,7 @@ class Gate:
         self._behind = behind
         self._admission = admission
         self._refused = refused
-        self._asking: dict[Task[None], str] = {}  # and their addresses, the oldest first
+        self._asking: dict[Task[None], str] = {}  # pending requests: address, the oldest first
         self._looking: set[Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = Thread(target=self._run, name="gate", daemon=True)
@@ -175,7 +173,7 @@ class Gate:
         while True:
             try:
                 connection, address = await self._loop.sock_accept(self._listener)
-            except OSError:  # too many files are open, or it was gone already
+            except OSError:  # too many files are open, or the client was gone already
                 await asyncio.sleep(1)
                 continue
             if len(self._asking) >= _MOST_ASKING:
@@ -189,7 +187,7 @@ class Gate:
             task.add_done_callback(self._looking.discard)
 
     async def _take(self, connection: socket.socket) -> None:
-        """Serve one who connects, from the request to the end."""
+        """Serve a connection, from the request to the end."""
         _configure(connection)
         reader, writer = await asyncio.open_connection(sock=connection, limit=_LARGEST_HEAD)
         with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
@@ -232,21 +230,21 @@ class Gate:
 
 
 async def _close(writer: StreamWriter) -> None:
-    """End a connection when what was written last is sent."""
+    """End a connection after the last data is sent."""
     writer.close()
     async with asyncio.timeout(_CLOSE_SECONDS):
         await writer.wait_closed()
 
 
 async def _pipe(reader: StreamReader, writer: StreamWriter) -> None:
-    """Copy until one side ends; who reads slowly lets the other wait, and nothing piles up."""
+    """Copy until one side ends; a slow reader blocks the writer, so nothing accumulates."""
     while block := await reader.read(_BLOCK):
         writer.write(block)
         await writer.drain()
 
 
 def _configure(connection: socket.socket) -> None:
-    """Keep little for a slow viewer, and give up one that vanished, as a laptop that sleeps."""
+    """Buffer little for a slow viewer, and drop one that vanished, as a laptop that sleeps."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -254,23 +252,23 @@ def _configure(connection: socket.socket) -> None:
         ("TCP_KEEPIDLE", _GONE_SECONDS),
         ("TCP_USER_TIMEOUT", _GONE_SECONDS * 1000),
     ):
-        if hasattr(socket, option):  # not everywhere
+        if hasattr(socket, option):  # not on all platforms
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
 
-PORT = 8765  # where Foxglove looks for a server if it is not told
-_BACKLOG = 8192  # messages that wait for a slow viewer, some megabytes; then the oldest are dropped
+PORT = 8765  # default port in Foxglove
+_BACKLOG = 8192  # messages queued for a slow viewer, some megabytes; then the oldest are dropped
 
 
 class _Listener(ServerListener):
-    """Takes what viewers ask for: descriptions that they missed, and the time to play."""
+    """Handles requests of viewers: missed descriptions, and playback control."""
 
     def __init__(self, publisher: Publisher, player: Playback | None) -> None:
         self._publisher = publisher
         self._player = player
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        del client  # only its number is known, and messages go to all: the others get it twice
+        del client  # only its number is available; messages go to all, so the others get it twice
         self._publisher.repeat(channel.id, channel.topic)
 
     def on_playback_control_request(
@@ -287,8 +285,8 @@ def serve(
     publisher: Publisher,
     player: Playback | None = None,
 ) -> Iterator[WebSocketServer]:
-    """Let viewers connect that may look."""
-    logging.getLogger("foxglove").addHandler(logging.NullHandler())  # it tells who hung up
+    """Serve allowed viewers."""
+    logging.getLogger("foxglove").addHandler(logging.NullHandler())  # it logs disconnects
     address = hidden_address()
     server = foxglove.start_server(
         name="hearthlog",

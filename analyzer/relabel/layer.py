@@ -1,4 +1,4 @@
-"""Layers of a relabelling: their job, their labels and segments, their metadata."""
+"""Relabel layers: job, labels and segments, metadata."""
 
 import glob
 import json
@@ -48,15 +48,15 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import Topic, label_topics, relabelling
 from hearthlog.schemas.new_files import new_file, readers_of, replaced_file
 
-OpenRuns = Mapping[str, StateRun]  # open segments, by the names of their microphones
+OpenRuns = Mapping[str, StateRun]  # open segments by microphone
 _RUN = ("label", "start", "frames", "confidence")
 
 
 class LayerInputs(NamedTuple):
-    """What a layer is made from; equal inputs give equal labels and segments.
+    """Inputs of a layer; equal inputs give equal labels and segments.
 
-    `before` and `behind` are stems of the logs before and after; empty where there is none, or
-    where it was not decided yet whether the sound goes on there.
+    `before` and `behind` are stems of the previous and next log; empty if there is none, or if it
+    was not decided yet whether the sound continues there.
     """
 
     model: str
@@ -67,12 +67,12 @@ class LayerInputs(NamedTuple):
 
 
 class LayerMetadata(NamedTuple):
-    """What the `hearthlog` record of a layer says."""
+    """Content of the `hearthlog` record of a layer."""
 
     inputs: LayerInputs
-    open_at_start: OpenRuns  # the segments that were open when the log began
+    open_at_start: OpenRuns  # the segments open at the start of the log
     open_at_end: OpenRuns
-    loss: str  # what could not be read of the log
+    loss: str  # unreadable parts of the log
 
 
 def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
@@ -87,9 +87,9 @@ def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[T
 
 
 def read_layer_metadata(layer: Path) -> LayerMetadata | None:
-    """Read what a layer says of itself; None if there is no layer.
+    """Read the metadata of a layer; None if there is no layer.
 
-    Raise `LogError` if the layer is damaged, or `relabel` has not made it.
+    Raise `LogError` if the layer is damaged, or was not made by `relabel`.
     """
     if not layer.exists():
         return None
@@ -109,12 +109,12 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
 
 
 def part_path(layer: Path) -> Path:
-    """Return a path for an unfinished layer: hidden beside the layer, and new each time."""
+    """Return a path for an unfinished layer: hidden, next to the layer, and unique."""
     return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
 
 
 def delete_parts(layer: Path) -> None:
-    """Delete the unfinished files that this and other runs have left of a layer."""
+    """Delete the unfinished files of a layer left by this and other runs."""
     for part in layer.parent.glob(f".{glob.escape(layer.name)}.*"):
         with suppress(OSError):
             part.unlink()
@@ -137,7 +137,7 @@ def layer_record(
 
 
 def _now() -> str:
-    """Return the time, or that of SOURCE_DATE_EPOCH, by which builds are made reproducible."""
+    """Return the time, or SOURCE_DATE_EPOCH, which makes builds reproducible."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
@@ -153,7 +153,7 @@ def _runs_text(runs: OpenRuns) -> str:
 
 
 def _read_runs(text: str, microphones: Collection[str]) -> OpenRuns:
-    """Read open segments; of older layers, which have one microphone, they have no name."""
+    """Parse open segments; older layers have one microphone and no names."""
     if not text:
         return {}
     fields = json.loads(text)
@@ -165,7 +165,7 @@ def _read_runs(text: str, microphones: Collection[str]) -> OpenRuns:
     return {name: StateRun(*(int(run[key]) for key in _RUN)) for name, run in fields.items()}
 
 
-_MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has a minute only
+_MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has only a minute
 
 
 class Job(NamedTuple):
@@ -173,12 +173,12 @@ class Job(NamedTuple):
 
     log: Path
     layer: Path
-    earlier: tuple[Path, ...]  # logs before it, the last first
+    earlier: tuple[Path, ...]  # previous logs, the latest first
     next_log: Path | None
     model: Path
     model_sha256: str
-    replaces: bool  # whether there is a layer that may be replaced
-    continues_layer: bool  # whether the open segment at the start is taken from the layer before
+    replaces: bool  # whether a replaceable layer exists
+    continues_layer: bool  # whether the segment open at the start comes from the previous layer
 
 
 def make_job(
@@ -189,7 +189,7 @@ def make_job(
     Parameters
     ----------
     continues_layer : bool
-        Whether the open segment at the start is taken from the layer before.
+        Whether the segment open at the start comes from the previous layer.
     """
     log = chain.logs[place]
     first = max(place - _MOST_EARLIER, 0) if continues_layer else 0
@@ -206,7 +206,7 @@ def make_job(
 
 
 def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
-    """Tell whether a layer need not be made again; its open segment at the start is not compared.
+    """Return whether a layer is up to date; its segment open at the start is not compared.
 
     Raise `LogError` if the layer is of another model, or of another log.
     """
@@ -221,21 +221,21 @@ def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
         raise LogError(
             f"{job.layer}: was made from another log of this name; move it away, and run again"
         )
-    # Where a log beside it has been deleted since, the layer knows more than one made now would.
+    # If a neighbouring log was deleted since, the layer has more context than a new one would.
     same_before = not job.earlier or stem(job.earlier[0]) == inputs.before
     same_behind = job.next_log is None or stem(job.next_log) == inputs.behind
     return same_before and same_behind and not metadata.loss
 
 
-_CHUNK_SPAN = 60 * NANOSECONDS  # who wants segments alone reads the minutes in which some end
-_PIECE_SPAN = 600 * NANOSECONDS  # of labels that are encoded at once
+_CHUNK_SPAN = 60 * NANOSECONDS  # readers of segments read only the minutes in which a segment ends
+_PIECE_SPAN = 600 * NANOSECONDS  # labels encoded at once
 
 
 class LabelledSound(NamedTuple):
-    """The segments of a microphone in a log, as far as they are known without other layers.
+    """Segments of a microphone in a log, as far as they are known without other layers.
 
-    `lacks_start` tells whether a segment is open when the log begins whose earlier frames, counted
-    in the layer before, are still to be added; `open_at_start` is None until then.
+    `lacks_start` is true if a segment is open at the start of the log and its earlier frames,
+    counted in the previous layer, are not added yet; `open_at_start` is None until then.
     """
 
     microphone: str
@@ -243,10 +243,10 @@ class LabelledSound(NamedTuple):
     open_at_start: StateRun | None
     open_at_end: StateRun | None
     lacks_start: bool
-    frames: int  # that are labelled
+    frames: int  # number of labelled frames
 
     def with_start(self, open_at_start: StateRun | None) -> "LabelledSound":
-        """Add the open segment with which the layer before ends, if it is still lacking.
+        """Add the segment open at the end of the previous layer, if it is still missing.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class LabelledSound(NamedTuple):
         Returns
         -------
         LabelledSound
-            This one, if it does not lack its start; else a new one, which does not.
+            This object if it does not lack its start; otherwise a new, complete one.
         """
         if not self.lacks_start:
             return self
@@ -274,16 +274,16 @@ class LabelledSound(NamedTuple):
 
 
 class UnfinishedLayer(NamedTuple):
-    """The labels of a log, and the segments of each of its microphones."""
+    """Labels of a log, and the segments of each of its microphones."""
 
-    part: Path  # of labels, as `_row_type` has them, one microphone behind the other
+    part: Path  # file of labels of type `_row_type`, one microphone after the other
     inputs: LayerInputs
     node: str
     provenance: Mapping[str, str]  # the `hearthlog` record of the log
     sounds: Sequence[LabelledSound]
-    left_out: Mapping[str, str]  # feature sets of microphones that the model is not for
-    loss: str  # what could not be read of the log
-    lacks_embeddings: bool  # those that the model takes
+    left_out: Mapping[str, str]  # feature sets of microphones that the model does not support
+    loss: str  # unreadable parts of the log
+    lacks_embeddings: bool  # embeddings that the model requires
 
     @property
     def lacks_starts(self) -> bool:
@@ -292,26 +292,26 @@ class UnfinishedLayer(NamedTuple):
 
     @property
     def open_at_start(self) -> OpenRuns:
-        """The segments that are open when the log begins."""
+        """The segments open at the start of the log."""
         return {s.microphone: s.open_at_start for s in self.sounds if s.open_at_start is not None}
 
     @property
     def open_at_end(self) -> OpenRuns:
-        """The segments that are open when the log ends."""
+        """The segments open at the end of the log."""
         return {s.microphone: s.open_at_end for s in self.sounds if s.open_at_end is not None}
 
     @property
     def frames(self) -> int:
-        """Number of frames that are labelled."""
+        """Number of labelled frames."""
         return sum(sound.frames for sound in self.sounds)
 
     def with_starts(self, open_at_start: OpenRuns) -> "UnfinishedLayer":
-        """Add the open segments with which the layer before ends, where they are lacking."""
+        """Add the missing segments that are open at the end of the previous layer."""
         sounds = [sound.with_start(open_at_start.get(sound.microphone)) for sound in self.sounds]
         return self._replace(sounds=sounds)
 
     def delete(self) -> None:
-        """Delete the file of the labels, if it is there."""
+        """Delete the file of labels, if it exists."""
         with suppress(OSError):
             self.part.unlink()
 
@@ -322,24 +322,24 @@ _Labellers = dict[str, StreamLabeller]  # by microphone
 def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | None]:
     """Write the labels of logs, and find their segments.
 
-    The whole parts of a damaged log are labelled.
+    The intact parts of a damaged log are labelled.
 
     Parameters
     ----------
     jobs : sequence of Job
-        Of logs of one chain, each the next of the one before it.
+        Consecutive logs of one chain.
 
     Returns
     -------
     list of UnfinishedLayer or None
-        One for each log. The labels are in the file `part` of a layer, which belongs to the caller.
-        None if one of several logs failed: alone, it raises its error.
+        One for each log. The labels are in the file `part` of a layer, which the caller must
+        delete. None if one of several logs failed; a single log raises its error.
 
     Raises
     ------
     LogError
-        If the log has no features, or those of another set than the model's; if nothing of it is
-        whole; if the labels cannot be written.
+        If the log has no features, or a feature set other than the model's; if the log has no
+        intact part; if the labels cannot be written.
     ModelError
         If the file of the model is missing or damaged, or holds another model.
     """
@@ -364,7 +364,7 @@ def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | None]:
 
 
 def _label_log(job: Job, before: _Labellers) -> tuple[UnfinishedLayer, _Labellers]:
-    """Label a log; return also the labellers at its end, if the next log may go on with them."""
+    """Label a log; return also the labellers at its end, if the next log may continue with them."""
     model, classifier = _loaded(job.model, job.model_sha256)
     with TemporaryDirectory(prefix="hearthlog") as folder:
         try:
@@ -379,12 +379,12 @@ def _label_log(job: Job, before: _Labellers) -> tuple[UnfinishedLayer, _Labeller
 
 
 def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
-    """Add the segments to the labels, and give the layer its name.
+    """Append the segments to the labels and rename the file to the layer.
 
     Parameters
     ----------
     labelled : UnfinishedLayer
-        That lacks no starts any more. Its file `part` is deleted once the layer is complete.
+        Must not lack starts. Its file `part` is deleted once the layer is complete.
 
     Raises
     ------
@@ -418,13 +418,13 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
             writer.add_metadata(HEARTHLOG_METADATA, record)
             writer.finish(job.layer.name)
     except LogError:
-        if read_layer_metadata(job.layer) != metadata:  # else another run was quicker
+        if read_layer_metadata(job.layer) != metadata:  # otherwise another run was quicker
             raise
     delete_parts(job.layer)
 
 
 def _in_pieces(batches: Sequence[TopicBatch]) -> Iterator[list[TopicBatch]]:
-    """Cut messages of several topics at the same times."""
+    """Split messages of several topics at the same times."""
     times = np.concatenate([batch.log_times for batch in batches])
     begins = np.unique(times // _PIECE_SPAN)[1:] * _PIECE_SPAN
     places = [batch.log_times.searchsorted(begins).tolist() for batch in batches]
@@ -443,7 +443,7 @@ def _part(batch: TopicBatch, rows: slice) -> TopicBatch:
 def _read_labels(
     labelled: UnfinishedLayer, topics: Sequence[str], classes: Sequence[str]
 ) -> list[TopicBatch]:
-    """Read the labels of each microphone from the part."""
+    """Read the labels of each microphone from the part file."""
     stored, first = labelled.part.read_bytes(), 0
     batches = []
     for topic, sound in zip(topics, labelled.sounds, strict=True):
@@ -469,7 +469,7 @@ def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
 
 
 class _Begun(NamedTuple):
-    """A microphone of a log, before its first frame."""
+    """State of a microphone in a log, before its first frame."""
 
     info: RecorderInfo
     labeller: StreamLabeller
@@ -480,7 +480,7 @@ class _Begun(NamedTuple):
 def _label(
     job: Job, log: Path, before: _Labellers, model: Model, classifier: Classifier
 ) -> tuple[UnfinishedLayer, _Labellers]:
-    """Label a log, or the copy that was saved of it."""
+    """Label a log, or its saved copy."""
     infos, left_out = infos_for_model(log, model, job.log)
     begun = [_begin(job, info, before.get(info.microphone), classifier) for info in infos]
     part = part_path(job.layer)
@@ -506,11 +506,11 @@ def _label(
 def _begin(
     job: Job, info: RecorderInfo, before: StreamLabeller | None, classifier: Classifier
 ) -> _Begun:
-    """Take the labeller at the end of the log before, or one that comes to the same labels."""
+    """Return the labeller from the end of the previous log, or one that gives the same labels."""
     first = info.first_frame
     if before is not None and first is not None and before.is_followed_by(first):
         labeller = before
-        labeller.segments = []  # the others are those of the log before
+        labeller.segments = []  # drop those of the previous log
     else:
         labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
     open_at_start = labeller.open_run
@@ -539,7 +539,7 @@ def _end(begun: _Begun, frames: int, *, goes_on: bool) -> LabelledSound:
 
 
 def _write_labels(part: Path, job: Job, begun: Sequence[_Begun]) -> list[int]:
-    """Write the labels of a log to a new file; return how many each microphone has."""
+    """Write the labels of a log to a new file; return the number of each microphone."""
     try:
         with part.open("xb") as out:
             return [_write_sound(out, each) for each in begun]
@@ -570,6 +570,6 @@ def _rows_of(labels: FrameLabels) -> NDArray[np.void]:
 
 
 def _row_type(classes: int) -> np.dtype[np.void]:
-    """Return the type of a label in the part of a layer."""
+    """Return the row type of a label in the part file."""
     times = [(name, np.int64) for name in ("frames", "stamps", "known_at")]
     return np.dtype([*times, ("probabilities", np.float32, (classes,)), ("novelty", np.float32)])

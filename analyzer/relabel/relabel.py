@@ -1,4 +1,4 @@
-"""A relabelling: its jobs for the workers, and the order in which layers are completed."""
+"""Relabelling: jobs for the workers, and the order in which layers are completed."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,27 +28,27 @@ from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.files import is_active, relabel_path
 from hearthlog.schemas.logs.metadata import check_version, log_digest
 
-_LONGEST_STRETCH = 8  # logs that follow each other and are labelled in one task
+_LONGEST_STRETCH = 8  # maximum number of contiguous logs labelled in one task
 
 
 @dataclass
 class Relabelled:
-    """What became of the logs."""
+    """Result for each log."""
 
-    layers: list[Path] = field(default_factory=list)  # that were written
-    frames: int = 0  # that were labelled
-    current: list[Path] = field(default_factory=list)  # layers that were up to date already
-    active: list[Path] = field(default_factory=list)  # logs that are still being written
-    lost: dict[Path, str] = field(default_factory=dict)  # what could not be read of relabelled logs
-    failed: dict[Path, str] = field(default_factory=dict)  # why logs were not relabelled
-    # feature sets of microphones that the model is not for, by name
+    layers: list[Path] = field(default_factory=list)  # written layers
+    frames: int = 0  # number of labelled frames
+    current: list[Path] = field(default_factory=list)  # layers already up to date
+    active: list[Path] = field(default_factory=list)  # logs still being written
+    lost: dict[Path, str] = field(default_factory=dict)  # unreadable parts of relabelled logs
+    failed: dict[Path, str] = field(default_factory=dict)  # errors of logs that were not relabelled
+    # Feature sets of microphones that the model does not support, by name.
     left_out: dict[str, str] = field(default_factory=dict)
 
     by_features: list[Path] = field(default_factory=list)  # logs without the model's embeddings
 
     @property
     def logs(self) -> int:
-        """Number of logs that are done."""
+        """Number of finished logs."""
         return sum(map(len, (self.layers, self.current, self.active, self.failed)))
 
 
@@ -59,27 +59,27 @@ def relabel(
     workers: Workers,
     progress: Progress = ignore_progress,
 ) -> Relabelled:
-    """Label logs anew, in layers beside them; layers that would be the same are left alone.
+    """Relabel logs into layers next to them; layers that are up to date are kept.
 
-    The same logs and the same model give the same labels and segments, whichever of the logs are
-    named together, and in however many tasks at once.
+    The same logs and the same model give the same labels and segments, independent of the selection
+    of logs in one call and of the number of parallel tasks.
 
     Parameters
     ----------
     progress : callable, optional
-        Told the share of the logs that is done, 0 to 1.
+        Called with the finished share of the logs, 0 to 1.
 
     Returns
     -------
     Relabelled
-        What became of each log; a log that fails is noted there, and stops no other.
+        The result for each log; a failed log is recorded there, and does not stop others.
 
     Raises
     ------
     LogError
-        If there is no such log, or one is a layer.
+        If a log does not exist, or is a layer.
     LostClusterError
-        If the workers are those of a cluster that is gone; what is complete stays.
+        If the workers' cluster is gone; completed layers stay.
     """
     chains = find_chains(paths)
     total = sum(len(chain.asked) for chain in chains)
@@ -89,38 +89,38 @@ def relabel(
 
 
 class _State(Enum):
-    CURRENT = auto()  # the layer may stay, if it continues the layer before
+    CURRENT = auto()  # the layer may stay, if it continues the previous layer
     WAITING = auto()  # for a worker
     RUNNING = auto()
-    LABELLED = auto()  # the layer can be completed after the layer before
+    LABELLED = auto()  # the layer can be completed after the previous layer
 
 
 @dataclass(eq=False)
 class _Task:
-    """A log on its way to a layer."""
+    """A log in progress."""
 
     place: int  # in its chain
     job: Job
-    metadata: LayerMetadata | None  # of the layer that is there, and may be replaced
+    metadata: LayerMetadata | None  # of an existing layer that may be replaced
     state: _State
     labelled: UnfinishedLayer | None = None
 
 
 class _ChainQueue:
-    """The tasks of one chain, in the order of time; layers are completed from its head."""
+    """Tasks of one chain, in time order; layers are completed from its head."""
 
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
         self.tasks: deque[_Task] = deque()
         self.open_runs: OpenRuns = {}  # at the end of the last layer
-        self._last: int | None = None  # place of the last log whose layer is complete or current
+        self._last: int | None = None  # place of the last log with a complete or current layer
 
     def follows_layer(self, task: _Task) -> bool:
-        """Tell whether `open_runs` are what is open when the log of a task begins."""
+        """Return whether `open_runs` are the segments open at the start of a task's log."""
         return self._last is not None and self._last == task.place - 1
 
     def pop(self, open_at_end: OpenRuns) -> None:
-        """Remove the first task, whose layer ends with these open segments."""
+        """Remove the first task; its layer ends with these open segments."""
         self._last, self.open_runs = self.tasks.popleft().place, open_at_end
 
 
@@ -137,7 +137,7 @@ class _Relabelling:
         self._unfinished: dict[Path, UnfinishedLayer] = {}  # by their files
 
     def run(self, progress: Callable[[int], None]) -> None:
-        """Label all logs; `progress` is told how many are done."""
+        """Label all logs; `progress` is called with the number of finished logs."""
         waiting = self._stretches()
         try:
             while True:
@@ -154,16 +154,16 @@ class _Relabelling:
 
     @property
     def _most_running(self) -> int:
-        """How many tasks to hand out at once, so that no worker waits for the next one."""
+        """Return the number of tasks to submit at once, so that no worker is idle."""
         parallel = self._workers.parallel
         return 2 * parallel if parallel > 1 else 1
 
     def _stretches(self) -> Iterator[tuple[_ChainQueue, Sequence[_Task]]]:
-        """Look at the logs of one chain after the other, and yield those to be labelled.
+        """Check the logs of one chain after the other, and yield the logs to label.
 
-        Logs that follow each other are yielded together, since the sound before the first of them
-        has to be labelled, too. Towards the end of a chain they are fewer, so that the workers come
-        to its end together.
+        Contiguous logs are yielded together, since the sound before the first of them has to be
+        labelled, too. Towards the end of a chain the groups get smaller, so that the workers finish
+        together.
         """
         for chain in self._chains:
             queue = _ChainQueue(chain)
@@ -196,7 +196,7 @@ class _Relabelling:
     def _task(
         self, chain: Chain, place: int, layer: tuple[LayerMetadata | None, str] | HearthlogError
     ) -> _Task | None:
-        """Decide what is to be done with a log; None if nothing is."""
+        """Decide the task of a log; None if nothing is to be done."""
         log = chain.logs[place]
         if is_active(log):
             self.result.active.append(log)
@@ -225,7 +225,7 @@ class _Relabelling:
         self._running[future] = queue, tasks
 
     def _receive(self, future: Future[Any]) -> None:
-        """Take the result of a worker."""
+        """Process the result of a worker."""
         queue, tasks = self._running.pop(future)
         error = future.exception()
         if error is not None:
@@ -234,14 +234,14 @@ class _Relabelling:
             if len(tasks) == 1:
                 self._fail(queue, tasks[0], error)
             else:
-                for task in tasks:  # one of them is to blame
+                for task in tasks:  # one of them is the cause
                     self._submit(queue, [task])
         elif (layers := future.result()) is None:
             self._note_layer(tasks[0])
         else:
             for task, layer in zip(tasks, layers, strict=True):
                 if layer is None:
-                    self._submit(queue, [task])  # its error may be that of a store for a moment
+                    self._submit(queue, [task])  # the error may be a temporary storage error
                 else:
                     self._take(task, layer)
         self._advance(queue)
@@ -252,18 +252,18 @@ class _Relabelling:
         self._unfinished[labelled.part] = labelled
 
     def _fail(self, queue: _ChainQueue, task: _Task, error: Exception) -> None:
-        """Note that a log was not relabelled; the others go on."""
+        """Record that a log was not relabelled; the others continue."""
         text = str(error)
         if not isinstance(error, HearthlogError):
             text = f"{task.job.log}: {type(error).__name__}: {text.partition(chr(10))[0]}"
         self.result.failed[task.job.log] = text
-        if task in queue.tasks:  # it is not, if its layer was to be completed
+        if task in queue.tasks:  # false if its layer was to be completed
             queue.tasks.remove(task)
         if task.labelled is not None:
             self._delete(task.labelled)
 
     def _advance(self, queue: _ChainQueue) -> None:
-        """Complete layers, in the order of time, up to the first log that is not labelled."""
+        """Complete layers, in time order, up to the first unlabelled log."""
         while queue.tasks and queue.tasks[0].state in {_State.CURRENT, _State.LABELLED}:
             task = queue.tasks[0]
             follows = queue.follows_layer(task)
@@ -286,7 +286,7 @@ class _Relabelling:
         self._running[self._workers.submit(complete_layer, task.job, labelled)] = queue, [task]
 
     def _label_alone(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
-        """Label a log once more, by itself: the layer before, which it should continue, failed."""
+        """Label a log again, separately: the previous layer, which it should continue, failed."""
         self._delete(labelled)
         job = self._job(queue.chain, task.place, continues_layer=False)
         task.job = job._replace(replaces=task.job.replaces)

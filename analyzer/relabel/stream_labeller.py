@@ -1,4 +1,4 @@
-"""Labels of recorded features: of one log after the other, and of as much before as they need."""
+"""Labeller of recorded features, log by log, with as much earlier sound as the labels need."""
 
 import shutil
 from collections import deque
@@ -24,24 +24,24 @@ from hearthlog.schemas.logs.files import is_active
 from hearthlog.schemas.messages.topics import EmbeddingSource
 from hearthlog.schemas.salvage.recover import recover_log
 
-_LARGEST_STEP = NANOSECONDS // 5  # by which the time of a sound card may jump between two frames
+_LARGEST_STEP = NANOSECONDS // 5  # maximum jump of a sound card's time between two frames
 
 
 class StreamLabeller:
-    """Labels what one microphone recorded, in the order of time.
+    """Labels the recording of one microphone, in time order.
 
     Parameters
     ----------
     label_from : int
-        Time before which frames are not labelled, in nanoseconds of UTC; of these only the floor of
-        the room is tracked, which is much quicker.
+        Time before which frames are not labelled, in nanoseconds of UTC; there only the noise
+        floor is tracked, which is much faster.
     microphone : str
-        Its name; the directions of an array that the model knows count.
+        Its name; selects the array directions that the model supports.
 
     Attributes
     ----------
     floor_converged : bool
-        Whether sound before the first frame would leave no trace in the floors to come.
+        Whether sound before the first frame would not affect later floors.
     """
 
     def __init__(
@@ -61,26 +61,26 @@ class StreamLabeller:
         self._floor = None if self._powers is None else FloorTracker()
         self._next: int | None = None  # number of the next frame
         self._end = 0  # end of the last frame, in nanoseconds of UTC
-        self._from_start = False  # whether it began where the sound began, or after a gap
+        self._from_start = False  # began at the start of the sound, or after a gap
 
     @property
     def states_converged(self) -> bool:
-        """Whether sound before the first frame would leave no trace in the states to come."""
+        """Whether sound before the first frame would not affect later states."""
         return self._from_start or self._labeller.states_converged
 
     @property
     def segments_converged(self) -> bool:
-        """Whether sound before the first frame would leave no trace in the segments to come."""
+        """Whether sound before the first frame would not affect later segments."""
         return self._from_start or self._labeller.segments_converged
 
     @property
     def takes_auxiliary(self) -> bool:
-        """Whether directions or embeddings change its labels."""
+        """Whether directions or embeddings affect its labels."""
         return self._labeller.takes_auxiliary
 
     @property
     def open_run(self) -> StateRun | None:
-        """The segment that has not ended; None if there is none."""
+        """The open segment; None if there is none."""
         return self._labeller.segmenter.open_run
 
     def discard_open(self) -> None:
@@ -88,7 +88,7 @@ class StreamLabeller:
         self._labeller.segmenter.discard_open()
 
     def is_followed_by(self, frame: tuple[int, int]) -> bool:
-        """Tell whether the sound goes on with a frame: the next one, within 0.2 s of its time.
+        """Return whether a frame continues the sound: the next number, within 0.2 s of its time.
 
         Parameters
         ----------
@@ -100,18 +100,18 @@ class StreamLabeller:
     def push(self, event: Features | Gap) -> FrameLabels | None:
         """Add features or a gap.
 
-        Segments that end are added to `segments`. The open segment ends at a gap, and where the
-        features do not follow the last ones.
+        Closed segments are added to `segments`. The open segment ends at a gap, and where
+        features are not contiguous.
 
         Parameters
         ----------
         event : Features or Gap
-            Of at least one frame, in the order of time.
+            At least one frame, in time order.
 
         Returns
         -------
         FrameLabels or None
-            Of the frames at which a whole window is complete, perhaps none; None for a gap.
+            Of the frames at which a window is complete, possibly none; None for a gap.
         """
         if isinstance(event, Gap):
             self.close()
@@ -138,7 +138,7 @@ class StreamLabeller:
         return floors._replace(converged=self.floor_converged)
 
     def close(self) -> None:
-        """End the open segment where the last frame ends; the next frame begins anew."""
+        """End the open segment at the end of the last frame; the next frame starts anew."""
         self.segments += self._labeller.close(self._end)
         if self._floor is not None:
             self._floor.restart()
@@ -147,9 +147,9 @@ class StreamLabeller:
 
 
 _WARM_UP = 30 * NANOSECONDS
-_FLOOR_WARM_UP = 150 * NANOSECONDS  # a minute, and the four seconds of steadiness behind it
+_FLOOR_WARM_UP = 150 * NANOSECONDS  # a minute, plus the four seconds of steadiness that follow
 _NEVER = (1 << 63) - 1
-_FRAMES = 12_000  # ten minutes at once: their arrays stay in the memory of the process
+_FRAMES = 12_000  # ten minutes at once: the process keeps the memory of their arrays
 _LONGEST_LOSS_TEXT = 1000  # characters
 
 
@@ -167,12 +167,12 @@ class UnreadableError(LogError):
 def infos_for_model(
     path: Path, model: Model, log: Path
 ) -> tuple[list[RecorderInfo], dict[str, str]]:
-    """Find the microphones of a log whose features a model is for.
+    """Find the microphones of a log whose features the model supports.
 
     Returns
     -------
     infos : list of RecorderInfo
-        At least one, in the order of the names of the microphones.
+        At least one, sorted by microphone name.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def read_sound(
     Raises
     ------
     UnreadableError
-        If it is damaged, or not of a recorder, or its feature set is not installed.
+        If it is damaged, or was not written by a recorder, or its feature set is not installed.
     """
     try:
         sound = read_recorded(info, start, _NEVER, sound_only=True, auxiliary=auxiliary)
@@ -224,12 +224,12 @@ def read_sound(
 
 
 def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
-    """Save the whole parts of a damaged log to a folder.
+    """Save the intact parts of a damaged log to a folder.
 
     Returns
     -------
     loss : str
-        What could not be saved; empty if nothing is lost.
+        The unsaved parts; empty if nothing is lost.
 
     Raises
     ------
@@ -256,8 +256,7 @@ def warm_up(
     Parameters
     ----------
     states_only : bool
-        Whether it suffices that the states have converged: the open segment may then lack its
-        beginning.
+        Whether converged states suffice: the open segment may then lack its beginning.
 
     Returns
     -------
@@ -286,11 +285,11 @@ def warm_up(
 def _label_earlier(
     logs: Sequence[Path], info: RecorderInfo, starts: tuple[int, int], classifier: Classifier
 ) -> tuple[StreamLabeller, bool]:
-    """Track the floor in earlier logs from a time on, and label them from another time on.
+    """Track the floor in earlier logs from one time on, and label them from another.
 
-    The result tells also whether there is nothing before the first of these times.
+    Return also whether there is nothing before the first of these times.
     """
-    copies: dict[Path, Path | None] = {}  # what could be saved of damaged logs
+    copies: dict[Path, Path | None] = {}  # saved copies of damaged logs
     with TemporaryDirectory(prefix="hearthlog") as folder:
         while True:
             try:
@@ -333,12 +332,12 @@ def _label_readable(
 
 
 def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
-    """Tell whether the sound of a log goes on in the next log.
+    """Return whether the sound of a log continues in the next log.
 
     Returns
     -------
     bool or None
-        None while that is not decided: the next log is being written and has no frame.
+        None while undecided: the next log is being written and has no frame.
     """
     other = None
     with suppress(LogError):

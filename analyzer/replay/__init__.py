@@ -1,1 +1,1 @@
-"""Recorded logs once more through the pipeline."""
+"""Replay of recorded logs through the pipeline."""

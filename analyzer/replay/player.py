@@ -1,4 +1,4 @@
-"""Recorded features or clips through a pipeline, and the new log of its messages."""
+"""Player of recorded features or clips through a pipeline, and the new log of its messages."""
 
 import time
 from collections import Counter
@@ -35,46 +35,46 @@ from hearthlog.schemas.messages.topics import (
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How logs are replayed."""
+    """Options of a replay."""
 
     kind: str = "features"  # or "audio", for clips
     model: Callable[[RecorderInfo], Model | None] = lambda _: None  # None: no labels
-    # By the name of the scenario: those that label beside it.
+    # Secondary models by scenario name.
     scenarios: Mapping[str, Model] = field(default_factory=dict)
-    output: Path | None = None  # folder of the new log, if there is to be one
+    output: Path | None = None  # folder of the new log; None for no log
     start_offset: float = 0.0  # seconds from the first message
     duration: float | None = None  # seconds; None for all
     rate: float | None = None  # multiple of real time; None for as fast as possible
-    loop: bool = False  # begin anew at the end, until stopped
+    loop: bool = False  # restart at the end, until stopped
 
 
 @dataclass
 class Replay:
-    """What came of a replay.
+    """Result of a replay.
 
-    `missing` are times (ns of UTC) before which the logs lack sound that was recorded: the labels
-    of the first second there, and the open segment, cannot be as recorded.
+    `missing` are times (ns of UTC) before which the logs lack recorded sound: the labels of the
+    first second there, and the open segment, may differ from the recording.
     """
 
-    sources: list[Path]  # logs that were replayed
-    logs: list[Path] = field(default_factory=list)  # that were written
+    sources: list[Path]  # replayed logs
+    logs: list[Path] = field(default_factory=list)  # written logs
     frames: int = 0
     labels: int = 0
     segments: int = 0
     gaps: int = 0
     compared: ReplayComparison = field(default_factory=ReplayComparison)
     missing: list[int] = field(default_factory=list)
-    unfinished: list[Path] = field(default_factory=list)  # cut off, and replayed up to there
+    unfinished: list[Path] = field(default_factory=list)  # truncated logs, replayed up to the cut
     interrupted: bool = False
 
     @property
     def seconds(self) -> float:
-        """Seconds of sound that were replayed."""
+        """Seconds of replayed sound."""
         return self.frames * FRAME_SECONDS
 
 
-_OF_RECORDER = (CANDIDATE, SCENARIO, FEATURE_SET)  # entries that are not those of the new log
-# How attachments begin that are about the models of microphones.
+_OF_RECORDER = (CANDIDATE, SCENARIO, FEATURE_SET)  # entries that the new log does not copy
+# Name prefixes of attachments about the models of microphones.
 _MODELS = tuple(name.partition(".")[0] + "." for name in (CARD, DESCRIPTION))
 
 
@@ -94,7 +94,7 @@ def describe(  # noqa: PLR0913, PLR0917
         The model that labels the new log; None if there are no labels.
     """
     if model is not None and model.sha256 == recorded.model_sha256:
-        model = replace(model, name=recorded.model)  # whatever its file is called here
+        model = replace(model, name=recorded.model)  # whatever the name of its file here
     classes = None if model is None else list(model.classes)
     info = stream_info(recorded.microphone, recorded.device, features, model)
     attachments = [item for item in recorded.attachments if not item.name.startswith(_MODELS)]
@@ -133,21 +133,21 @@ _LOST = "the log that was replayed does not have it"
 
 
 class Player:
-    """Gives what recorders recorded to pipelines, one run of a recorder after the other.
+    """Pushes recorded events to pipelines, one recorder run after the other.
 
     Parameters
     ----------
     start : int
-        Log time before which messages are left out, in nanoseconds of UTC.
+        Log time before which messages are dropped, in nanoseconds of UTC.
     progress : callable
-        Told the time (nanoseconds of UTC) up to which frames were replayed.
+        Called with the time (nanoseconds of UTC) up to which frames were replayed.
 
     Attributes
     ----------
     converged : bool
-        Whether frames before the first one would leave no trace in the messages to come.
+        Whether frames before the first one would not affect the messages to come.
     missing_before : bool
-        Whether frames before the first one were recorded, and are not in the logs.
+        Whether frames before the first one were recorded, but are missing in the logs.
     """
 
     def __init__(
@@ -165,27 +165,27 @@ class Player:
         self._stop = stop
         self._progress = progress
         self._pace = _Pace(options.rate)
-        self._info: RecorderInfo | None = None  # of the first log of this run of a recorder
+        self._info: RecorderInfo | None = None  # of the first log of this recorder run
         self._opened: Path | None = None
         self._log: RollingLog | None = None
         self._next = 0  # number of the next frame
-        self._after_gap = False  # so that the next frame may be any later one
+        self._after_gap = False  # the next frame may then be any later one
         self._end: int | None = None  # end of the last frame of this run
         self._uncompared: list[EncodedMessage] = []
 
     def open(self, info: RecorderInfo) -> None:
-        """Go on with another log; where it is of another run of a recorder, begin anew.
+        """Continue with another log; restart if it is of another recorder run.
 
         Parameters
         ----------
         info : RecorderInfo
-            Of the log; the log that is open already is no change.
+            Of the log; a log that is already open changes nothing.
 
         Raises
         ------
         LogError
-            If its feature set is not installed, or not that of the model, or if the new log cannot
-            be written.
+            If its feature set is not installed, or differs from the model's, or if the new log
+            cannot be written.
         """
         if info.path == self._opened:
             return
@@ -211,9 +211,9 @@ class Player:
         return True
 
     def compare(self, batch: RecordedBatch) -> None:
-        """Compare what was replayed since the last call with what was recorded.
+        """Compare the messages replayed since the last call with the recorded ones.
 
-        Raise `LogError` if a recorded message is not of the type that its channel says.
+        Raise `LogError` if a recorded message does not have the type stated by its channel.
         """
         if self._info is None:
             return
@@ -231,7 +231,7 @@ class Player:
         Parameters
         ----------
         cut : bool
-            Whether the recorded sound goes on: the last segment is then not as recorded.
+            Whether the recorded sound continues: the last segment then differs from the recording.
 
         Raises
         ------
@@ -248,7 +248,7 @@ class Player:
         configuration = info.configuration
         features = self._features(info, model)
         classifier = None if model is None else Classifier(model)
-        clips = self._options.kind != "features"  # which do not say how often
+        clips = self._options.kind != "features"  # clips do not state how often
         every = LOGGED_EVERY if clips else configuration.statistics_every
         self._beside = self._scenarios(info, features, model)
         beside = {scenario_labelling(name): Classifier(one) for name, one in self._beside.items()}
@@ -267,7 +267,7 @@ class Player:
         self._next, self._end, self._after_gap = 0, None, False
 
     def _features(self, info: RecorderInfo, model: Model | None) -> FeatureSet:
-        """Return the feature set of the pipeline; clips suit any."""
+        """Return the feature set of the pipeline; clips work with any."""
         if self._options.kind != "features":
             return DEFAULT if model is None else feature_set(model.description.feature_set)
         if model is not None:
@@ -277,9 +277,9 @@ class Player:
     def _scenarios(
         self, info: RecorderInfo, features: FeatureSet, live: Model | None
     ) -> dict[str, Model]:
-        """Return what labels beside the model, by the name of the scenario.
+        """Return the secondary models by scenario name.
 
-        A class of two models is refused, as the recorder does; names leave it to the other.
+        A class of two models is refused, as by the recorder; names are left to the other model.
         """
         known = {} if live is None else {LIVE: live}
         beside = {}
@@ -304,7 +304,7 @@ class Player:
         return {name: beside[name] for name in self._options.scenarios if name in beside}
 
     def _goes_on(self, info: RecorderInfo) -> bool:
-        """Tell whether a log is of the same run of a recorder, but of another model."""
+        """Return whether a log is of the same recorder run, but of another model."""
         assert self._info is not None
         if info.first_frame is None or info.model_sha256 == self._info.model_sha256:
             return False
@@ -314,7 +314,7 @@ class Player:
         return self._next > 0 and follows and same
 
     def _change_model(self, info: RecorderInfo) -> None:
-        """Change the model where the recorder did, if it is another one here too."""
+        """Change the model where the recorder did, if the model differs here too."""
         self._info = info
         model = self._options.model(info)
         sha256 = _digest(model)
@@ -325,7 +325,7 @@ class Player:
         self._beside = self._scenarios(info, self._features(info, model), model)
         classifier = None if model is None else Classifier(model)
         closing, opening = self._pipeline.change_model(model, classifier, *info.first_frame)
-        for name in self._options.scenarios:  # names may have to leave other classes out now
+        for name in self._options.scenarios:  # they may now have to exclude other classes
             own = self._beside.get(name)
             if _digest(own) != _digest(before.get(name)):
                 last, first = self._pipeline.change_model(
@@ -349,7 +349,7 @@ class Player:
         return describe(info, features, model, self._beside, self._options.output, replayed)
 
     def _join(self, event: Features) -> None:
-        """Begin anew or add a gap where frames do not follow the last ones, as the recorder did."""
+        """Restart or add a gap where frames are not contiguous, as the recorder did."""
         if self._after_gap:
             self._after_gap = False
             return
@@ -399,7 +399,7 @@ class Player:
             self._log.write(messages)
 
     def _count(self, messages: list[EncodedMessage]) -> list[EncodedMessage]:
-        """Leave out messages before the start, and count the others."""
+        """Drop messages before the start, and count the others."""
         microphone = self._pipeline.microphone
         label, segment, gap = (topic(microphone, kind) for kind in ("label", "segment", "gap"))
         if messages and messages[0].log_time < self._start:
@@ -424,12 +424,12 @@ class Player:
 
 
 class _Pace:
-    """Waits until the time of a sound has come; `rate` is that of `ReplayOptions`."""
+    """Waits until the time of a sound; `rate` is that of `ReplayOptions`."""
 
     def __init__(self, rate: float | None) -> None:
         self._rate = rate
         self._last: int | None = None
-        self._anchor = 0.0, 0  # a time of the clock, and the time of the sound then
+        self._anchor = 0.0, 0  # a clock time, and the sound's time then
 
     def wait(self, start: int, end: int, stop: Flag) -> None:
         """Wait until the end of frames from `start` to `end` (ns of UTC), or until stopped."""
@@ -445,7 +445,7 @@ class _Pace:
 
 
 def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool:
-    """Tell whether a log is of another run of a recorder than the last one."""
+    """Return whether a log is of another recorder run than the last one."""
     if info.first_frame is not None and info.first_frame[0] < next_frame:
         return True
     same = _without(info, *_BESIDE) == _without(last, *_BESIDE)
@@ -457,12 +457,12 @@ def _digest(model: Model | None) -> str | None:
 
 
 def _without(info: RecorderInfo, *models: str) -> dict[str, str]:
-    """Return the metadata without what names some models, which may change within a run."""
+    """Return the metadata without the entries about models that may change within a run."""
     return {key: text for key, text in info.metadata.items() if not key.startswith(models)}
 
 
 def _name(paths: Sequence[Path]) -> str:
-    """Name logs in a few words, since every new log repeats them."""
+    """Return a short name of logs, since every new log repeats it."""
     if len(paths) == 1:
         return paths[0].name
     return f"{paths[0].name} … {paths[-1].name} ({len(paths)} logs)"

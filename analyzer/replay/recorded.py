@@ -1,4 +1,4 @@
-"""Recorded events of a log, and the comparison of its labels and segments with a replay."""
+"""Recorded events of a log, and the comparison of labels and segments with a replay."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -54,7 +54,7 @@ _Known = TypeVar("_Known", Directions, Embeddings)
 
 
 class Features(NamedTuple):
-    """Features of successive frames, as `Pipeline.push_features` takes them.
+    """Features of successive frames, as input of `Pipeline.push_features`.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Features(NamedTuple):
 
 
 class RecordedBatch(NamedTuple):
-    """The messages of one span of time of a log; events are in the order of the log."""
+    """Messages of one span of time of a log; events are in log order."""
 
     events: list[Features | Gap | SourceHealth]
     labels: list[RawMessages]
@@ -96,17 +96,17 @@ def read_recorded(
     Parameters
     ----------
     start, end : int
-        Log times, in nanoseconds of UTC: from `start` on, before `end`.
+        Log times, in nanoseconds of UTC; `end` is excluded.
     sound_only : bool
-        Read only features and gaps, and compare the checksums of what is read.
+        Read only features and gaps, and verify their checksums.
     auxiliary : bool
         Read the directions of an array and the embeddings of a network, too.
 
     Raises
     ------
     LogError
-        If the log is damaged, or its messages are not those of a recorder, or its feature set is
-        not installed.
+        If the log is damaged, or was not written by a recorder, or its feature set is not
+        installed.
     """
     width = features_of(info).width
     kinds = _SOUND_TYPES if sound_only else _TYPES
@@ -120,7 +120,7 @@ def read_recorded(
         for raw in batch:
             type_ = topics[raw.channel.topic]
             if type_ == message_types.EMBEDDING and not _is_of(raw, info):
-                continue  # those of another network, in a log that was merged
+                continue  # embeddings of another network, in a merged log
             if is_compatible(raw.channel, raw.schema, type_, _FIELDS[type_]):
                 by_type[type_].append(raw)
         buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
@@ -132,7 +132,7 @@ def read_recorded(
 
 
 def _is_of(raw: RawMessages, info: RecorderInfo) -> bool:
-    """Return whether embeddings are of the network that is that of the microphone."""
+    """Return whether embeddings are of the microphone's network."""
     source = EmbeddingSource.from_metadata(raw.channel.metadata)
     return source is not None and source == info.embedding
 
@@ -140,7 +140,7 @@ def _is_of(raw: RawMessages, info: RecorderInfo) -> bool:
 def _events(
     by_type: _RawByType, microphone: str, width: int, buffers: Sequence[int]
 ) -> list[Features | Gap | SourceHealth]:
-    """Return features, gaps and health in the order in which they were written."""
+    """Return features, gaps and health in the order of the log."""
     features = [_features(raw, width) for raw in by_type[message_types.FEATURES]]
     others: list[Gap | SourceHealth | None] = [
         gap for raw in by_type[message_types.GAP] for gap in _gaps(raw)
@@ -180,7 +180,7 @@ def _events(
 
 
 def _runs(frames: Fields, rows: NDArray[np.intp]) -> Iterator[Features]:
-    """Cut features where a frame does not follow the one before."""
+    """Split features where frame numbers are not contiguous."""
     numbers = frames["frame"][rows]
     for run in np.split(rows, np.flatnonzero(np.diff(numbers) != 1) + 1):
         first = int(frames["frame"][run[0]])
@@ -201,21 +201,21 @@ def _features(raw: RawMessages, width: int) -> Fields:
 
 
 def _directions(raw: RawMessages) -> tuple[Int64, Directions]:
-    """Return directions, and when they were known."""
+    """Return directions, and their log times."""
     (columns,) = decode([raw], _FIELDS[message_types.DIRECTION])
     return columns.log_times, directions_of(columns)
 
 
 def _embeddings(raw: RawMessages) -> tuple[Int64, Embeddings]:
-    """Return embeddings, and when they were known."""
+    """Return embeddings, and their log times."""
     (columns,) = decode([raw], _FIELDS[message_types.EMBEDDING])
     return columns.log_times, embeddings_of(columns)
 
 
 def _known(run: Features, read: Sequence[tuple[Int64, _Known]], nothing: _Known) -> _Known:
-    """Return what became known with some frames; the rest is of sound that is not here.
+    """Return the auxiliary data logged with some frames; the rest belongs to other sound.
 
-    Frames of another run of a recorder may have the same numbers, but not the same times.
+    Frames of another recorder run may have the same numbers, but not the same times.
     """
     known = nothing
     for times, rows in read:
@@ -237,7 +237,7 @@ def _gaps(raw: RawMessages) -> list[Gap]:
 
 
 def _health(raw: RawMessages, microphone: str) -> list[SourceHealth | None]:
-    """Read the health of the source; None for messages about something else."""
+    """Read the health of the source; None for messages about other things."""
     (columns,) = decode([raw], _FIELDS[message_types.DIAGNOSTICS])
     name = f"hearthlog: {microphone}"
     return [
@@ -259,24 +259,24 @@ def _check_times(columns: Columns, times: Int64) -> None:
         )
 
 
-_Absent = frozenset[str]  # fields of ours that messages of another version do not have
-_Content = bytes | tuple[bytes, ...]  # a whole message, or one field after the other
+_Absent = frozenset[str]  # fields of this version that other versions lack
+_Content = bytes | tuple[bytes, ...]  # a complete message, or one field after the other
 
 
 @dataclass
 class ReplayComparison:
-    """Counts of recorded labels and segments, and of how many came out again."""
+    """Counts of recorded labels and segments, and of identical replayed ones."""
 
     labels: int = 0  # recorded ones
-    same_labels: int = 0  # came out with the same class for the same frame
-    identical_labels: int = 0  # came out bit for bit, in the fields that were recorded
+    same_labels: int = 0  # replayed with the same class for the same frame
+    identical_labels: int = 0  # replayed bit for bit, in the recorded fields
     segments: int = 0
     identical_segments: int = 0
     _unmatched: set[tuple[int, _Absent | None, _Content]] = field(default_factory=set, repr=False)
 
     @property
     def identical(self) -> bool:
-        """Whether all recorded labels and segments came out bit for bit."""
+        """Whether all recorded labels and segments were replayed bit for bit."""
         return (self.labels, self.segments) == (self.identical_labels, self.identical_segments)
 
     def add_labels(
@@ -287,12 +287,12 @@ class ReplayComparison:
         Parameters
         ----------
         end : int
-            Time from which on nothing was replayed, in nanoseconds of UTC.
+            Time at which the replay ended, in nanoseconds of UTC.
 
         Raises
         ------
         LogError
-            If a recorded message is not of the type that its channel says.
+            If a recorded message does not have the type stated by its channel.
         """
         for absent, same in _by_version(recorded).items():
             old = {time: data for time, data in _recorded(same, absent) if time < end}
@@ -312,7 +312,7 @@ class ReplayComparison:
         Parameters
         ----------
         replayed : sequence of EncodedMessage
-            Segments as they came out again. One that closes at a gap is recorded earlier than it is
+            Replayed segments. A segment that closes at a gap is recorded earlier than it is
             replayed.
         end : int
             End of the last replayed frame, in nanoseconds of UTC: no earlier segment comes after.
@@ -320,7 +320,7 @@ class ReplayComparison:
         Raises
         ------
         LogError
-            If a recorded message is not of the type that its channel says.
+            If a recorded message does not have the type stated by its channel.
         """
         for absent, same in _by_version(recorded).items():
             self._unmatched.update((time, absent, data) for time, data in _recorded(same, absent))
@@ -335,13 +335,13 @@ class ReplayComparison:
         self._unmatched -= matched | missed
 
     def finish(self, *, cut: bool) -> None:
-        """Count the recorded segments that never came out.
+        """Count the recorded segments that were never replayed.
 
         Parameters
         ----------
         cut : bool
-            Whether the replay was cut short: then they are not counted, for they might have come
-            out.
+            Whether the replay was cut short: then they are not counted, since they might have been
+            replayed later.
         """
         if not cut:
             self.segments += len(self._unmatched)
@@ -349,7 +349,7 @@ class ReplayComparison:
 
 
 def _by_version(recorded: Iterable[RawMessages]) -> dict[_Absent | None, list[RawMessages]]:
-    """Group messages by the fields of ours that they lack; None where they are of this version."""
+    """Group messages by the fields of this version that they lack; None for this version."""
     versions: dict[_Absent | None, list[RawMessages]] = {}
     for raw in recorded:
         kind = _kind_of(raw)
@@ -358,12 +358,12 @@ def _by_version(recorded: Iterable[RawMessages]) -> dict[_Absent | None, list[Ra
 
 
 def _kind_of(raw: RawMessages) -> MessageType:
-    assert raw.schema is not None  # or it was not read
+    assert raw.schema is not None  # otherwise it was not read
     return message_type(raw.schema.name, raw.schema.encoding, raw.schema.data)
 
 
 def _absent(kind: MessageType) -> _Absent:
-    """Return the fields of ours that a file's definition does not have."""
+    """Return the fields of this version that a file's definition lacks."""
     missing = lacking(kind, fields_of(message_type(kind.name)))
     left_out = kind.growth[kind.name].absent if kind.name in kind.growth else ()
     paths = [*missing, *(name for name, _ in left_out)]
@@ -373,7 +373,7 @@ def _absent(kind: MessageType) -> _Absent:
 def _recorded(
     same: Iterable[RawMessages], absent: _Absent | None
 ) -> Iterator[tuple[int, _Content]]:
-    """Yield log times and contents of messages."""
+    """Yield log times and contents of recorded messages."""
     for raw in same:
         kind, times = _kind_of(raw), raw.log_times.tolist()
         if absent is not None:
@@ -387,7 +387,7 @@ def _recorded(
 def _replayed(
     records: Sequence[EncodedMessage], typename: str, absent: _Absent | None
 ) -> Iterator[tuple[int, _Content]]:
-    """Yield log times and contents of messages, as `_recorded` does for messages of a version."""
+    """Yield log times and contents of replayed messages, in the form of `_recorded`."""
     times = (record.log_time for record in records)
     payloads = [record.data for record in records]
     if absent is None or not payloads:
@@ -402,7 +402,7 @@ def _replayed(
 def _contents(
     kind: MessageType, absent: _Absent, buffer: Bytes, offsets: Int64, sizes: Int64
 ) -> Iterator[_Content]:
-    """Yield the fields of messages that we have, except those that are absent."""
+    """Yield the fields of this version, except the absent ones."""
     ours = fields_of(message_type(kind.name))
     paths = [path for path in ours if path.partition(".")[0] not in absent]
     columns = decode_rows(kind, buffer, offsets, sizes, paths)
@@ -416,7 +416,7 @@ def _bits(value: Any) -> bytes:
 
 
 def _count_same(recorded: Sequence[RawMessages], replayed: Mapping[int, bytes]) -> int:
-    """Count the replayed labels whose class is the recorded one of the same time."""
+    """Count the replayed labels with the class recorded at the same time."""
     if not replayed:
         return 0
     sizes = np.array([len(data) for data in replayed.values()])

@@ -1,4 +1,4 @@
-"""Replay of logs through the pipeline, from their features or from their clips."""
+"""Replay of logs through the pipeline, from features or clips."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -31,9 +31,9 @@ class LogSet:
     Parameters
     ----------
     paths : sequence of Path
-        Layers and empty logs among them are left out.
+        Layers and empty logs among them are skipped.
     microphone : str or None
-        Name of the microphone; None if there is one only.
+        Name of the microphone; None if there is only one.
 
     Attributes
     ----------
@@ -57,13 +57,13 @@ class LogSet:
         self._infos: dict[Path, list[RecorderInfo]] = {}
 
     def span(self, options: ReplayOptions) -> tuple[int, int]:
-        """Return the span of time that is replayed.
+        """Return the replayed span of time.
 
         Returns
         -------
         start, end : int
-            Log times in nanoseconds of UTC, from `start` on, before `end`; without a duration the
-            end is the largest number of 64 bits.
+            Log times in nanoseconds of UTC; `end` is excluded, and is the largest 64-bit number
+            without a duration.
         """
         start = self.first + round(options.start_offset * NANOSECONDS)
         if options.duration is None:
@@ -89,7 +89,7 @@ class LogSet:
         return infos
 
     def nothing(self) -> LogError:
-        """Make the error that says that there is nothing to replay."""
+        """Make the error for an empty replay."""
         what = "clips" if self.kind == "audio" else "features"
         there = sorted({info.microphone for infos in self._infos.values() for info in infos})
         if self._microphone is not None and there and self._microphone not in there:
@@ -105,17 +105,17 @@ class LogSet:
         Parameters
         ----------
         start, end : int
-            Log times, in nanoseconds of UTC: from `start` on, before `end`.
+            Log times, in nanoseconds of UTC; `end` is excluded.
 
         Returns
         -------
         list of RecorderInfo
-            In the order of their first messages, without logs that have nothing of this kind.
+            In the order of their first messages, without logs that lack the replayed kind.
 
         Raises
         ------
         LogError
-            If they are of several microphones or nodes, or one is damaged or there twice.
+            If they are of several microphones or nodes, or one is damaged or listed twice.
         """
         infos: list[RecorderInfo] = []
         for first, last, path in self._spans:
@@ -140,12 +140,12 @@ class LogSet:
         return infos
 
 
-_JOINED = 10_000_000  # nanoseconds at most between clips that follow each other
+_JOINED = 10_000_000  # maximum nanoseconds between contiguous clips
 _REASON = "no clip holds it"
 
 
 class ClipFramer:
-    """Cuts clips into frames; clips that follow each other are one sound.
+    """Cuts clips into frames; contiguous clips are one sound.
 
     After a hole the next frame begins with the first sample of a clip. Samples before a hole that
     do not fill a frame are dropped.
@@ -154,16 +154,16 @@ class ClipFramer:
     def __init__(self) -> None:
         self._next_frame = 0
         self._end: int | None = None  # end of the last frame, in nanoseconds of UTC
-        self._rate = 0  # of the clips that follow each other; 0 before the first one
+        self._rate = 0  # of the contiguous clips; 0 before the first one
         self._samples = 0  # number of their samples
         self._frames = 0  # number of frames cut from them
         self._cutter = FrameCutter()
-        # Where clips begin, in nanoseconds of their sound, and how much later that is in UTC.
+        # Starts of clips, in nanoseconds of their sound, and their offsets to UTC.
         self._starts: list[int] = []
         self._offsets: list[int] = []
 
     def add(self, start: int, rate: int, samples: Float32) -> Iterator[Frames | Gap]:
-        """Add a clip, and yield the frames that it completes and the gap before them.
+        """Add a clip, and yield the completed frames and the gap before them.
 
         Parameters
         ----------
@@ -176,7 +176,7 @@ class ClipFramer:
         Yields
         ------
         Frames or Gap
-            In the order of time: the last frames before a hole, the gap, the frames of this clip.
+            In time order: the last frames before a hole, the gap, the frames of this clip.
         """
         if rate != self._rate or abs(start - self._expected()) > _JOINED:
             yield from self.finish()
@@ -190,12 +190,12 @@ class ClipFramer:
         yield from self._events(self._cutter.push(samples))
 
     def finish(self) -> Iterator[Frames | Gap]:
-        """Yield the last frames of the clips that follow each other, and a gap before them."""
+        """Yield the last frames of the contiguous clips, and a gap before them."""
         yield from self._events(self._cutter.push(np.empty(0, np.float32), last=True))
         self._cutter = FrameCutter()
 
     def _position(self) -> int:
-        """Return the length of the clips so far that follow each other, in nanoseconds."""
+        """Return the length of the current contiguous clips, in nanoseconds."""
         return self._samples * NANOSECONDS // self._rate
 
     def _expected(self) -> int:
@@ -217,7 +217,7 @@ class ClipFramer:
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
 
     def _stamps(self, count: int) -> NDArray[np.int64]:
-        """Return when the next frames start, each by the clip that it starts in."""
+        """Return the start times of the next frames, each by its clip."""
         positions = (self._frames + np.arange(count)) * FRAME_NANOSECONDS
         clips = np.searchsorted(self._starts, positions, side="right") - 1
         stamps = positions + np.array(self._offsets)[clips]
@@ -230,17 +230,17 @@ _LONGEST_NAME = 200
 
 
 def find_model(name: str, sha256: str, folders: Sequence[Path]) -> Model | None:
-    """Look in some folders for the model that a log was recorded with.
+    """Search folders for the model of a recording.
 
     Parameters
     ----------
     name : str
-        Name of the model, which is that of its file without the suffix.
+        Name of the model: its file name without the suffix.
 
     Returns
     -------
     Model or None
-        None if no folder has it; files that cannot be read are passed over.
+        None if no folder has it; unreadable files are skipped.
     """
     for folder in folders:
         path = folder / (name + SUFFIX)
@@ -260,21 +260,21 @@ def replay(
 ) -> Replay:
     """Run logs through the pipeline again.
 
-    From features, the model of the recording gives its labels and segments bit for bit. Where the
-    replay starts later than the logs, the sound before it is run through as far as it matters, and
-    nothing of that is logged.
+    From features, the model of the recording gives its labels and segments bit for bit. If the
+    replay starts later than the logs, the sound before it is processed as far as it affects the
+    result, without logging.
 
     Parameters
     ----------
     progress : callable, optional
-        Told the share that was replayed, 0 to 1.
+        Called with the replayed share, 0 to 1.
 
     Raises
     ------
     LogError
         If a log is damaged, or the logs are of several microphones, or of another feature set, or
-        hold nothing to replay, or if the new log cannot be written. What was replayed up to there
-        is a complete log.
+        hold nothing to replay, or if the new log cannot be written. The part replayed before the
+        error is a complete log.
     """
     start, end = logs.span(options)
     chosen = logs.chosen(options)
@@ -316,7 +316,7 @@ def replay(
 def _warmed_up(
     logs: LogSet, start: int, new_player: Callable[[], Player], result: Replay
 ) -> Player:
-    """Return a player that has played enough before a time to be as if it had played everything."""
+    """Return a player whose state at a time is the same as after playing all earlier sound."""
     back = _WARM_UP
     while True:
         player = new_player()

@@ -1,1 +1,1 @@
-"""The review of logs: their timeline in a viewer, and marks made there."""
+"""Review of logs: their timeline in a viewer, and marks made there."""

@@ -1,4 +1,4 @@
-"""Spans for a review beside the ranking: changes by a model, hints, random minutes."""
+"""Spans for a review without ranking: changes by a model, hints, random minutes."""
 
 from collections.abc import Collection, Iterator
 from itertools import pairwise
@@ -53,23 +53,23 @@ def hinted_spans(
     reviewed: Spans,
     count: int,
 ) -> list[ReviewSpan]:
-    """Choose sounds that a network names with a name that is a hint, and labels do not.
+    """Choose sounds with a network name that is a hint, and without such a label.
 
     Parameters
     ----------
     count : int
-        How many, at most.
+        Maximum number.
 
     Returns
     -------
     list of ReviewSpan
-        Spread over names and days, of each the clearest first. The score is by how many logits the
-        network is above the threshold of the name.
+        Spread over names and days, the clearest of each first. The score is the network's logit
+        minus the threshold of the name.
 
     Raises
     ------
     DataError
-        If there are no embeddings, or nothing is left in which the network gives a hint.
+        If there are no embeddings, or no hint is left.
     """
     names = [name for name in audioset_names() if not name.is_event]
     hints, above = _named(sources, microphone, names)
@@ -107,9 +107,9 @@ def hinted_spans(
 def _named(
     sources: Labellings, microphone: str, names: list[SoundName]
 ) -> tuple[Events, np.ndarray[tuple[int], np.dtype[np.float64]]]:
-    """Return the sounds that networks name, one at a time, and how far each is above.
+    """Return the sounds named by networks, one at a time, and their logits above the threshold.
 
-    Of two names at once it is the one that is further above its threshold.
+    Of two simultaneous names the one further above its threshold is used.
     """
     found: list[tuple[int, int, int, float]] = []
     embedded = False
@@ -141,7 +141,7 @@ def _named(
 
 
 def _embedded(log: LabelledFile, microphone: str) -> Iterator[tuple[Embeddings, Projection]]:
-    """Yield the embeddings of a log, of which frames follow, with their projection."""
+    """Yield the embeddings of a log that are followed by frames, with their projection."""
     name = topic(microphone, "embedding")
     columns = read_columns([log.path], {name}, fields=EMBEDDING_FIELDS).get(name)
     if columns is None or columns.type != message_types.EMBEDDING or not len(columns):
@@ -157,27 +157,27 @@ def _embedded(log: LabelledFile, microphone: str) -> Iterator[tuple[Embeddings, 
 
 
 def _time(embeddings: Embeddings, frame: int) -> int:
-    """Return the start of a frame in nanoseconds of UTC, by the window nearest before it."""
+    """Return the start of a frame in nanoseconds of UTC, from the last window before it."""
     place = max(int(np.searchsorted(embeddings.frames, frame, "right")) - 1, 0)
     away = frame - int(embeddings.frames[place])
     return int(embeddings.stamps[place]) + away * FRAME_NANOSECONDS
 
 
 MINUTE = 60 * NANOSECONDS
-SOUND_SHARE = 0.75  # of the minutes that are drawn has a sound, so that nights take no one's time
+SOUND_SHARE = 0.75  # of the drawn minutes have a sound, so that nights waste no time
 _SEED = 20_261_123
-_UNLABELLED = NANOSECONDS // 10  # in a minute at most
+_UNLABELLED = NANOSECONDS // 10  # maximum in a minute
 
 
 class RecordedMinutes(NamedTuple):
-    """Minutes of the clock that are labelled from start to end.
+    """Completely labelled minutes of the clock.
 
     Attributes
     ----------
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC, ascending.
     has_sound : np.ndarray [shape=(n,)], bool
-        Whether a label in it is none of silence.
+        Whether any label in it is not silence.
     """
 
     starts: Int64
@@ -185,7 +185,7 @@ class RecordedMinutes(NamedTuple):
 
 
 def whole_minutes(labelling: Labelling) -> RecordedMinutes:
-    """Find the minutes of a labelling, and tell those with a sound from those without."""
+    """Find the complete minutes of a labelling, and which have a sound."""
     if not len(labelling):
         return RecordedMinutes(np.empty(0, np.int64), np.empty(0, bool))
     stretches = joined(labelling.starts, labelling.ends, _UNLABELLED)
@@ -203,23 +203,23 @@ def whole_minutes(labelling: Labelling) -> RecordedMinutes:
 def draw_minutes(
     minutes: RecordedMinutes, count: int, drawn: Collection[int] = (), taken: Spans = NONE
 ) -> Int64:
-    """Draw minutes at random, three of four of those with a sound.
+    """Draw minutes at random, three of four with a sound.
 
-    The same minutes and the same earlier draws give the same ones.
+    The same minutes and the same earlier draws give the same result.
 
     Parameters
     ----------
     count : int
-        How many, at most.
+        Maximum number.
     drawn : collection of int
-        Starts of the minutes that were drawn and reviewed before, in nanoseconds of UTC.
+        Starts of the minutes drawn and reviewed before, in nanoseconds of UTC.
     taken : Spans
-        Time that is reviewed already, of which no minute is drawn.
+        Reviewed time, excluded from the draw.
 
     Returns
     -------
     np.ndarray [shape=(m,)], int64
-        Starts, in the order in which they were drawn.
+        Starts, in the order of the draw.
     """
     before = minutes.has_sound[np.isin(minutes.starts, list(drawn))]
     shuffled = np.random.default_rng([_SEED, len(drawn)]).permutation(len(minutes.starts))
@@ -235,7 +235,7 @@ def draw_minutes(
 
 
 def _length_in(spans: Spans, minutes: Int64) -> Int64:
-    """Return how much of each minute lies in spans, in nanoseconds."""
+    """Return the length of each minute covered by spans, in nanoseconds."""
     if not len(minutes):
         return np.empty(0, np.int64)
     edges = np.unique(np.concatenate([minutes, minutes + MINUTE]))
@@ -244,12 +244,12 @@ def _length_in(spans: Spans, minutes: Int64) -> Int64:
 
 
 class ReviewedTime(NamedTuple):
-    """The time of a microphone that a person has marked, or looked at.
+    """Marked or reviewed time of a microphone.
 
     Attributes
     ----------
     random : frozenset of int
-        Starts of the spans that were drawn at random, in nanoseconds of UTC.
+        Starts of the spans drawn at random, in nanoseconds of UTC.
     """
 
     spans: Spans
@@ -257,7 +257,7 @@ class ReviewedTime(NamedTuple):
 
 
 def reviewed_time(sources: Labellings, microphone: str, scenario: str = "") -> ReviewedTime:
-    """Read what is reviewed of a microphone, by anyone and of any labelling of one scenario.
+    """Read the reviewed time of a microphone, by all reviewers, of all labellings of one scenario.
 
     Parameters
     ----------
@@ -290,22 +290,22 @@ def changed_by(  # noqa: PLR0913, PLR0917
     count: int,
     progress: Progress = ignore_progress,
 ) -> list[ReviewSpan]:
-    """Choose spans in which a model says something else than the one that labels now.
+    """Choose spans that a model labels differently from the current model.
 
     Parameters
     ----------
     side : NamedLabelling
-        The labelling to be reviewed. Where it says something else than the model that labels now,
-        as of older logs it may, nothing is asked.
+        The labelling to review. Spans are skipped where it differs from the current model, as it
+        may for older logs.
     count : int
-        How many, at most.
+        Maximum number.
     progress : callable, optional
-        Is told the share of the sound that is done, 0 to 1.
+        Called with the processed share of the sound, 0 to 1.
 
     Returns
     -------
     list of ReviewSpan
-        Those of the largest changes first, spread over changes and days, of each the longest first.
+        Spans of the largest changes first, spread over changes and days, the longest of each first.
         The score is minutes a day, if a day is recorded.
 
     Raises
@@ -342,7 +342,7 @@ def _champion(folder: Path, model: Model, paths: list[Path]) -> Model:
 
 
 def _where(changed: ChangedTime, side: NamedLabelling) -> Events:
-    """Return the changed time in which a labelling says what the first model does."""
+    """Return the changed time in which a labelling agrees with the first model."""
     classes, labels = changed.changes.classes, side.called_as(changed.changes.classes)
     every = list(dict.fromkeys([*classes, *labels.classes]))
     said = events_of(labels.labelling, every)
@@ -360,7 +360,7 @@ def _listed(  # noqa: PLR0913, PLR0917
     model: str,
     count: int,
 ) -> list[ReviewSpan]:
-    """List the spans to be asked, at most one of what changes without a break."""
+    """List the spans for the review, at most one per uninterrupted change."""
     classes, changes = changed.changes.classes, changed.changes
     _, first = np.unique(spans.sources, return_index=True)
     ordered = first[np.argsort(spans.starts[first] - spans.ends[first], kind="stable")]

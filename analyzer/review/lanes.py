@@ -1,4 +1,4 @@
-"""Lanes and plots of a timeline and of a watch: their names, colours and values."""
+"""Lanes and plots of a timeline and of a watch: names, colours and values."""
 
 import re
 from collections import Counter
@@ -39,17 +39,17 @@ from hearthlog.schemas.messages.topics import (
 
 _TROUBLED: Colour = (240, 140, 40)
 _TROUBLES = {"warning": _TROUBLED, "error": (230, 60, 60), "stale": (150, 90, 160)}
-TROUBLES = tuple(_TROUBLES)  # texts of a live lane, by the level of a diagnostic status less one
+TROUBLES = tuple(_TROUBLES)  # texts of a live lane, by the level of a diagnostic status minus one
 GAP_STATE = "not heard"
 
 
 @dataclass(frozen=True)
 class LaneKind:
-    """How lanes of one kind look; the viewer shows them in the order of their names."""
+    """Appearance of lanes of one kind; the viewer shows kinds in name order."""
 
     name: str
-    colours: Callable[[Iterable[str]], dict[str, Colour]]  # of states
-    states: Sequence[str] = ()  # that a watch announces to the viewer before they occur
+    colours: Callable[[Iterable[str]], dict[str, Colour]]  # by state
+    states: Sequence[str] = ()  # announced to the viewer before they occur, for a watch
 
 
 def _class_colours(states: Iterable[str]) -> dict[str, Colour]:
@@ -66,12 +66,12 @@ TROUBLE = LaneKind("Trouble", _trouble_colours, TROUBLES)
 
 
 def scenario_kind(labelling: str) -> LaneKind:
-    """Return the kind of lane of a scenario, which shows its segments once they are closed."""
+    """Return the lane kind of a scenario, whose segments appear once they are closed."""
     return LaneKind(labelling.replace("/", "_").capitalize(), _class_colours)
 
 
 class StateChanges(NamedTuple):
-    """When a lane changes, and to which states.
+    """Times at which a lane changes, and its new states.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class StateChanges(NamedTuple):
 
 
 class StateLane(NamedTuple):
-    """What is new in a lane."""
+    """Additions to a lane."""
 
     kind: LaneKind
     microphone: str
@@ -94,7 +94,7 @@ class StateLane(NamedTuple):
 
 
 def state_changes(spans: LabelledSpans) -> StateChanges:
-    """Turn spans into changes of a lane.
+    """Convert spans into changes of a lane.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
     Returns
     -------
     LabelledSpans
-        With the labels of the other one; none where only one of the two has a label.
+        With the labels of `other`; empty where only one of the two has a label.
     """
     if not len(one) or not len(other):
         return no_spans()
@@ -136,13 +136,13 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
     return LabelledSpans(parts.starts[places], ends, other.texts[b[places]])
 
 
-REVIEWED = "Reviewed"  # the name of the lane, and of its spans without a mark
+REVIEWED = "Reviewed"  # name of the lane, and text of spans without a mark
 NOT_HEARD = "Not heard"
 _TROUBLE = "Trouble"
 _RECURRING = "Recurs"
 _VOICES = "Voices"
 _LOOKED_AT: Colour = (58, 70, 92)
-_MOST_LANES = 12  # of classes, where some were not heard at all
+_MOST_LANES = 12  # of classes, if some were not heard at all
 
 
 class Lane(NamedTuple):
@@ -151,7 +151,7 @@ class Lane(NamedTuple):
     Attributes
     ----------
     labelling : str
-        The one whose labels it shows; empty if it stands beside all of them.
+        The labelling it shows; empty for lanes shared by all labellings.
     """
 
     microphone: str
@@ -162,15 +162,14 @@ class Lane(NamedTuple):
 
 
 def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
-    """Make the lanes of a timeline, microphone by microphone, from above.
+    """Make the lanes of a timeline, microphone by microphone, from the top.
 
     Yields
     ------
     Lane
-        For each labelling a lane for each class but silence: what was heard for the shortest time
-        comes first, what was not heard last. Then what stands beside all labellings: a lane for
-        each scenario, where others differ from the first one, what is reviewed, also of scenarios,
-        what was not heard, and trouble.
+        For each labelling a lane for each class except silence: the class heard for the shortest
+        time first, classes not heard last. Then the lanes shared by all labellings: each scenario,
+        differences from the first labelling, reviewed spans (also of scenarios), gaps, and trouble.
     """
     for microphone in timeline.microphones.values():
         labellings = labellings_of(microphone)
@@ -189,14 +188,14 @@ def labellings_of(microphone: MicrophoneTimeline) -> list[LabellingTimeline]:
 
 
 def labelling_in_words(name: str) -> str:
-    """Name a labelling: `the recorder`, the scenario, or the model."""
+    """Return the displayed name of a labelling: `the recorder`, the scenario, or the model."""
     if is_scenario(name):
         return name.replace("/", " ")
     return "the recorder" if name == LIVE else name.removeprefix(f"{RELABEL}/")
 
 
 def scenario_sounds(spans: LabelledSpans) -> LabelledSpans:
-    """Leave out of the spans of a scenario what it has no name for."""
+    """Drop the spans of a scenario that name no class of it."""
     named = np.array([class_name(text) not in OF_EVERY_SCENARIO for text in spans.texts], bool)
     return LabelledSpans(spans.starts[named], spans.ends[named], spans.texts[named])
 
@@ -204,7 +203,7 @@ def scenario_sounds(spans: LabelledSpans) -> LabelledSpans:
 def reviewed_lane(
     microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
 ) -> Lane:
-    """Make the lane of what is reviewed.
+    """Make the lane of reviewed spans.
 
     Parameters
     ----------
@@ -224,7 +223,7 @@ def reviewed_lane(
 def _classes(
     microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]
 ) -> dict[str, Colour]:
-    """Return the classes in words, what was heard for the shortest time first."""
+    """Return the displayed names of classes, the one heard for the shortest time first."""
     models = {name for one in labellings if one.probabilities for name in one.probabilities.names}
     known = {name for one in labellings for name in one.spans.texts} | models
     names = [name for name in microphone.classes if name in known and class_name(name) != SILENCE]
@@ -271,7 +270,7 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
 
 
 def _scenario_lane(microphone: str, labelling: LabellingTimeline) -> Lane:
-    """Make one lane of all classes of a scenario, but of what it has no name for."""
+    """Make one lane of all classes of a scenario, without spans that name none."""
     spans = scenario_sounds(labelling.spans)
     shades = {in_words(text): colour(text) for text in dict.fromkeys(spans.texts)}
     words = np.array([in_words(text) for text in spans.texts], object)
@@ -287,12 +286,12 @@ def _named_lane(microphone: str, lane: str, named: LabelledSpans) -> Lane:
     return Lane(microphone, "", lane, LabelledSpans(*named[:2], texts), shades)
 
 
-Checked = Mapping[tuple[str, str], ClassCheck]  # by microphone, and class in words
+Checked = Mapping[tuple[str, str], ClassCheck]  # by microphone and displayed class name
 _AROUND = 28 * 86_400 * NANOSECONDS
 
 
 def class_precision(timeline: Timeline, logs: HomeLogs) -> Checked:
-    """Count sounds of the recorder in minutes that were drawn at random, and those that are right.
+    """Count the recorder's sounds, and the correct ones, in minutes drawn at random.
 
     Parameters
     ----------
@@ -302,7 +301,7 @@ def class_precision(timeline: Timeline, logs: HomeLogs) -> Checked:
     Returns
     -------
     mapping
-        From microphone and class in words; classes without a sound in these minutes are left out.
+        By microphone and displayed class name; without classes that have no sound in these minutes.
     """
     start, end = timeline.grid.start - _AROUND, timeline.grid.end + _AROUND
     near = read_reviewed_labels(logs, LIVE, start, end, [], {RANDOM})
@@ -319,13 +318,13 @@ _BRIGHT: Colour = (235, 215, 140)
 _GROUND: Colour = (200, 120, 90)
 _NEW: Colour = (160, 200, 255)
 _TOWARDS: Colour = (150, 215, 150)
-_HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
+_HEAT_COLUMNS = 600  # maximum: each value is a square, which costs the viewer about ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
 _TINY = np.finfo(np.float64).tiny
 
 
 class Style(Enum):
-    """How values are drawn: shares of one in bands, 0 to 1 from dark to bright, a line, points."""
+    """Drawing of values: stacked bands (shares of one), dark to bright (0 to 1), line, points."""
 
     BANDS = auto()
     HEAT_MAP = auto()
@@ -335,17 +334,17 @@ class Style(Enum):
 
 @dataclass(frozen=True)
 class PlotKind:
-    """How plots of one kind look; they are shown in the order of `PLOTS`."""
+    """Appearance of plots of one kind; they are shown in the order of `PLOTS`."""
 
     name: str  # of the entity
-    # Of the view; kinds of one title share it. With {first} and {last} for names of columns, and
-    # {end} for the last number.
+    # Title of the view, shared by all kinds with the same title. Placeholders: {first} and {last}
+    # are names of columns, {end} is the last number.
     title: str
-    height: int  # in relation to other views
+    height: int  # relative to other views
     style: Style
     colour: Colour = _BRIGHT  # of a line, or of points
     scale: tuple[float, float] | None = None  # None fits the values
-    live_scale: tuple[float, float] | None = None  # if another one, where values go on
+    live_scale: tuple[float, float] | None = None  # replaces `scale` where values are added live
 
     @property
     def view(self) -> str:
@@ -375,12 +374,12 @@ PLOTS = (SHARES, LEVEL, FLOOR, DIRECTION, NOVELTY, FEATURES)
 
 
 class Plot(NamedTuple):
-    """A plot, or what is new in it: means over spans of time.
+    """A plot, or an addition to it: means over spans of time.
 
     Attributes
     ----------
     labelling : str
-        Empty if the plot is of none.
+        Empty if the plot belongs to none.
     times : np.ndarray [shape=(n,)], int64
         Middles of the spans, in nanoseconds of UTC.
     values : np.ndarray [shape=(n, k)], float64
@@ -399,13 +398,13 @@ class Plot(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Of a view of it."""
+        """Title of the plot's view."""
         last = len(self.names) - 1
         return self.kind.title.format(first=self.names[0], last=self.names[-1], end=last)
 
     @property
     def text(self) -> str:
-        """What stands beside it: what it shows, of bands each from below."""
+        """Text next to the plot: its title, or the names of bands from the bottom."""
         if self.kind.style is not Style.BANDS:
             return self.title
         return f"From below: {', '.join(map(in_words, self.names))}"
@@ -441,19 +440,19 @@ def _values(
 
 
 def _shades(times: Int64, values: Float64) -> tuple[Int64, Float64]:
-    """Scale each column from its low values (0) to its high ones (1), in few enough rows."""
+    """Scale each column from its low values (0) to its high values (1), and limit the rows."""
     present = ~np.isnan(values[:, 0])
     if not present.any():
         return times[:0], values[:0]
     times, values = times[present], values[present]
-    absent = np.isnan(values)  # where the logs are of another feature set
+    absent = np.isnan(values)  # where the logs have another feature set
     times, values = _thin(times, np.where(absent, np.nanmin(values, axis=0), values))
     low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
     return times, np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
 
 
 def _thin(times: Int64, values: Float64) -> tuple[Int64, Float64]:
-    """Average successive rows until they are few enough."""
+    """Average successive rows to at most `_HEAT_COLUMNS`."""
     size = -(-len(times) // _HEAT_COLUMNS)
     first = np.arange(0, len(times), size)
     sizes = np.diff(first, append=len(times))

@@ -1,4 +1,4 @@
-"""Updates of a timeline from growing logs, second by second, within bounded memory."""
+"""Timeline updates from growing logs, second by second, within bounded memory."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -52,16 +52,16 @@ from hearthlog.schemas.logs.files import find_logs, is_layer, time_span
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.topics import LIVE, is_scenario
 
-_MEMORY = 600  # seconds that the scale of a feature follows
-_SPREAD = 2.0  # standard deviations from its middle to its ends
-_MOST_OPEN = 100_000  # seconds of a segment that may be shown before it closes
+_MEMORY = 600  # seconds covered by the scale of a feature
+_SPREAD = 2.0  # standard deviations from the middle of a scale to its ends
+_MOST_OPEN = 100_000  # maximum seconds of a segment shown before it closes
 _TINY = np.finfo(np.float64).tiny
 
 Update = Plot | StateLane | LogLines
 
 
 def last_time(folder: Path) -> int | None:
-    """Return the last log time of the log in a folder that was written to last.
+    """Return the last log time of the most recently written log in a folder.
 
     Returns
     -------
@@ -71,14 +71,14 @@ def last_time(folder: Path) -> int | None:
     Raises
     ------
     LogError
-        If there is no such folder.
+        If the folder does not exist.
     """
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; name the one that `hearthlog record` writes to")
     logs: list[tuple[int, Path]] = []
     with suppress(LogError):  # none yet
         for path in find_logs(folder):
-            with suppress(FileNotFoundError):  # it got its final name at this moment
+            with suppress(FileNotFoundError):  # it was renamed at this moment
                 logs.append((path.stat().st_mtime_ns, path))
     for _, path in sorted(logs, reverse=True):
         if is_layer(path):
@@ -93,7 +93,7 @@ def last_time(folder: Path) -> int | None:
 
 
 class LiveTimeline:
-    """Turns messages into updates of lanes and plots."""
+    """Converts messages into updates of lanes and plots."""
 
     def __init__(self) -> None:
         self._ends: dict[tuple[str, ...], int] = {}  # of the last frame, by topic and names
@@ -101,7 +101,7 @@ class LiveTimeline:
         self._open: dict[str, Int64] = {}  # seconds without a segment yet, by microphone
 
     def take(self, path: Path, batch: Sequence[RawMessages]) -> Iterator[Update]:
-        """Yield the updates that new messages of a log make.
+        """Yield the updates from new messages of a log.
 
         Raise `LogError` if the messages are not of the types of their channels, or a channel
         does not name its values.
@@ -159,7 +159,7 @@ class LiveTimeline:
         self._open[microphone] = seconds[-_MOST_OPEN:]
 
     def _segments(self, microphone: str, spans: LabelledSpans) -> Iterator[StateLane]:
-        """Replace the labels of the seconds in closed segments by those of the segments."""
+        """Replace the labels of the seconds in closed segments with the segments' labels."""
         seconds = self._open_seconds(microphone)
         times = np.unique(np.append(seconds, spans.starts))
         rows = rows_at(spans, times)
@@ -174,7 +174,7 @@ class LiveTimeline:
     def _by_second(
         self, key: tuple[str, ...], times: Int64, values: NDArray[np.floating]
     ) -> tuple[Int64, Int64, Float64]:
-        """Average frames over each second, and put a row of NaN where frames are missing.
+        """Average frames over each second, and insert a row of NaN where frames are missing.
 
         Returns
         -------
@@ -201,7 +201,7 @@ class LiveTimeline:
 
 
 class _Scale:
-    """Where values lie among those of the last minutes: 0 low, 1 high."""
+    """Position of values among those of the last minutes: 0 low, 1 high."""
 
     def __init__(self) -> None:
         self._count = 0

@@ -1,4 +1,4 @@
-"""The marks of a review: written to their layers one by one, and undone."""
+"""Writing and undoing of review marks, one by one, in their layers."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -23,18 +23,18 @@ from hearthlog.analyzer.review.timeline import LabelledSpans
 
 @dataclass
 class _Change:
-    """The marks of a layer before a change, and what it said was looked at, to undo it."""
+    """Marks and reviewed spans of a layer before a change, to undo it."""
 
     log: Path
     span: MarkedSpan
     before: list[Mark]
-    reviewed: list[ReviewedSpan]  # that it added
-    not_reviewed: list[ReviewedSpan] = field(default_factory=list)  # that it took out
+    reviewed: list[ReviewedSpan]  # added by the change
+    not_reviewed: list[ReviewedSpan] = field(default_factory=list)  # removed by the change
 
 
 @dataclass
 class Marking:
-    """The review layers of some logs, as one reviewer changes them."""
+    """Review layers of some logs, edited by one reviewer."""
 
     microphone: str
     coverage: Coverage
@@ -43,18 +43,18 @@ class Marking:
     labelled: LabelledSpans
     scenario: str = ""
     _done: list[list[_Change]] = field(default_factory=list)
-    _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
+    _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as last read
     _reviewed: dict[Path, list[ReviewedSpan]] = field(default_factory=dict)
 
     def mark(self, start: int, end: int, label: str, chosen: str = "") -> list[Mark]:
-        """Label a span of time, in place of the marks that it has.
+        """Label a span of time, replacing its marks.
 
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC; what lies before or after all logs is cut off.
+            In nanoseconds of UTC; parts before or after all logs are cut off.
         chosen : str, optional
-            As of `ReviewedSpan`, if the span counts as reviewed; else empty.
+            As in `ReviewedSpan`, if the span counts as reviewed; otherwise empty.
 
         Raises
         ------
@@ -66,12 +66,12 @@ class Marking:
         return self._write(start, end, [(start, end, label)], chosen)
 
     def review(self, start: int, end: int, chosen: str) -> None:
-        """Say that a span was looked at: what is not marked in it is right.
+        """Record a span as reviewed: its unmarked labels are correct.
 
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC; what lies before or after all logs is cut off.
+            In nanoseconds of UTC; parts before or after all logs are cut off.
 
         Raises
         ------
@@ -88,12 +88,12 @@ class Marking:
         self._done.append(changes)
 
     def confirm(self, start: int, end: int) -> list[Mark]:
-        """Mark a span with the labels that it has, in place of its marks.
+        """Mark a span with its current labels, replacing its marks.
 
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC; what lies before or after all logs is cut off.
+            In nanoseconds of UTC; parts before or after all logs are cut off.
 
         Raises
         ------
@@ -117,12 +117,12 @@ class Marking:
         return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
-        """Delete the marks of a span of time, which counts as reviewed no more.
+        """Delete the marks of a span of time, which then no longer counts as reviewed.
 
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC; what lies before or after all logs is cut off.
+            In nanoseconds of UTC; parts before or after all logs are cut off.
 
         Returns
         -------
@@ -170,7 +170,7 @@ class Marking:
         return _spans([(mark.start, mark.end, mark.label) for mark in own])
 
     def reviewed(self) -> LabelledSpans:
-        """Return what was looked at of the microphone in these logs, with how it was chosen.
+        """Return the reviewed spans of the microphone in these logs, with how they were chosen.
 
         Raise `LogError` if a layer is damaged.
         """
@@ -189,7 +189,7 @@ class Marking:
         self._reviewed[log] = read_reviewed(log, self.scenario)
 
     def _pieces(self, start: int, end: int) -> list[tuple[Path, int, int]]:
-        """Divide a span of time among the logs, each with its start and end."""
+        """Split a span of time by log, each part with its start and end."""
         start = max([start, *self.coverage.starts[:1]])
         end = min([end, *self.coverage.ends[-1:]])
         pieces = self.coverage.split(start, end) if start < end else []
@@ -245,7 +245,7 @@ class Marking:
     def _change(  # noqa: PLR0913
         self, log: Path, start: int, end: int, now: int, chosen: str, *, deleted: bool = False
     ) -> _Change:
-        """Return the marks that a change will touch, and the span that they reach over."""
+        """Return the marks affected by a change, and their total span."""
         touched = [
             mark
             for mark in read_marks(log, self.scenario)
@@ -276,7 +276,7 @@ def _spans(rows: Sequence[tuple[int, int, str]]) -> LabelledSpans:
 
 
 def _outside(span: ReviewedSpan, start: int, end: int) -> list[ReviewedSpan]:
-    """Cut a reviewed span; a part of a minute is none that was drawn at random."""
+    """Cut a reviewed span; a part of a random minute is not random, so it is dropped."""
     if span.chosen == RANDOM:
         return []
     parts = span._replace(end=min(span.end, start)), span._replace(start=max(span.start, end))

@@ -1,4 +1,4 @@
-"""The queue of a review: spans ranked by uncertainty, disagreement, novelty and coverage."""
+"""Review queue: spans ranked by uncertainty, disagreement, novelty and coverage."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.messages.topics import labelling_topic, scenario_name
 
-MOST_CANDIDATES = 3000  # of which all pairs are compared
+MOST_CANDIDATES = 3000  # maximum spans whose pairs are all compared
 _SEED = 20_261_123
 
 
 def sample(weights: Float64, most: int = MOST_CANDIDATES) -> tuple[Indices, Float64]:
-    """Choose rows that stand for all: each as likely as it weighs, spread over their order.
+    """Choose representative rows: with probability proportional to weight, spread over their order.
 
     Parameters
     ----------
@@ -44,9 +44,10 @@ def sample(weights: Float64, most: int = MOST_CANDIDATES) -> tuple[Indices, Floa
     Returns
     -------
     rows : np.ndarray [shape=(m,)], intp
-        Ascending; all that weigh something, if they are not more. The same weights give the same.
+        Ascending; all rows with a weight, if these are at most `most`. The same weights give the
+        same rows.
     shares : np.ndarray [shape=(m,)], float64
-        How much of the sum of all weights each of them stands for.
+        Share of the sum of all weights that each row represents.
     """
     rows = np.flatnonzero(weights > 0.0)
     if len(rows) <= most:
@@ -58,14 +59,14 @@ def sample(weights: Float64, most: int = MOST_CANDIDATES) -> tuple[Indices, Floa
     return rows[hit], times * np.float64(step)
 
 
-# What a set of spans covers is a facility location function, of which the greedy choice has at
-# least 1 - 1 / e of the most that is possible (Nemhauser, Wolsey and Fisher, "An analysis of
+# The coverage of a set of spans is a facility location function; its greedy maximum has at
+# least 1 - 1 / e of the possible maximum (Nemhauser, Wolsey and Fisher, "An analysis of
 # approximations for maximizing submodular set functions", 1978).
 def cover(points: Float64, gamma: float, weights: Float64, eligible: Bool, count: int) -> Indices:
-    """Choose points to which most of the weight of all points is similar.
+    """Choose points that are similar to most of the weight of all points.
 
-    Each time it is the point that adds the most to the sum of weight times similarity to the
-    nearest chosen point, where the similarity of x and y is exp(-gamma |x - y|^2).
+    Each step adds the point with the largest gain in the sum of weight times similarity to the
+    nearest chosen point. The similarity of x and y is exp(-gamma |x - y|^2).
 
     Parameters
     ----------
@@ -74,14 +75,14 @@ def cover(points: Float64, gamma: float, weights: Float64, eligible: Bool, count
     weights : np.ndarray [shape=(n,)], float64
         Not negative.
     eligible : np.ndarray [shape=(n,)], bool
-        Which may be chosen.
+        Points that may be chosen.
     count : int
-        How many, at most.
+        Maximum number.
 
     Returns
     -------
     np.ndarray [shape=(m,)], intp
-        In the order in which they were chosen; none that adds nothing.
+        In the order of choice, without points of no gain.
     """
     similar = _similarities(points, gamma)
     nearest = np.zeros(len(points), np.float32)
@@ -109,24 +110,24 @@ def _similarities(points: Float64, gamma: float) -> Float32:
     return similar
 
 
-# Of two that differ one may be right, and what is new may be labelled well.
+# Where two labellings differ one may be right, and novel sounds may be labelled correctly.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])
 _MOSTLY = 0.5
 USEFUL, UNCERTAIN, DISAGREEING = "useful", "uncertain", "disagreeing"
-_ALONE = {UNCERTAIN: 0, DISAGREEING: 1, "novel": 2}  # rows of what is weighed
+_ALONE = {UNCERTAIN: 0, DISAGREEING: 1, "novel": 2}  # rows of `weighted`
 RANKINGS = (USEFUL, *_ALONE)
-_LONG_ENOUGH = 3 * NANOSECONDS // 2  # for whole windows of one sound
+_LONG_ENOUGH = 3 * NANOSECONDS // 2  # enough for complete windows of one sound
 _LONGEST_WEIGHED = 3 * NANOSECONDS
 
 
 @dataclass(frozen=True)
 class ReviewQueue:
-    """Spans to be reviewed, the best first.
+    """Spans to review, the best first.
 
     Attributes
     ----------
     labels, others : list of str
-        The label of most of each span by the labelling, and by the other one; empty without one.
+        Main label of each span in the labelling, and in the other one; empty without one.
     uncertainty, disagreement, novelty : np.ndarray [shape=(n,)], float64
         0 to 1.
     has_uncertainty : bool
@@ -152,12 +153,12 @@ class ReviewQueue:
 
     @property
     def weighted(self) -> Float64:
-        """The weighted parts of the scores: uncertainty, disagreement and novelty; shape (3, n)."""
+        """Weighted parts of the scores: uncertainty, disagreement and novelty; shape (3, n)."""
         return _WEIGHTS * np.stack([self.uncertainty, self.disagreement, self.novelty])
 
     @property
     def scores(self) -> Float64:
-        """The scores, before spans are spread over days and classes; shape (n,)."""
+        """Scores before spans are spread over days and classes; shape (n,)."""
         return self.weighted.sum(axis=0)
 
 
@@ -174,29 +175,28 @@ def make_queue(  # noqa: PLR0913
     audible: Spans | None = None,
     progress: Progress = ignore_progress,
 ) -> ReviewQueue:
-    """Choose the spans from which a model learns most, or whose labels are likely to be wrong.
+    """Choose the spans that teach a model most, or whose labels are probably wrong.
 
     Parameters
     ----------
     other : NamedLabelling or None
-        Another one, to find disagreements; another name for a class is none.
+        Another labelling, to find disagreements; two names of one class are no disagreement.
     count : int
-        Number of spans, at most.
+        Maximum number of spans.
     ranking : str, optional
-        One of `RANKINGS`, to rank by it alone; by default uncertainty, disagreement and novelty are
-        weighed, without `border_pieces`. What is mostly silence is not `uncertain`, for there is
-        nothing to judge. The most
-        `useful` spans are those that sound like most of what the model is uncertain of, those of
-        rare classes before others.
+        One of `RANKINGS`, to rank by it alone; by default by the weighted sum of uncertainty,
+        disagreement and novelty, without `border_pieces`. Mostly silent spans are not `uncertain`,
+        since there is nothing to judge. The most `useful` spans sound like most of the sounds that
+        the model is uncertain of, with rare classes preferred.
     audible : Spans, optional
-        Time of which sound was kept: `useful` spans that lie in it go first.
+        Time with kept sound: `useful` spans within it go first.
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Called with the share of the logs that is read, 0 to 1.
 
     Returns
     -------
     ReviewQueue
-        At most one span of each segment, unless they are chosen as `useful`.
+        At most one span of each segment, except for `useful` spans.
 
     Raises
     ------
@@ -264,7 +264,7 @@ def _useful(
     sounds: Callable[[JudgeableSpans], SpanSounds],
     audible: Spans | None,
 ) -> Int64:
-    """Choose spans that sound like most of what a model is uncertain of, in rare classes more."""
+    """Choose spans similar to most of a model's uncertain sounds, with rare classes preferred."""
     rows, shares = sample(worth(spans, uncertain))
     some = spans.take(rows)
     points, gamma = sounds(some)
@@ -282,15 +282,15 @@ def _useful(
 
 
 def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:
-    """Weigh spans by their length, and by how uncertain a model is of them.
+    """Weigh spans by their length and by the model's uncertainty.
 
-    Together, the spans of a class weigh as the square root of how much of it there is, so that what
-    is heard rarely is asked for, and what is heard often more so.
+    The total weight of a class is proportional to the square root of its duration, so that rare
+    classes are included, and frequent ones more often.
 
     Parameters
     ----------
     uncertain : np.ndarray [shape=(n,)], float64
-        0 to 1; where all are 0, all spans are as uncertain.
+        0 to 1; if all are 0, all spans count as equally uncertain.
 
     Returns
     -------
@@ -338,16 +338,16 @@ def _add_frames(
 
 
 def _best_of_each(scores: Float64, sources: Int64) -> Int64:
-    """Return the row of the best span of each source, of equal ones the first."""
+    """Return the row of the best span of each source, the first of equal ones."""
     order = np.lexsort((-scores, sources))
     return order[np.flatnonzero(np.diff(sources[order], prepend=-1))]
 
 
 def spread(scores: Float64, spans: JudgeableSpans, count: int) -> Int64:
-    """Choose the best spans, of many days and classes rather than of one.
+    """Choose the best spans, spread over days and classes.
 
-    Each time it is the one with the highest score / sqrt((1 + c) (1 + d)), where c and d are how
-    many of its class and of its day are chosen already; of equal ones the first.
+    Each step adds the span with the highest score / sqrt((1 + c) (1 + d)), where c and d are the
+    numbers of spans of its class and of its day chosen already; the first of equal ones.
 
     Parameters
     ----------
@@ -355,16 +355,16 @@ def spread(scores: Float64, spans: JudgeableSpans, count: int) -> Int64:
     spans : JudgeableSpans
         In any order, at least one.
     count : int
-        How many, at most.
+        Maximum number.
 
     Returns
     -------
     np.ndarray [shape=(m,)], int64
-        Rows, in the order in which they were chosen.
+        Rows, in the order of choice.
     """
     _, day = np.unique(spans.starts // DAY, return_inverse=True)
     label = spans.labels
-    order = np.lexsort((-scores, label, day))  # only the best of a day and class can be next
+    order = np.lexsort((-scores, label, day))  # only the best span of a day and class can be next
     group = (day * (label.max() + 1) + label)[order]
     head = np.flatnonzero(np.diff(group, prepend=-1))
     stop = np.append(head[1:], len(order))

@@ -1,4 +1,4 @@
-"""Lists of spans to be reviewed, as CSV, and the label files and sounds made from them."""
+"""CSV lists of spans to review, and the label files and sounds made from them."""
 
 import os
 import re
@@ -36,8 +36,8 @@ from hearthlog.schemas.new_files import new_file, new_folder
 
 MOST_SPANS = 100_000
 _PARTS = ("uncertainty", "disagreement", "novelty")
-CHANGE = "change"  # which another model would make
-HINT = "hint"  # of a network, which has a name for the sound
+CHANGE = "change"  # a label that another model would change
+HINT = "hint"  # a sound named by a network
 REASONS = (*_PARTS, USEFUL, RANDOM, CHANGE, HINT)
 _SIZE_LIMIT = 64 << 20
 _LATEST = 1 << 62  # nanoseconds
@@ -45,17 +45,18 @@ _NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,20})?")
 
 
 class ReviewSpan(NamedTuple):
-    """A span of time to be reviewed, and why.
+    """A span of time to review, and the reason.
 
     Attributes
     ----------
     b, label_b : str
-        Another one; both are empty if there is none, the label where it has none.
+        The other labelling and its label; both are empty if there is none, the label also where
+        the labelling has none.
     score : float or None
-        None where spans are not ranked by one; of a change the minutes a day that change so, of a
-        hint the logits above the threshold of the name.
+        None for unranked spans; for a change, the minutes a day with the same change; for a hint,
+        the logits above the threshold of the name.
     reason : str
-        One of `REASONS`; `random` is a whole minute that was drawn at random.
+        One of `REASONS`; `random` is a complete minute drawn at random.
     """
 
     microphone: str
@@ -70,16 +71,16 @@ class ReviewSpan(NamedTuple):
 
     @property
     def proposed_label(self) -> str:
-        """The label that a reviewer may leave as it is."""
+        """The label that a reviewer may leave unchanged."""
         return self.label_b if self.reason == HINT else self.label_a
 
     def as_text(self) -> dict[str, str | float | None]:
-        """Return the fields by name, with the times as texts."""
+        """Return the fields by name, with times as text."""
         return self._asdict() | {"start": time_text(self.start), "end": time_text(self.end)}
 
 
 def disagreements(difference: LabellingDifference, microphone: str) -> list[ReviewSpan]:
-    """List where two labellings differ.
+    """List the spans in which two labellings differ.
 
     Returns
     -------
@@ -100,13 +101,13 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
     Parameters
     ----------
     b : str, optional
-        The labelling that it was compared with; empty without one.
+        The other labelling of the comparison; empty without one.
 
     Returns
     -------
     list of ReviewSpan
-        With the score, to three digits, and as the reason what they are ranked by, or what weighs
-        most in the score; `useful` ones have no score.
+        With the score, to three digits; the reason is the ranking, or the part with the largest
+        weight in the score. `useful` spans have no score.
     """
     reasons = queue.reasons.tolist()
     columns = queue.spans.starts, queue.spans.ends, queue.scores.round(3)
@@ -123,7 +124,7 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
 
 
 def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> list[ReviewSpan]:
-    """List minutes that were drawn at random, in their order."""
+    """List minutes drawn at random, in their order."""
     spans = []
     for start, end in zip(minutes.starts.tolist(), minutes.ends.tolist(), strict=True):
         parts, rows, _ = pieces(side.labelling, one(start, end))
@@ -161,12 +162,12 @@ def read_list(path: Path) -> list[ReviewSpan]:
     Returns
     -------
     list of ReviewSpan
-        In the order of the file, at least one.
+        In file order, at least one.
 
     Raises
     ------
     DataError
-        If the file cannot be read, is no list of spans, or holds none; the message has the line.
+        If the file cannot be read, is no list of spans, or is empty; the message has the line.
     """
     header: list[str] = []
     spans: list[ReviewSpan] = []
@@ -220,17 +221,17 @@ def _time(where: str, text: str) -> int:
 
 _SUFFIX = ".queue.csv"
 _EVER = 1 << 62  # nanoseconds
-_SHORTEST = NANOSECONDS // 10  # sound that is worth a file
+_SHORTEST = NANOSECONDS // 10  # minimum sound for a file
 _FULL_SCALE = 32767.0
 
 
 def queue_file(labels: Path) -> Path:
-    """Return the path of the list beside a label file: `ten.queue.csv` beside `ten.txt`."""
+    """Return the path of the list next to a label file: `ten.queue.csv` for `ten.txt`."""
     return labels.with_name(_stem(labels) + _SUFFIX)
 
 
 def sounds_folder(labels: Path) -> Path:
-    """Return the path of the folder of sounds beside a label file: `ten` beside `ten.txt`."""
+    """Return the folder of sounds next to a label file: `ten` for `ten.txt`."""
     return labels.with_name(_stem(labels))
 
 
@@ -240,7 +241,7 @@ def _stem(labels: Path) -> str:
 
 
 class KeptSoundLayers(NamedTuple):
-    """The kept sound of a microphone."""
+    """Layers with kept sound of a microphone."""
 
     layers: dict[Path, Spans]
     topic: str
@@ -248,12 +249,12 @@ class KeptSoundLayers(NamedTuple):
 
 
 class SoundFile(NamedTuple):
-    """The kept sound of a line of a label file, or of the lines of a minute.
+    """Kept sound of a line of a label file, or of the lines of a minute.
 
     Attributes
     ----------
     first, last : int
-        Numbers of the lines, from 1.
+        Line numbers, from 1.
     """
 
     first: int
@@ -262,7 +263,7 @@ class SoundFile(NamedTuple):
     end: int
 
     def name(self, lines: int) -> str:
-        """Name the file: `07.wav`, or `12-31.wav` for a minute."""
+        """Return the file name: `07.wav`, or `12-31.wav` for a minute."""
         width = max(len(str(lines)), 2)
         last = f"-{self.last:0{width}}" if self.last > self.first else ""
         return f"{self.first:0{width}}{last}.wav"
@@ -271,12 +272,12 @@ class SoundFile(NamedTuple):
 def find_kept_sound(
     logs: Path, microphone: str, limits: tuple[int | None, int | None], losses: list[str]
 ) -> KeptSoundLayers:
-    """Find what sound of a microphone was kept.
+    """Find the kept sound of a microphone.
 
     Parameters
     ----------
     limits : (int or None, int or None)
-        Start and end in nanoseconds of UTC; None for all that there is.
+        Start and end in nanoseconds of UTC; None for no limit.
 
     Raises
     ------
@@ -302,7 +303,7 @@ def find_kept_sound(
 def sound_files(
     marks: Sequence[Mark], asked: Iterable[ReviewSpan], kept: KeptSoundLayers
 ) -> list[SoundFile]:
-    """List the lines of a label file of which sound was kept, and the minutes."""
+    """List the lines of a label file that have kept sound, then the minutes."""
     lines = [SoundFile(n, n, mark.start, mark.end) for n, mark in enumerate(marks, 1)]
     files = [*lines, *(one for one in drawn_minutes(asked, marks) if one.last > one.first)]
     return [one for one in files if cut(kept.time, one.start, one.end).length >= _SHORTEST]
@@ -311,7 +312,7 @@ def sound_files(
 def write_sounds(
     folder: Path, files: Sequence[SoundFile], lines: int, kept: KeptSoundLayers
 ) -> None:
-    """Write sounds as WAV files into a new folder, for the user alone; where there is none silence.
+    """Write sounds as WAV files into a new private folder; holes become silence.
 
     Raise `LogError` if the folder exists or cannot be written, or the sound cannot be read.
     """
@@ -338,7 +339,7 @@ def label_lines(
     folder: str,
     zone: tzinfo,
 ) -> str:
-    """Write labels for people with an editor: times of the clock, and which file to listen to.
+    """Format labels for people with an editor: local times, and the file to listen to.
 
     An import reads the first three columns.
     """
@@ -359,7 +360,7 @@ def label_lines(
 
 
 def _clock(nanoseconds: int, zone: tzinfo) -> str:
-    """Write a time of the clock on the wall, with its offset: no moment is meant twice."""
+    """Format a local time with its UTC offset, so that it is unambiguous."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     text = datetime.fromtimestamp(seconds, zone).isoformat()
     decimals = f"{rest:09}".rstrip("0")
@@ -367,7 +368,7 @@ def _clock(nanoseconds: int, zone: tzinfo) -> str:
 
 
 def drawn_minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterator[SoundFile]:
-    """Yield the minutes that were drawn at random; one whose log is gone has no lines."""
+    """Yield the minutes drawn at random; a minute whose log is gone has no lines and is skipped."""
     for span in asked:
         lines = [number for number, mark in enumerate(marks, 1) if _answers(mark, span)]
         if span.reason == RANDOM and lines:
@@ -375,17 +376,17 @@ def drawn_minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterato
 
 
 def chosen_as(span: ReviewSpan) -> str:
-    """Return how a span was chosen, as `ReviewedSpan` says it."""
+    """Return how a span was chosen, as in `ReviewedSpan`."""
     return RANDOM if span.reason == RANDOM else QUEUE
 
 
 def corrected_name(labelling: str) -> str:
-    """Return the name of a labelling, as marks say it: that of a model without `relabel/`."""
+    """Return the name of a labelling as in marks: a model without `relabel/`."""
     return labelling.removeprefix(f"{RELABEL}/")
 
 
 def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, option: str) -> None:
-    """Check that all spans of a list are of one scenario.
+    """Check that all spans of a list belong to one scenario.
 
     Parameters
     ----------
@@ -395,7 +396,7 @@ def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, optio
     Raises
     ------
     DataError
-        If a span is of another one.
+        If a span belongs to another one.
     """
     for span in spans:
         other = scenario_name(span.a)
@@ -406,7 +407,7 @@ def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, optio
 
 
 def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
-    """Return the labels of a span for a label file: one, or of a whole minute all."""
+    """Return the labels of a span for a label file: one, or all of a complete minute."""
     if span.reason != RANDOM:
         return [Mark(span.microphone, span.start, span.end, span.proposed_label)]
     parts, rows, _ = pieces(labelling, one(span.start, span.end))
@@ -424,7 +425,7 @@ def looked_at(
     reviewer: str,
     made: int,
 ) -> dict[Path, list[ReviewedSpan]]:
-    """Return which of the spans that were asked a person has looked at: those with a label."""
+    """Return the requested spans that a person has reviewed: those with a label."""
     reviewed: dict[Path, list[ReviewedSpan]] = {}
     for span in asked:
         if span.microphone in coverage and any(_answers(mark, span) for mark in marks):
@@ -436,7 +437,7 @@ def looked_at(
 
 
 def unasked(asked: Sequence[ReviewSpan], marks: Iterable[Mark]) -> list[Mark]:
-    """Return the marks that lie in no span that was asked."""
+    """Return the marks outside all requested spans."""
     return [mark for mark in marks if not any(_answers(mark, span) for span in asked)]
 
 

@@ -1,4 +1,4 @@
-"""A review session: its queue of spans, the keys of a reviewer, and playback of kept sound."""
+"""Review session: its queue of spans, the reviewer's keys, and playback of kept sound."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -58,7 +58,7 @@ _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time
 
 
 class ReviewItem(NamedTuple):
-    """A span to be reviewed."""
+    """A span to review."""
 
     start: int
     end: int
@@ -68,16 +68,16 @@ class ReviewItem(NamedTuple):
 
 
 class Screen(Protocol):
-    """A viewer, for a session; all methods may raise ConnectionError or TimeoutError."""
+    """Viewer interface of a session; all methods may raise ConnectionError or TimeoutError."""
 
     def is_open(self) -> bool:
-        """Tell whether the viewer is open."""
+        """Return whether the viewer is open."""
 
     def selection(self) -> tuple[int, int] | None:
         """Return start and end of the selected span, in nanoseconds of UTC; None without one."""
 
     def cursor(self) -> int | None:
-        """Return the time of the cursor, in nanoseconds of UTC; None if there is no cursor."""
+        """Return the time of the cursor, in nanoseconds of UTC; None without a cursor."""
 
     def show(self, start: int, end: int, margin: int) -> None:
         """Select a span, and show it with a margin.
@@ -91,18 +91,18 @@ class Screen(Protocol):
         """
 
     def ask(self, start: int, end: int, text: str) -> None:
-        """Draw which span is asked, in place of the one before.
+        """Draw the requested span, in place of the previous one.
 
         Parameters
         ----------
         start, end : int
             In nanoseconds of UTC.
         text : str
-            What is asked.
+            The question.
         """
 
     def play(self, start: int) -> None:
-        """Let the time cursor run from a time on.
+        """Start the time cursor running from a time.
 
         Parameters
         ----------
@@ -113,20 +113,20 @@ class Screen(Protocol):
     def redraw_marks(
         self, microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
     ) -> None:
-        """Draw what is reviewed of a microphone again.
+        """Redraw the reviewed spans of a microphone.
 
         Parameters
         ----------
         microphone, scenario : str
-            Their names; the second is empty for the sounds of the home.
+            Their names; the scenario is empty for the sounds of the home.
         marks, reviewed : LabelledSpans
-            All that it has now.
+            All current ones.
         """
 
 
 @dataclass
 class ReviewSession:
-    """A review, driven by keys.
+    """Keyboard-driven review.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class ReviewSession:
         Plays the kept sound of a span (start, end in nanoseconds of UTC); returns a line for the
         reviewer.
     items : sequence of ReviewItem
-        The spans to go through; empty where the reviewer chooses spans.
+        The spans to review; empty where the reviewer chooses spans.
     """
 
     screen: Screen
@@ -150,11 +150,11 @@ class ReviewSession:
     _at: int = -1
     _judged: list[int] = field(default_factory=list)  # the item of each change
     _began: float = 0.0
-    _begin: int | None = None  # of a span whose end is not set yet
+    _begin: int | None = None  # start of a span without an end yet
 
     @property
     def keys(self) -> list[tuple[str, str]]:
-        """Each key, and what it does."""
+        """Each key and its action."""
         queued = bool(self.items)
         keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
         keys += [(_RIGHT, "or Enter: all else in the span is right")]
@@ -164,7 +164,7 @@ class ReviewSession:
         return [*keys, ("q", "quit")]
 
     def run(self, keys: "SimpleQueue[str]") -> int:
-        """Obey keys until the reviewer quits or closes the viewer, or the last item is done.
+        """Process keys until the reviewer quits or closes the viewer, or the last item is done.
 
         Raise `LogError` if a review layer is damaged when the session begins.
         """
@@ -185,13 +185,13 @@ class ReviewSession:
         return len(self._judged)
 
     def press(self, key: str) -> None:
-        """Obey one key. An error is shown to the reviewer, and changes nothing.
+        """Process one key; an error is shown to the reviewer and changes nothing.
 
         Parameters
         ----------
         key : str
-            One of `keys`, or Enter; where there are items, a space skips one, too. For any other
-            key the keys are shown, unless it is white space.
+            One of `keys`, or Enter; with items, a space also skips one. Any other key except
+            white space shows the list of keys.
         """
         try:
             self._press(key)
@@ -228,7 +228,7 @@ class ReviewSession:
 
     @property
     def _labels(self) -> dict[str, str]:
-        """What each key of a class marks."""
+        """Label of each class key."""
         classes = [name for name in self.classes if name != UNKNOWN]
         return dict(zip(_CLASS_KEYS, classes, strict=False)) | {"u": UNKNOWN}
 
@@ -289,7 +289,7 @@ class ReviewSession:
 
     @contextmanager
     def _unless_silent(self) -> Iterator[None]:
-        """Tell the reviewer if the viewer does not answer; what was done stays done."""
+        """Report a viewer that does not answer; completed changes are kept."""
         try:
             yield
         except (ConnectionError, TimeoutError):
@@ -333,7 +333,7 @@ class ReviewSession:
         return span
 
     def _go(self, step: int) -> None:
-        """Show the next or the previous item."""
+        """Show the next or previous item."""
         self._at = max(self._at + step, 0)
         if self._at >= len(self.items):
             return
@@ -373,14 +373,14 @@ def _margin(start: int, end: int) -> int:
 
 
 QUEUES = (*RANKINGS, RANDOM, HINT)
-_TEN = 10  # which takes a person ten minutes
-_MINUTE_EVERY = 5  # of the items of a queue of useful spans
-_MINUTES_LEFT = 10  # for each that is drawn, or a short log would have no useful span
+_TEN = 10  # a person needs ten minutes for them
+_MINUTE_EVERY = 5  # items of a queue of useful spans
+_MINUTES_LEFT = 10  # labelled minutes per drawn one, or a short log would have no useful span
 Limits = tuple[int | None, int | None]
 
 
 def review_items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
-    """Return the items of a review, in the order of the spans."""
+    """Return the items of a review, in span order."""
     return [
         ReviewItem(span.start, span.end, span.proposed_label, _text(span), chosen_as(span))
         for span in spans
@@ -402,25 +402,25 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     Parameters
     ----------
     queue : str
-        One of `QUEUES`, or the name of a list (`*.csv`) that `hearthlog diff` made, or a model
-        whose changes are asked for: its name in the folder of models, or its file. Every fifth item
-        of a `useful` queue is a minute drawn at random, and every one of a `random` one.
+        One of `QUEUES`, a list (`*.csv`) made by `hearthlog diff`, or a model whose changes are
+        requested: its name in the folder of models, or its file. Every fifth item of a `useful`
+        queue is a minute drawn at random, and every item of a `random` queue.
     limits : (int or None, int or None)
-        Start and end in nanoseconds of UTC; None for all that there is.
+        Start and end in nanoseconds of UTC; None for no limit.
     count : int or None
-        How many, at most; None for ten, all of a list.
+        Maximum number; None for ten, or for all of a list.
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Called with the share of the logs that is read, 0 to 1.
 
     Raises
     ------
     DataError
-        If there is nothing to review, or no such list or model; of a scenario also if minutes are
-        to be drawn at random, or the changes of a model are asked for.
+        If there is nothing to review, or the list or model does not exist; for a scenario also
+        if random minutes or the changes of a model are requested.
     ModelError
-        If the model that labels now cannot be found or used.
+        If the current model cannot be found or used.
     LogError
-        If the labelling has no segment in these limits, or its segments overlap or cannot be.
+        If the labelling has no segment in these limits, or its segments overlap or are invalid.
     """
     microphone, labelling = labelled
     scenario = scenario_name(labelling)
@@ -467,7 +467,7 @@ def queue_spans(  # noqa: PLR0913, PLR0917
 
 
 def _drawn(queue: str, side: NamedLabelling, done: ReviewedTime, wanted: int) -> Spans:
-    """Draw minutes at random: all of a random queue, some of a useful one."""
+    """Draw minutes at random: all items of a random queue, some of a useful one."""
     if queue not in {USEFUL, RANDOM}:
         return NONE
     there = whole_minutes(side.labelling)
@@ -477,14 +477,14 @@ def _drawn(queue: str, side: NamedLabelling, done: ReviewedTime, wanted: int) ->
 
 
 def _is_comparable(name: str, labelling: str) -> bool:
-    """Tell whether another labelling is by a model that has the same classes to choose from."""
+    """Return whether another labelling is by a model with the same classes to choose from."""
     return not (
         scenario_name(labelling) or scenario_name(name) or name == labelling or is_review(name)
     )
 
 
 def _model(queue: str, models: Path) -> tuple[Path, Model]:
-    """Load the model that the changes of are asked for; return its folder, too."""
+    """Load the model whose changes are requested; return its folder, too."""
     place = Path(queue)
     folder = models if place.name == queue else place.parent
     try:
@@ -512,7 +512,7 @@ def _listed(path: Path, microphone: str, limits: Limits, scenario: str) -> list[
 
 
 def _mixed(spans: Sequence[ReviewSpan], minutes: Sequence[ReviewSpan]) -> list[ReviewSpan]:
-    """Put a minute behind every four spans, and the rest at the end."""
+    """Insert a minute after every four spans, and the remaining minutes at the end."""
     mixed, left = list[ReviewSpan](), list(minutes)
     for number, span in enumerate(spans, 1):
         mixed.append(span)
@@ -539,12 +539,12 @@ _FULL_SCALE = np.float32(32768.0)
 
 
 def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
-    """Start to play the kept sound of a span of time.
+    """Start playback of the kept sound of a span of time.
 
     Returns
     -------
     str
-        A line for the reviewer: how long the sound is, or why there is none.
+        A line for the reviewer: the duration of the sound, or why there is none.
     """
     rate, samples = sound_of(clips, start, end)
     if not len(samples):
@@ -561,7 +561,7 @@ def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
 def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:
     """Return the kept sound of a span of time, without the holes.
 
-    Clips of another rate than the first are left out.
+    Clips with a sample rate other than the first clip's are skipped.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Spans of one label each that a person can judge, their uncertainty, and their sound."""
+"""Single-label spans that a person can judge, with their uncertainty and sound features."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -39,7 +39,7 @@ _MOST = 5_000_000
 
 @dataclass(frozen=True)
 class JudgeableSpans:
-    """Spans in the order of time, which do not overlap.
+    """Spans in time order, without overlaps.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class JudgeableSpans:
     labels : np.ndarray [shape=(n,)], int64
         Indices of classes.
     sources : np.ndarray [shape=(n,)], int64
-        Equal for spans that were cut from one.
+        Equal for spans cut from the same segment.
     """
 
     starts: Int64
@@ -65,7 +65,7 @@ class JudgeableSpans:
         Parameters
         ----------
         rows : np.ndarray [shape=(m,)], int64
-            In the order of time, or they are no longer in it.
+            In time order, otherwise the result is not in time order.
         """
         return JudgeableSpans(
             self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows]
@@ -73,16 +73,16 @@ class JudgeableSpans:
 
 
 def judgeable_spans(segments: Events) -> JudgeableSpans:
-    """Make spans that a person can judge: join segments that flicker, and cut long ones.
+    """Make spans that a person can judge: join flickering segments, and cut long ones.
 
-    Successive segments of less than a second each are joined, with the label of the longest. What
-    is longer than ten seconds is cut into equal spans; what is shorter than half a second is left
-    out, for nobody could judge it.
+    Successive segments of less than a second each are joined, with the label of the longest. Spans
+    longer than ten seconds are cut into equal parts; spans shorter than half a second are dropped,
+    since nobody could judge them.
 
     Parameters
     ----------
     segments : Events
-        In nanoseconds of UTC, in the order of time, one label at a time.
+        In nanoseconds of UTC, in time order, one label at a time.
 
     Raises
     ------
@@ -109,10 +109,10 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
 
 
 def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which spans are less than a second of the border of another sound.
+    """Find spans shorter than a second next to another sound.
 
-    Where one sound goes over into the next the label wavers, and a person hears only the two. What
-    is as short and stands alone, such as a cough, can be judged.
+    Where one sound changes into the next the label wavers, and a person hears only the two. A sound
+    as short that stands alone, such as a cough, can be judged.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[n
 
 
 def without(segments: Events, reviewed: Spans) -> Events:
-    """Return the parts of segments outside of some time."""
+    """Return the parts of segments outside the reviewed time."""
     spans, rows = remains(segments, reviewed)
     return Events(*spans, segments.labels[rows])
 
@@ -143,9 +143,9 @@ def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[
     Returns
     -------
     labels : np.ndarray [shape=(n,)], int64
-        The other label of most of each span; -1 for none.
+        The other labelling's main label in each span; -1 for none.
     differing : np.ndarray [shape=(n,)], float64
-        The share of each span that has another label, 0 to 1.
+        The share of each span with a different label, 0 to 1.
     """
     own = Events(spans.starts, spans.ends, spans.labels)
     pieces = overlay([own, others]).in_all()
@@ -156,12 +156,12 @@ def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[
     pairs, place = np.unique(np.stack([row, label]), axis=1, return_inverse=True)
     by_length = np.lexsort((np.bincount(place, lengths), pairs[0]))
     labels = np.full(len(spans), -1)
-    labels[pairs[0][by_length]] = pairs[1][by_length]  # of equal rows the last one stays
+    labels[pairs[0][by_length]] = pairs[1][by_length]  # of duplicate rows the last value remains
     return labels, differing
 
 
 class ModelUncertainty:
-    """Mean uncertainty, novelty and silence of spans, of labels that come batch by batch.
+    """Mean uncertainty, novelty and silence of spans, computed from batches of labels.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class ModelUncertainty:
     uncertainty, novelty : SpanMeans
         0 to 1.
     silence : SpanMeans
-        The probability of silence, which is 1 where nothing is above the floor of the room.
+        The probability of silence; 1 where nothing is above the noise floor.
     """
 
     def __init__(self, spans: JudgeableSpans, classes: Sequence[str]) -> None:
@@ -181,7 +181,7 @@ class ModelUncertainty:
         self.uncertainty, self.novelty, self.silence = (SpanMeans(len(spans)) for _ in range(3))
 
     def add(self, frames: Columns) -> None:
-        """Add the labels of frames; probabilities without names are left out.
+        """Add the labels of frames; probabilities without names are skipped.
 
         Parameters
         ----------
@@ -204,17 +204,17 @@ class ModelUncertainty:
 
 
 def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64:
-    """Return (1 - p + q) / 2, of the probabilities p of the label and q of the best other class.
+    """Return (1 - p + q) / 2 for p of the label and q of the best other class.
 
     Smoothing may choose another label than the most probable class, so the difference of the two
-    highest probabilities would not do.
+    highest probabilities would be wrong.
 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float
         Of each class, 0 to 1.
     labelled : np.ndarray [shape=(n,)], int64
-        Columns of the labels; -1 for a label without a column, whose p is 0.
+        Columns of the labels; -1 for a label without a column, with p = 0.
 
     Returns
     -------
@@ -236,12 +236,12 @@ class SpanMeans:
         self._sums, self._counts = np.zeros(count), np.zeros(count)
 
     def add(self, row: Int64, values: Float64) -> None:
-        """Add values to their spans; those that are not finite are left out.
+        """Add values to their spans; values that are not finite are skipped.
 
         Parameters
         ----------
         row : np.ndarray [shape=(n,)], int64
-            Of the span that each value is in.
+            Row of the span of each value.
         values : np.ndarray [shape=(n,)], float64
         """
         finite = np.isfinite(values)
@@ -263,21 +263,21 @@ class SpanMeans:
 
 
 _FIELDS = ("header.stamp", "frame", "values")
-_BEFORE = 60 * NANOSECONDS  # in which the floor of the room is found
+_BEFORE = 60 * NANOSECONDS  # time used to find the noise floor
 _MOST_AT_ONCE = 1800 * NANOSECONDS
-_MOST_WINDOWS = 12  # of a span
-_EMBEDDED = 0.5  # what of the kernel's exponent is theirs, of two spans on average, halved
-_GAMMA = 0.5  # over the number of inputs, as of the starter models
+_MOST_WINDOWS = 12  # per span
+_EMBEDDED = 0.5  # their part of the kernel exponent of two spans, on average, halved
+_GAMMA = 0.5  # divided by the number of inputs, as in the starter models
 
 
 class SpanSounds(NamedTuple):
-    """Points, one for each span.
+    """One point per span.
 
     Attributes
     ----------
     points : np.ndarray [shape=(n, width)], float64
-        Means of scaled inputs, and behind them of the embeddings of one network, 0 for a span
-        without any; NaN for a span without features.
+        Means of scaled inputs, followed by the embeddings of one network, 0 for a span without
+        any; NaN for a span without features.
     gamma : float
         The kernel of two points is exp(-gamma |x - y|^2).
     """
@@ -294,12 +294,12 @@ def labelling_model(
     Parameters
     ----------
     scenario : str, optional
-        For which it labelled; empty for the sounds of the home.
+        Scenario of the model; empty for the sounds of the home.
 
     Returns
     -------
     Model or None
-        None if its file is gone, or cannot be used.
+        None if its file is missing or unusable.
     """
     with suppress(ModelError):
         path = find_model(models, model_of(logs[-1].path, microphone, scenario).model_sha256)
@@ -314,17 +314,17 @@ def span_sounds(
     model: Model | None,
     progress: Progress = ignore_progress,
 ) -> SpanSounds:
-    """Read what spans sound like.
+    """Read the inputs and embeddings of spans.
 
     Parameters
     ----------
     spans : JudgeableSpans
         At least one.
     model : Model or None
-        The one that labelled them. Without one, or if its features are not those of the logs, the
-        points are means and standard deviations of the features, scaled by their own spread.
+        The model that labelled them. Without one, or if its feature set differs from that of the
+        logs, the points are means and standard deviations of the features, scaled by their spread.
     progress : callable, optional
-        Told the share of the spans that is read, 0 to 1.
+        Called with the share of the spans that is read, 0 to 1.
     """
     name, points = topic(microphone, "features"), np.empty((len(spans), 0))
     embedded: dict[EmbeddingSpace, Float64] = {}
@@ -363,13 +363,13 @@ def _embed(
     spans: JudgeableSpans,
     part: slice,
 ) -> None:
-    """Read what networks hear of some spans, each network apart: log by log."""
+    """Read the embeddings of some spans, log by log, separately for each network."""
     name, starts, ends = topic(microphone, "embedding"), spans.starts[part], spans.ends[part]
     for log in sources.logs:
         if log.last < starts[0] or log.first >= ends[-1]:
             continue
         try:
-            span = int(starts[0]), int(ends[-1]) + NANOSECONDS  # known when a window has ended
+            span = int(starts[0]), int(ends[-1]) + NANOSECONDS  # logged when a window has ended
             columns = read_columns([log.path], {name}, *span, fields=_FIELDS[::2]).get(name)
         except LogError as error:
             sources.lose(error)
@@ -383,7 +383,7 @@ def _embed(
 
 
 def _scaled(embedded: Float64, gamma: float) -> Float64:
-    """Scale embeddings so that two of any spans are as far apart as their inputs are."""
+    """Scale embeddings so that spans are on average as far apart as by their inputs."""
     there = np.isfinite(embedded).all(axis=1)
     own = embedded[there] - embedded[there].mean(axis=0)
     spread = own.std(axis=0)
@@ -393,7 +393,7 @@ def _scaled(embedded: Float64, gamma: float) -> Float64:
 
 
 class _Space(NamedTuple):
-    """Inputs of windows, and how they are scaled."""
+    """Inputs of windows, and their scaling."""
 
     features: FeatureSet | None
     inputs: Inputs
@@ -402,7 +402,7 @@ class _Space(NamedTuple):
     gamma: float = 0.0
 
     def is_of(self, recorded: Columns) -> bool:
-        """Tell whether these are inputs of recorded features."""
+        """Return whether these are inputs of recorded features."""
         width = recorded["values"].shape[1]
         if self.features is None:
             return self.inputs.width == 2 * width
@@ -411,7 +411,7 @@ class _Space(NamedTuple):
 
 
 def _space(model: Model) -> _Space | None:
-    """Return the space of a classifier with kernels; None for other models."""
+    """Return the input space of a kernel classifier; None for other models."""
     description, arrays = model.description, model.arrays
     gamma = description.parameters.get("gamma")
     if gamma is None or not {"scaler_mean", "scaler_scale"} <= arrays.keys():
@@ -430,7 +430,7 @@ def _space_of_features(recorded: Columns) -> _Space:
 
 
 def _groups(spans: JudgeableSpans) -> Iterator[tuple[int, int]]:
-    """Yield rows of spans that are read at once: first, and behind the last one."""
+    """Yield row ranges (first, end) of spans that are read at once."""
     first = 0
     while first < len(spans):
         last = int(np.searchsorted(spans.starts, spans.starts[first] + _MOST_AT_ONCE))
@@ -474,7 +474,7 @@ def _means(recorded: Columns, starts: Int64, ends: Int64, space: _Space) -> Floa
 
 
 def _floors(recorded: Columns, features: FeatureSet | None) -> Float64:
-    """Return the floor of the room at each frame, near to that of the recorder."""
+    """Return the noise floor at each frame, close to the recorder's own."""
     assert features is not None
     assert features.band_powers is not None
     frames, powers = recorded["frame"].astype(np.int64), features.band_powers(recorded["values"])

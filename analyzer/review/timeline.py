@@ -1,4 +1,4 @@
-"""A timeline: rows of messages, their arrays on a grid of time, and the clock of the home."""
+"""Timeline: rows of messages, their arrays on a time grid, and the clock of the home."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ class TimelineGrid:
 
     @property
     def edges(self) -> Int64:
-        """Starts of the shares, and the end of the last one; shape (count + 1,)."""
+        """Starts of the shares, then the end of the last share; shape (count + 1,)."""
         shares = np.arange(self.count + 1) / self.count
         return self.start + np.round(shares * (self.end - self.start)).astype(np.int64)
 
     @property
     def step(self) -> int:
-        """Length of a share in nanoseconds, but for rounding."""
+        """Length of a share in nanoseconds, except for rounding."""
         return (self.end - self.start) // self.count
 
     @property
@@ -59,14 +59,14 @@ class TimelineGrid:
         Returns
         -------
         np.ndarray [shape=(n,)], int
-            0 to count - 1; for a time outside of the grid the nearest share.
+            0 to count - 1; the nearest share for a time outside the grid.
         """
         places = (times - self.start) * (self.count / (self.end - self.start))
         return np.clip(places.astype(np.int64), 0, self.count - 1)
 
 
 class GridMeans:
-    """Means of rows of values in each share of a grid."""
+    """Means of rows in each share of a grid."""
 
     def __init__(self, grid: TimelineGrid, width: int) -> None:
         self._grid = grid
@@ -74,7 +74,7 @@ class GridMeans:
         self._counts = np.zeros(grid.count, np.int64)
 
     def add(self, times: Int64, values: NDArray[np.floating]) -> None:
-        """Add rows in the order of time; values that are not finite count as 0.
+        """Add rows in time order; values that are not finite count as 0.
 
         Parameters
         ----------
@@ -91,40 +91,40 @@ class GridMeans:
 
     @property
     def values(self) -> Float64:
-        """The means, shape (count, width); NaN in shares without a row."""
+        """Means, shape (count, width); NaN in shares without a row."""
         with np.errstate(invalid="ignore"):
             return self._sums / self._counts[:, np.newaxis]
 
 
 @dataclass(frozen=True)
 class HomeClock:
-    """What the clock of a home shows, as nanoseconds since 1970.
+    """Local wall clock of a home, as nanoseconds since 1970.
 
     Attributes
     ----------
     name : str
-        Of the axis, in words, with the distance from UTC.
+        Name of the axis, with the offset from UTC.
     offset : int
-        Nanoseconds by which it is ahead of UTC.
+        Local time minus UTC, in nanoseconds.
     """
 
     name: str
     offset: int
 
     def shown(self, utc: Any) -> Any:
-        """Turn nanoseconds of UTC, int or np.ndarray of int64, into what the clock shows."""
+        """Convert UTC to local time, both in nanoseconds (int or np.ndarray of int64)."""
         return utc + self.offset
 
     def utc(self, shown: Any) -> Any:
-        """Turn what the clock shows into nanoseconds of UTC, int or np.ndarray of int64."""
+        """Convert local time to UTC, both in nanoseconds (int or np.ndarray of int64)."""
         return shown - self.offset
 
 
 def home_clock(zone: tzinfo, start: int, end: int) -> HomeClock:
     """Make the clock of a home for a span of time.
 
-    Where clocks are changed in between, it goes on with the time that holds in the middle, and its
-    name says so: an axis of time has no hour twice.
+    If the clocks change within the span, the offset at its middle is used throughout, and the name
+    states it: a time axis has no hour twice.
     """
     ahead = _ahead((start + end) // 2, zone)
     is_one = _ahead(start, zone) == ahead == _ahead(max(start, end - 1), zone)
@@ -147,7 +147,7 @@ class LabelledSpans(NamedTuple):
     Attributes
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, in the order of time.
+        In nanoseconds of UTC, in time order.
     texts : np.ndarray [shape=(n,)] of str
     """
 
@@ -178,7 +178,7 @@ class GridSeries(NamedTuple):
 
 
 class FrameValues(NamedTuple):
-    """Values of successive frames, 20 a second, as they are in a log.
+    """Values of successive frames of a log, 20 a second.
 
     Attributes
     ----------
@@ -193,14 +193,14 @@ class FrameValues(NamedTuple):
 
 
 class LogLines(NamedTuple):
-    """Lines that the recorder logged in words, in the order of time.
+    """Text lines logged by the recorder, in time order.
 
     Attributes
     ----------
     times : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
     levels : np.ndarray [shape=(n,)], int
-        Those of `rcl_interfaces/msg/Log`.
+        Levels of `rcl_interfaces/msg/Log`.
     texts : np.ndarray [shape=(n,)] of str
     """
 
@@ -210,12 +210,12 @@ class LogLines(NamedTuple):
 
 
 class SoundClip(NamedTuple):
-    """Kept sound.
+    """Clip of kept sound.
 
     Attributes
     ----------
     rate : int
-        Samples a second.
+        Samples per second.
     samples : np.ndarray [shape=(n,)], int16
     """
 
@@ -231,13 +231,13 @@ class SoundClip(NamedTuple):
 
 @dataclass
 class LabellingTimeline:
-    """The labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`).
+    """Labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`).
 
     Attributes
     ----------
     novelty : np.ndarray [shape=(count,)], float64, or None
     frames : list of FrameValues
-        The probabilities, frame by frame; none of more than three hours, see `read_frames`.
+        Probabilities of each frame; empty above three hours, see `read_frames`.
     """
 
     name: str
@@ -249,18 +249,18 @@ class LabellingTimeline:
 
 @dataclass
 class MicrophoneTimeline:
-    """What the logs have of a microphone.
+    """Logged data of a microphone.
 
     Attributes
     ----------
     level : np.ndarray [shape=(count,)], float64, or None
         Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
     level_frames : list of FrameValues
-        The level, frame by frame; none of more than three hours.
+        Level of each frame; empty above three hours.
     floor : np.ndarray [shape=(count,)], float64, or None
-        Level of the floor of the room, in the same unit; NaN where it is not known.
+        Noise floor of the room, in the same unit; NaN where unknown.
     direction : np.ndarray [shape=(count,)], float64, or None
-        Whence the sound of an array came, in degrees; NaN where nothing was located.
+        Direction of the sound at an array, in degrees; NaN where nothing was located.
     """
 
     name: str
@@ -280,16 +280,16 @@ class MicrophoneTimeline:
 
     @property
     def classes(self) -> list[str]:
-        """The classes of the models but those of scenarios, then other labels that there are."""
+        """Classes of the models except scenarios, then other labels."""
         return self.classes_of("")
 
     def classes_of(self, scenario: str) -> list[str]:
-        """Return the classes of a scenario, then other labels that there are.
+        """Return the classes of a scenario, then other labels.
 
         Parameters
         ----------
         scenario : str
-            Its name; empty for all labellings that are of none.
+            Its name; empty for all labellings without a scenario.
         """
         labellings = [one for one in self.labellings if scenario_name(one.name) == scenario]
         series = [one.probabilities for one in labellings if one.probabilities is not None]
@@ -299,12 +299,12 @@ class MicrophoneTimeline:
 
 @dataclass
 class Timeline:
-    """What some logs hold, at the resolution of a screen.
+    """Content of some logs, at the resolution of a screen.
 
     Attributes
     ----------
     grid : TimelineGrid
-        The whole span, in shares that are a pixel or two wide.
+        Complete span, in shares one or two pixels wide.
     """
 
     grid: TimelineGrid
@@ -317,9 +317,9 @@ class Timeline:
 
     @property
     def clock(self) -> HomeClock:
-        """The clock of the home.
+        """Clock of the home.
 
-        Raise `DataError` if there is no such time zone.
+        Raise `DataError` if the time zone is unknown.
         """
         return home_clock(home_zone(self.zone), self.grid.start, self.grid.end)
 
@@ -336,7 +336,7 @@ FIELDS = {
     message_types.LOG: ("stamp", "level", "msg"),
 }
 _KINDS = {"features", "label", "segment", "gap", "direction"}
-_QUIETEST = 1e-10  # of a mean square: -100 dB
+_QUIETEST = 1e-10  # mean square: -100 dB
 
 
 class FeatureRows(NamedTuple):
@@ -391,14 +391,14 @@ class GapRows(NamedTuple):
 
 
 class DirectionRows(NamedTuple):
-    """Whence the sound of an array came, in n blocks.
+    """Directions of the sound at an array, in n blocks.
 
     Attributes
     ----------
     times : np.ndarray [shape=(n,)], int64
         Starts of the blocks, in nanoseconds of UTC.
     directions : np.ndarray [shape=(n, 2)], float64
-        Ahead and left: of a length that is the confidence.
+        Ahead and left; the length is the confidence.
     """
 
     microphone: str
@@ -407,7 +407,7 @@ class DirectionRows(NamedTuple):
 
 
 class StateRows(NamedTuple):
-    """How microphones were, by the diagnostics."""
+    """Health of microphones, from the diagnostics."""
 
     states: list[MicrophoneHealth]
 
@@ -416,7 +416,7 @@ Rows = FeatureRows | LabelRows | SegmentRows | GapRows | DirectionRows | StateRo
 
 
 def read_rows(path: Path, columns: Columns) -> Rows | None:
-    """Take the fields out of messages of one topic.
+    """Extract the fields from the messages of one topic.
 
     Parameters
     ----------
@@ -443,7 +443,7 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
 
 
 def worded(line: str) -> str:
-    """Return a line about a segment with the name that the lane of its class has."""
+    """Return a line about a segment, with the class name replaced by its lane's name."""
     return _SEGMENT_LINE.sub(lambda found: f"{in_words(found[1])} for", line)
 
 
@@ -467,12 +467,12 @@ def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:
 
 
 def shown_topic(name: str) -> TopicName | None:
-    """Return the parts of a topic that a timeline shows.
+    """Parse a topic shown in a timeline.
 
     Returns
     -------
     TopicName or None
-        None for any other topic. Marks are not shown by their topic, but read from their layers.
+        None for any other topic. Marks are read from their layers, not shown by topic.
     """
     topic = parse_topic(name)
     if topic is None or topic.kind not in _KINDS or is_review(topic.labelling):
@@ -481,7 +481,7 @@ def shown_topic(name: str) -> TopicName | None:
 
 
 def decibel(energy: Any) -> Any:
-    """Return the level of a mean square, in dB relative to full scale: 10 log10 of it.
+    """Return the level of a mean square, in dB relative to full scale: 10 log10(energy).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Logs, layers and clips read as a timeline: once through, within bounded memory."""
+"""Single-pass reader of logs, layers and clips into a timeline, within bounded memory."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -75,7 +75,7 @@ class _NamedMeans:
         self.means.setdefault(names, GridMeans(self.grid, len(names))).add(times, values)
 
     def series(self) -> GridSeries | None:
-        """Bring all rows to the same columns; None without rows."""
+        """Align all rows to the same columns; None without rows."""
         if not self.means:
             return None
         names = tuple(dict.fromkeys(name for names in self.means for name in names))
@@ -90,7 +90,7 @@ class _NamedMeans:
 
 @dataclass
 class _Microphone:
-    """What is collected of a microphone."""
+    """Data collected for one microphone."""
 
     features: _NamedMeans
     level_frames: list[FrameValues] = field(default_factory=list)
@@ -100,7 +100,7 @@ class _Microphone:
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
     reviewed: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by scenario
     gaps: list[LabelledSpans] = field(default_factory=list)
-    directions: GridMeans | None = None  # ahead and left
+    directions: GridMeans | None = None  # ahead, left
     states: list[MicrophoneHealth] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
@@ -111,13 +111,13 @@ class _Microphone:
 
     @property
     def labellings(self) -> list[str]:
-        """The names of its labellings: the recorder's first, the reviewer's last."""
+        """Names of the labellings: the recorder's first, the reviewer's last."""
         names = {*self.labels, *self.spans}
         return sorted(names, key=lambda name: (is_review(name), name != LIVE, name))
 
 
 class Collector:
-    """Collects the rows of logs, one after the other in the order of time."""
+    """Collects the rows of successive logs in time order."""
 
     def __init__(self, grid: TimelineGrid, *, sampled: bool, frames: bool) -> None:
         self._grid = grid
@@ -127,7 +127,7 @@ class Collector:
         self._lines: list[LogLines] = []
 
     def add(self, rows: Rows) -> None:
-        """Add the rows of one topic, in the order of time.
+        """Add the rows of one topic, in time order.
 
         Parameters
         ----------
@@ -156,11 +156,11 @@ class Collector:
                 microphone.directions.add(rows.times, rows.directions)
 
     def add_log(self, microphone: str, log: Path) -> None:
-        """Note that a log or a layer has topics of a microphone."""
+        """Record that a log or layer has topics of a microphone."""
         self._microphone(microphone).logs.add(log)
 
     def add_review(self, review: Mapping[str, Reviewed]) -> None:
-        """Add the marks that are in the span of the grid, and what a person has looked at."""
+        """Add the marks within the span of the grid, and the reviewed spans."""
         for scenario, (marks, reviewed) in review.items():
             for mark in marks:
                 if mark.start < self._grid.end and mark.end > self._grid.start:
@@ -176,11 +176,11 @@ class Collector:
         return self._microphone(microphone).reviewed.setdefault(scenario, [])
 
     def add_clip(self, microphone: str, clip: SoundClip) -> None:
-        """Add kept sound."""
+        """Add a clip of kept sound."""
         self._microphone(microphone).clips.append(clip)
 
     def microphones(self) -> dict[str, MicrophoneTimeline]:
-        """Return the timelines of the microphones that have something to show."""
+        """Return the timelines of the microphones that have data."""
         return {
             name: self._timeline(name, rows)
             for name, rows in sorted(self._microphones.items())
@@ -192,7 +192,7 @@ class Collector:
         return self._microphones[microphone].logs
 
     def lines(self) -> LogLines:
-        """Return the lines of all logs, in the order of time."""
+        """Return the lines of all logs, in time order."""
         if not self._lines:
             return LogLines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
         times, levels, texts = map(np.concatenate, zip(*self._lines, strict=True))
@@ -227,7 +227,7 @@ class Collector:
             novelty.add(rows.times[finite], rows.novelty[finite, np.newaxis])
 
     def _forget_frames(self, name: str, labelling: str) -> None:
-        """Forget the frames whose segments are known, unless single frames are kept."""
+        """Drop the frames covered by segments, unless single frames are kept."""
         microphone = self._microphone(name)
         spans, frames = microphone.spans.get(labelling), microphone.label_frames.get(labelling)
         while not self._frames and spans and frames and frames[0].times[-1] < spans[-1].ends[-1]:
@@ -259,7 +259,7 @@ class Collector:
         means, frames = rows.labels.get(name), rows.label_frames.get(name, [])
         parts = rows.spans.get(name, [])
         end = max((int(spans.ends.max()) for spans in parts), default=0)
-        parts = [*parts, *_runs(frames, end, FRAME_NANOSECONDS)]  # what is open is no segment yet
+        parts = [*parts, *_runs(frames, end, FRAME_NANOSECONDS)]  # open segments are not logged yet
         if not parts and means is not None:
             parts = list(_runs(_shares(means, self._grid), 0, self._grid.step))
         return LabellingTimeline(
@@ -271,7 +271,7 @@ class Collector:
         )
 
     def _join(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:
-        """Chain spans in the order of time, cut off at the ends of the grid."""
+        """Concatenate spans in time order, clipped to the grid."""
         if not parts:
             return no_spans()
         spans = LabelledSpans(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -288,7 +288,7 @@ def _one_span(span: ReviewedSpan) -> LabelledSpans:
 
 
 def _shares(means: _NamedMeans, grid: TimelineGrid) -> Iterator[FrameValues]:
-    """Yield the shares of a grid as if they were frames, without those that have no values."""
+    """Yield the grid shares as frames, without empty shares."""
     for names, part in means.means.items():
         values = part.values
         present = ~np.isnan(values[:, 0])
@@ -296,7 +296,7 @@ def _shares(means: _NamedMeans, grid: TimelineGrid) -> Iterator[FrameValues]:
 
 
 def _runs(parts: Iterable[FrameValues], after: int, step: int) -> Iterator[LabelledSpans]:
-    """Join successive frames, `step` apart, from some time on whose likeliest class is the same."""
+    """Merge successive frames (`step` apart) with the same likeliest class, from a time on."""
     for names, all_times, all_values in parts:
         later = all_times >= after
         times, values = all_times[later], all_values[later]
@@ -313,7 +313,7 @@ def _runs(parts: Iterable[FrameValues], after: int, step: int) -> Iterator[Label
 def _floor(
     states: Sequence[MicrophoneHealth], grid: TimelineGrid, features: GridSeries | None
 ) -> Float64 | None:
-    """Let a floor last until the next message, as far as features were recorded."""
+    """Hold each floor value until the next message, where features were recorded."""
     states = [state for state in states if not math.isnan(state.floor_dbfs)]
     if not states or features is None:
         return None
@@ -323,7 +323,7 @@ def _floor(
 
 
 def _trouble_spans(states: Sequence[MicrophoneHealth], end: int) -> LabelledSpans:
-    """Let a trouble last until the next message says that it is over, or that it is another."""
+    """Hold each trouble until the next message that ends or replaces it."""
     changes = [(state.time, state.text or None) for state in states]
     spans = [span for span in lasting(changes, end) if span[0] < span[1]]
     if not spans:
@@ -333,7 +333,7 @@ def _trouble_spans(states: Sequence[MicrophoneHealth], end: int) -> LabelledSpan
 
 
 def _join_clips(parts: list[SoundClip]) -> list[SoundClip]:
-    """Join clips that follow each other without a hole; forget the parts, which are large."""
+    """Join contiguous clips; release the parts, which are large."""
     runs: list[list[SoundClip]] = []
     for part in sorted(parts, key=lambda clip: clip.start):
         last = runs[-1][-1] if runs else None
@@ -350,15 +350,15 @@ def _join_clips(parts: list[SoundClip]) -> list[SoundClip]:
     return clips
 
 
-SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
-MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
-MOST_FRAMES = 3 * 3600 * NANOSECONDS  # of which every frame is kept; a day's would be 90 MB
+SHARES = 1_200  # maximum per timeline: more than a screen has pixels
+MOST_CLIP_SECONDS = 3_600  # maximum kept sound shown: 115 MB
+MOST_FRAMES = 3 * 3600 * NANOSECONDS  # maximum span with all frames kept; a day's are 90 MB
 _PART = 3600 * NANOSECONDS
 OFF = "the recorder was off"
-_SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
-_WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
+_SHORTEST = 2 * FRAME_NANOSECONDS  # minimum share, so that each contains a frame
+_WHOLE_BYTES = 2 << 30  # maximum size of logs read completely: about three days
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
-# At most, from the time of a label until it is known: names wait for windows.
+# Maximum delay from the time of a label to its log time: the labels wait for windows.
 _LATE = (MOST_AHEAD_FRAMES + 1) * FRAME_NANOSECONDS
 _OF_SPANS = (message_types.SEGMENT, message_types.GAP)  # logged at their end
 
@@ -373,21 +373,21 @@ def read_timeline(
 ) -> Timeline:
     """Read logs, their layers and clips as a timeline.
 
-    Of more than about three days a sample is read: some chunks of each log, evenly.
+    Above about three days only a sample is read: some chunks of each log, evenly spaced.
 
     Parameters
     ----------
     start, end : int, optional
         In nanoseconds of UTC; by default from the first message to the last.
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Called with the share of the logs that is read, 0 to 1.
 
     Raises
     ------
     LogError
         If there is no log.
     DataError
-        If there is nothing in this span of time, or no such time zone.
+        If this span of time is empty, or the time zone is unknown.
     """
     losses: list[str] = []
     files = find_timed_files(paths, start, None if end is None else end + _LATE, losses)
@@ -430,12 +430,12 @@ def read_timeline(
 def read_frames(
     timeline: Timeline, start: int | None = None, end: int | None = None
 ) -> Iterator[Timeline]:
-    """Read the frames of a timeline that is too long to keep them, an hour at a time.
+    """Read the frames of a timeline too long to keep them, one hour at a time.
 
     Parameters
     ----------
     start, end : int, optional
-        In nanoseconds of UTC; by default from its start to its end.
+        In nanoseconds of UTC; by default the complete timeline.
     """
     start = timeline.grid.start if start is None else max(start, timeline.grid.start)
     end = timeline.grid.end if end is None else min(end, timeline.grid.end)
@@ -447,7 +447,7 @@ def read_frames(
         for one in timeline.coverage.values()
         for log in zip(one.logs, one.starts, one.ends, strict=True)
     ]
-    # The last labels before a log begins may be in it: a part ends before them.
+    # A log may hold the last labels from before its start: a part ends before them.
     begins = sorted({time - _LATE for _, begin, stop in logs for time in range(begin, stop, _PART)})
     edges = [start]
     for time in begins:
@@ -465,7 +465,7 @@ def read_frames(
 def _unheard(
     microphone: MicrophoneTimeline, coverage: Coverage, grid: TimelineGrid
 ) -> LabelledSpans:
-    """Add to the gaps of a recorder when it was off, as far as that is past."""
+    """Add the recorder's off times, up to now, to its gaps."""
     gaps = microphone.gaps
     spans = [gaps, *(one.spans for one in microphone.labellings)]
     past = max(time_ns(), *coverage.ends, grid.start)
@@ -488,12 +488,12 @@ def _nothing(losses: Sequence[str], *, limited: bool) -> DataError:
 
 
 def _as_kept(samples: Float32) -> Int16:
-    """Return 16-bit samples: those of an hour are large."""
+    """Return 16-bit samples, since an hour of samples is large."""
     return np.clip(np.rint(samples * 32768.0), -32768, 32767).astype(np.int16)
 
 
 class _Reader:
-    """Reads one log or layer after the other, in the order of time."""
+    """Reads logs and layers one after the other, in time order."""
 
     def __init__(self, grid: TimelineGrid, every: int) -> None:
         self.every = every
@@ -504,17 +504,17 @@ class _Reader:
         self._layers: dict[tuple[Path, str], Path] = {}
 
     def read(self, file: TimedFile) -> None:
-        """Collect the messages of a log or of a layer."""
+        """Collect the messages of a log or layer."""
         if file.layer == AUDIO_LAYER:
             self._read_clips(file.path)
             return
         if file.layer == REVIEW_LAYER:
-            return  # with its log
+            return  # read with its log
         types = FIELDS
         if file.layer:
             types = {name: FIELDS[name] for name in _OF_LAYERS}
         self._read_messages(file, types)
-        if not file.layer:  # last, for a damaged layer must not hide its log
+        if not file.layer:  # last, since a damaged layer must not hide its log
             self.collector.add_review(read_review(file.path))
 
     def _read_messages(self, file: TimedFile, types: Mapping[str, Sequence[str]]) -> None:
@@ -525,19 +525,19 @@ class _Reader:
                 for columns in batch:
                     self._collect(file.path, columns)
                 if min(int(columns.log_times[0]) for columns in batch) > self._grid.end + _LATE:
-                    break  # what ended later began later, but for what lasted for minutes
+                    break  # later ends mean later starts, except for spans of minutes
 
     def _parts(self, file: TimedFile) -> Iterator[tuple[list[str] | None, int | None, int]]:
-        """Yield topics, the log time up to which they are read, and one of how many chunks."""
+        """Yield topics, the log time limit, and n to read one of n chunks."""
         with LogFile(file.path) as log:
             topics = [channel.topic for channel in log.channels.values()]
-            complete = log.complete  # or its topics are known only when all of it is read
+            complete = log.complete  # otherwise its topics are unknown until all of it is read
         if not file.layer:
             needed = [name for name in topics if not name.endswith("/statistics")]
             yield needed if complete else None, None, self.every
             return
         self._check_alone(file.path, topics)
-        # They have chunks of their own, so all can be read even where labels are too many.
+        # Segments have their own chunks, so all can be read even where there are too many labels.
         yield [name for name in topics if name.endswith("/segment")], None, 1
         if self.every == 1:
             labels = [name for name in topics if name.endswith("/label")]
@@ -558,7 +558,7 @@ class _Reader:
         topic = shown_topic(columns.topic)
         if topic is not None:
             self.collector.add_log(topic.microphone, path)
-        if columns.type == message_types.LABEL:  # which is known later than its frame
+        if columns.type == message_types.LABEL:  # labels are logged later than their frame
             stamps = columns["header.stamp"]
             inside = (stamps >= self._grid.start) & (stamps < self._grid.end)
             columns = columns if inside.all() else columns.take(np.flatnonzero(inside))

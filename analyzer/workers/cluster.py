@@ -23,23 +23,23 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-_SILENT_SECONDS = 20.0  # after which a scheduler that does not answer is as good as gone
+_SILENT_SECONDS = 20.0  # timeout after which a scheduler counts as gone
 
 
 class Members:
-    """The workers of a cluster, as they come and go."""
+    """Current workers of a cluster."""
 
     def __init__(self, client: "Client") -> None:
         self._client = client
         self._ours = version("hearthlog")
         self._asking: dict[str, asyncio.Task[None]] = {}
-        self._versions: dict[str, str] = {}  # by address, of workers that are there
-        self.threads: dict[str, int] = {}  # by address, of workers that may be used
-        self.manned = asyncio.Event()  # whether there are any
-        self.refused: dict[str, str] = {}  # by address, what other workers have; kept
+        self._versions: dict[str, str] = {}  # by address, of current workers
+        self.threads: dict[str, int] = {}  # by address, of usable workers
+        self.manned = asyncio.Event()  # set while there are usable workers
+        self.refused: dict[str, str] = {}  # by address, versions of other workers; kept
 
     async def look(self) -> None:
-        """Ask the scheduler which workers there are, and new ones for their version.
+        """Query the scheduler for its workers, and new workers for their version.
 
         Raise `OSError, TimeoutError` if the scheduler does not answer.
         """
@@ -49,7 +49,7 @@ class Members:
         for address in self._versions.keys() - workers.keys():
             del self._versions[address]
         for address in workers.keys() - self._versions.keys() - self._asking.keys():
-            # Not waited for: a worker that hangs must not hide that the scheduler does.
+            # Not awaited: a hanging worker must not hide a hanging scheduler.
             self._asking[address] = asyncio.create_task(self._ask(address))
         self.threads = {
             address: about["nthreads"]
@@ -62,13 +62,13 @@ class Members:
             self.manned.clear()
 
     async def settle(self) -> None:
-        """Wait until the workers that were seen have said their version, and look again."""
+        """Wait until all current workers have reported their version, and query again."""
         if self._asking:
             await asyncio.wait(self._asking.values(), timeout=_SILENT_SECONDS)
         await self.look()
 
     def any_of(self, addresses: Collection[str]) -> bool:
-        """Tell whether one of some workers is still there, and may be used."""
+        """Return whether one of some workers is still usable."""
         return not self.threads.keys().isdisjoint(addresses)
 
     async def _ask(self, address: str) -> None:
@@ -77,7 +77,7 @@ class Members:
             (theirs,) = (
                 await self._client.run(version, "hearthlog", workers=[address], on_error="return")
             ).values()
-        except (OSError, ValueError):  # it has gone
+        except (OSError, ValueError):  # it has left
             return
         finally:
             del self._asking[address]
@@ -90,13 +90,13 @@ class Members:
 
 
 _CONNECT_SECONDS = 10.0
-_WORKERS_SECONDS = 30.0  # for workers that are started together with the run
+_WORKERS_SECONDS = 30.0  # wait for workers that are started together with the run
 _CLOSE_SECONDS = 3.0
-_LOOK_SECONDS = 1.0  # between two looks at the cluster
-_DESERTED_SECONDS = 600.0  # without a worker, after which no more are waited for
-_RETRIES = 2  # of a task that raises an error, which may be that of a store for a moment
-_LOSSES = 4  # of the worker of a task, after which it is given up, as Dask does
-_SENT_ONCE = 100_000  # bytes of an array from which on each worker gets it once, not each task
+_LOOK_SECONDS = 1.0  # interval of cluster queries
+_DESERTED_SECONDS = 600.0  # without a worker, before giving up
+_RETRIES = 2  # of a task that raises an error, which may be a temporary storage error
+_LOSSES = 4  # of a task's worker before the task is given up, as in Dask
+_SENT_ONCE = 100_000  # bytes from which an array is sent once to each worker, not with each task
 _GONE = "is gone; start it"
 _NOISY = ("distributed", "tornado")  # loggers
 
@@ -108,10 +108,10 @@ T = TypeVar("T")
 def connected(scheduler: str) -> Iterator["Cluster"]:
     """Connect to a Dask cluster whose workers have this version of hearthlog.
 
-    Workers of another version that join later get no tasks; they are named in a HearthlogWarning
+    Workers of another version that join later get no tasks; they are listed in a HearthlogWarning
     when the block ends.
 
-    Raise `WorkerError` if Dask is not installed, there is no such scheduler, it has no workers,
+    Raise `WorkerError` if Dask is not installed, the scheduler does not exist, it has no workers,
     or a worker has another version of hearthlog.
     """
     try:
@@ -123,17 +123,17 @@ def connected(scheduler: str) -> Iterator["Cluster"]:
         with suppress(OSError, ValueError):
             client = Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
         if client is None:
-            gc.collect()  # else the remains may block the next client, if they are collected then
+            gc.collect()  # otherwise a later collection may block the next client
             raise WorkerError(f"no Dask scheduler at {scheduler}; start one with: dask scheduler")
         cluster = Cluster(client, scheduler)
-        # What Dask leaves behind when it loses a scheduler would be told at the end of the process.
+        # Otherwise Dask prints errors when the process ends, if it has lost a scheduler.
         cluster.loop.set_exception_handler(lambda *_: None)
         try:
             cluster.open()
             yield cluster
         finally:
             cluster.close()
-            with suppress(Exception):  # what is left of a lost connection ends with the process
+            with suppress(Exception):  # the rest of a lost connection ends with the process
                 client.close(timeout=_CLOSE_SECONDS)
     for worker, has in cluster.refused.items():
         what = f"the Dask worker has {has}, this is {version('hearthlog')}: not used"
@@ -142,7 +142,7 @@ def connected(scheduler: str) -> Iterator["Cluster"]:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep Dask from logging, since errors are reported once, by us."""
+    """Disable Dask's logging, since errors are reported once, by hearthlog."""
     known = (name for name in logging.root.manager.loggerDict if name.split(".")[0] in _NOISY)
     loggers = [logging.getLogger(name) for name in {*_NOISY, *known}]
     levels = [logger.level for logger in loggers]
@@ -158,18 +158,18 @@ def _silence() -> Iterator[None]:
 class Cluster:
     """Workers of a Dask cluster.
 
-    All that waits for the cluster waits, in the event loop of the client, for the end of `_watch`
-    too, which looks at the cluster once a second: so nothing outlives the scheduler, and no task
-    costs a call of its own.
+    Everything that waits for the cluster also waits, in the client's event loop, for the end of
+    `_watch`, which queries the cluster once a second: so nothing outlives the scheduler, and no
+    task costs a query of its own.
     """
 
     def __init__(self, client: "Client", scheduler: str) -> None:
         self._client, self._scheduler = client, scheduler
         running: Any = client.loop
-        self.loop: asyncio.AbstractEventLoop = running.asyncio_loop  # of the client alone
+        self.loop: asyncio.AbstractEventLoop = running.asyncio_loop  # used by the client alone
         self._members = Members(client)
         self._watching: asyncio.Task[LostClusterError]
-        self._sent: dict[int, tuple[Any, asyncio.Task[Any]]] = {}  # by the id of the array
+        self._sent: dict[int, tuple[Any, asyncio.Task[Any]]] = {}  # by array id
         self._open: set[Future[Any]] = set()
 
     def open(self) -> None:
@@ -180,7 +180,7 @@ class Cluster:
         self._in_loop(self._begin()).result()
 
     def close(self) -> None:
-        """Give up the tasks that are not done; those that run come to their end."""
+        """Give up unfinished tasks; running ones still finish on their workers."""
         for future in tuple(self._open):
             future.cancel()
         if hasattr(self, "_watching"):
@@ -188,12 +188,12 @@ class Cluster:
 
     @property
     def refused(self) -> dict[str, str]:
-        """What workers have that were not used, by their addresses."""
+        """Versions of unused workers, by address."""
         return self._members.refused
 
     @property
     def parallel(self) -> int:
-        """Number of threads of all workers that may be used, a moment ago; at least 1."""
+        """Number of threads of all usable workers at the last query; at least 1."""
         return max(sum(self._members.threads.values()), 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
@@ -202,7 +202,7 @@ class Cluster:
         Parameters
         ----------
         *args
-            Arguments of the function, which can be pickled. A large array that several tasks have
+            Arguments of the function, which can be pickled. A large array shared by several tasks
             is sent once, and must not change.
         """
         future = self._in_loop(self._until_lost(self._run(function, args)))
@@ -238,7 +238,7 @@ class Cluster:
             )
 
     async def _watch(self) -> LostClusterError:
-        """Look at the cluster until it is lost, and return the error that says so."""
+        """Query the cluster until it is lost, and return the error."""
         try:
             what = await self._look_on()
         except TimeoutError:
@@ -248,7 +248,7 @@ class Cluster:
         return self._lost(what)
 
     async def _look_on(self) -> str:
-        """Look at the cluster once a second; return why that has an end."""
+        """Query the cluster once a second; return the reason for its end."""
         manned = time.monotonic()
         while self._client.status == "running":
             await self._members.look()
@@ -265,7 +265,7 @@ class Cluster:
         )
 
     async def _until_lost(self, work: Coroutine[Any, Any, T]) -> T:
-        """Return what work returns; raise LostClusterError once the cluster is lost."""
+        """Return the result of work; raise LostClusterError once the cluster is lost."""
         working = asyncio.create_task(work)
         try:
             await asyncio.wait({working, self._watching}, return_when=asyncio.FIRST_COMPLETED)
@@ -276,7 +276,7 @@ class Cluster:
             working.cancel()
 
     async def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
-        """Run a task, again if Dask drops it, or if all workers that may run it have left."""
+        """Run a task; repeat it if Dask drops it, or if all its usable workers have left."""
         from distributed import KilledWorker  # noqa: PLC0415  part of the extra `cluster`
         from distributed.comm.core import CommClosedError  # noqa: PLC0415
 
@@ -288,7 +288,7 @@ class Cluster:
                     return await self._attempt(function, args, allowed)
                 except (CancelledError, CommClosedError):
                     self._sent.clear()
-                    await asyncio.sleep(_LOOK_SECONDS)  # for a look, if the scheduler is gone
+                    await asyncio.sleep(_LOOK_SECONDS)  # for a query, if the scheduler is gone
         raise WorkerError(f"the task lost its worker {_LOSSES} times: killed, or out of memory")
 
     async def _attempt(
@@ -303,8 +303,8 @@ class Cluster:
             _caller(),
             pickle.dumps((function, others, places)),
             *sent,
-            key=f"{name}-{uuid4().hex}",  # Dask groups tasks by what is before the number
-            workers=allowed,  # not those of another version
+            key=f"{name}-{uuid4().hex}",  # Dask groups tasks by the key before the number
+            workers=allowed,  # excludes workers of another version
             retries=_RETRIES,
             pure=False,
         )
@@ -335,10 +335,10 @@ def _is_large(value: Any) -> bool:
 
 
 def _caller() -> Callable[..., Any]:
-    """Make the function that calls what it is sent.
+    """Make the function that unpickles and runs a call.
 
-    Dask's scheduler unpickles the arguments of a task, too. As bytes, and with a nested function,
-    which Dask sends as code, they do not keep it busy with importing what workers need.
+    Dask's scheduler unpickles the arguments of a task, too. Bytes and a nested function, which Dask
+    sends as code, spare the scheduler the imports that workers need.
     """
 
     def call(packed: bytes, *sent: Any) -> Any:

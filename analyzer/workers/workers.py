@@ -1,4 +1,4 @@
-"""Workers that run tasks: this process, processes of this machine, or a Dask cluster."""
+"""Workers that run tasks: this process, local processes, or a Dask cluster."""
 
 import os
 import pickle
@@ -33,7 +33,7 @@ def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
 
 
 def attempt(call: bytes) -> bytes:
-    """Do a call, and pickle its result or its exception."""
+    """Run a call, and pickle its result or its exception."""
     try:
         function, args = pickle.loads(call)  # noqa: S301  sent by our own parent or client
         return pickle.dumps((function(*args), None))
@@ -42,14 +42,14 @@ def attempt(call: bytes) -> bytes:
 
 
 def read_reply(reply: bytes) -> Any:
-    """Return what the call returned, or raise what it raised.
+    """Return the result of a call, or raise its exception.
 
     Raises
     ------
     Exception
-        What the call raised; with its traceback as a note, unless it is an error of hearthlog.
+        The call's exception; with its traceback as a note, unless it is an error of hearthlog.
     WorkerError
-        If the call raised something that cannot be pickled.
+        If the call's exception cannot be pickled.
     """
     value, error = pickle.loads(reply)  # noqa: S301  sent by our own worker
     if error is not None:
@@ -78,17 +78,17 @@ T = TypeVar("T")
 
 
 # concurrent.futures.ProcessPoolExecutor does not suffice: one killed worker fails all running
-# tasks, so does an exception that cannot be unpickled, and workers outlive a killed parent.
+# tasks, as does an exception that cannot be unpickled, and workers outlive a killed parent.
 class Processes:
-    """Processes, each with a thread here that gives it one task after the other.
+    """Local processes, each with a thread in this process that sends it one task after the other.
 
     Parameters
     ----------
     count : int
         Number of processes, at least 1.
     module : str, optional
-        Name of the module of the tasks. The processes are started at once and import it while there
-        is no task yet; without it each is started by its first task.
+        Name of the module of the tasks. The processes start and import it at once; without it each
+        process starts with its first task.
     """
 
     def __init__(self, count: int, module: str | None = None) -> None:
@@ -107,7 +107,7 @@ class Processes:
         return self._threads.submit(self._run, function, args)
 
     def close(self) -> None:
-        """Give up the tasks that are not done, and end the processes.
+        """Give up unfinished tasks, and end the processes.
 
         A task that has not begun is cancelled: its future raises CancelledError.
         """
@@ -152,7 +152,7 @@ class Processes:
 
 
 class _LostError(Exception):
-    """The process ended before it answered."""
+    """The process ended before it replied."""
 
 
 class _Process:
@@ -186,7 +186,7 @@ class _Process:
             raise _LostError from error
 
     def hang_up(self) -> None:
-        """Let the process end: nobody will call it again."""
+        """Close the pipe of calls, so that the process ends."""
         self._calls.close()
 
     def end(self) -> None:
@@ -228,15 +228,15 @@ def _listen(calls: Connection, waiting: "SimpleQueue[bytes]") -> None:
 
 
 class Workers(Protocol):
-    """Workers, which run tasks.
+    """Interface of workers, which run tasks.
 
-    A task is a function of the top level of a module, with arguments that are small and can be
-    pickled: paths, not arrays. It may run more than once, if its worker is lost.
+    A task is a top-level function of a module, with small arguments that can be pickled: paths, not
+    arrays. It may run more than once, if its worker is lost.
     """
 
     @property
     def parallel(self) -> int:
-        """Number of tasks that run at once at the moment; at least 1."""
+        """Current number of parallel tasks; at least 1."""
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a task.
@@ -244,14 +244,14 @@ class Workers(Protocol):
         Parameters
         ----------
         function : callable
-            At the top level of a module.
+            Top-level function of a module.
         *args
             Arguments of the function, which are small and can be pickled.
 
         Returns
         -------
         concurrent.futures.Future
-            It raises what the function raises, WorkerError if the worker was lost three times, and
+            Raises the function's exception, WorkerError if the worker was lost three times, and
             LostClusterError if the cluster is gone.
         """
 
@@ -260,7 +260,7 @@ class Workers(Protocol):
 def open_workers(
     count: int = 1, scheduler: str | None = None, module: str | None = None
 ) -> Iterator[Workers]:
-    """Open workers; tasks that are not done when the block ends are given up.
+    """Open workers; unfinished tasks are given up when the block ends.
 
     Parameters
     ----------
@@ -274,8 +274,8 @@ def open_workers(
     Raises
     ------
     WorkerError
-        If Dask is not installed, there is no such scheduler, it has no workers, or one of another
-        version.
+        If Dask is not installed, the scheduler does not exist, it has no workers, or a worker has
+        another version.
     """
     if scheduler is not None:
         with connected(scheduler) as cluster:
@@ -298,7 +298,7 @@ class InlineWorkers:
         future: Future[T] = Future()
         try:
             future.set_result(function(*args, **kwargs))
-        except Exception as error:  # noqa: BLE001  raised where the result is asked for
+        except Exception as error:  # noqa: BLE001  raised where the result is requested
             future.set_exception(error)
         return future
 
@@ -331,7 +331,7 @@ def _on(cluster: Cluster, calls: Iterable[Any]) -> Iterator[Any]:
 
 @contextmanager
 def fits_on(scheduler: str | None) -> Iterator[None]:
-    """Let `in_parallel` run calls in this block on a Dask cluster, if one is named.
+    """Run the calls of `in_parallel` in this block on a Dask cluster, if one is given.
 
     Parameters
     ----------
@@ -355,9 +355,9 @@ def fits_on(scheduler: str | None) -> Iterator[None]:
 
 
 class _SingleThread:
-    """Lets libraries of linear algebra use one thread while anybody is inside.
+    """Limits linear algebra libraries to one thread while any thread is inside.
 
-    The limit of a BLAS is of the process: who leaves first must not lift it for the others.
+    The limit of a BLAS is per process, so the first thread that leaves must not lift it.
     """
 
     def __init__(self) -> None:
@@ -375,7 +375,7 @@ class _SingleThread:
                 self._limits = threadpool_limits(1, user_api="blas")
             self._inside += 1
         try:
-            with threadpool_limits(1, user_api="openmp"):  # of this thread alone
+            with threadpool_limits(1, user_api="openmp"):  # for this thread alone
                 yield
         finally:
             with self._lock:
@@ -387,7 +387,7 @@ class _SingleThread:
 
 
 def _forget_controlling_thread() -> None:
-    """Let this thread set limits: since 3.8 threadpoolctl heeds only the one that did last."""
+    """Allow this thread to set limits: threadpoolctl >= 3.8 accepts only the last setter's."""
     import threadpoolctl  # noqa: PLC0415  as joblib
 
     openblas = getattr(threadpoolctl, "OpenBLASController", None)
@@ -399,13 +399,13 @@ single_thread = _SingleThread()  # a sum depends on how many threads share it
 
 
 def kernel_in_use() -> str:
-    """Return the library and the kernel of the products of this process.
+    """Return the BLAS library and kernel of this process.
 
     Returns
     -------
     str
-        Such as "openblas SkylakeX"; empty if it is another library than OpenBLAS, or not known
-        for want of threadpoolctl.
+        Such as "openblas SkylakeX"; empty for a library other than OpenBLAS, or without
+        threadpoolctl.
     """
     try:
         from threadpoolctl import threadpool_info  # noqa: PLC0415  part of the extra `headless`

@@ -1,1 +1,1 @@
-"""Rerun: the only package that knows it, for much of it is unstable and changes by the release."""
+"""Rerun viewer; only this package uses Rerun's API, much of which is unstable between releases."""

@@ -1,4 +1,4 @@
-"""Draw arrays into a Rerun recording: lanes, bands, lines, heat maps, lines of text, clips."""
+"""Canvas that draws arrays into a Rerun recording: lanes, bands, lines, heat maps, text, clips."""
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,10 +16,10 @@ from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
 
 _STROKE_WIDTH = 2.0  # pixels
-_LEAST_SHARE = 0.004  # below, a band is less than a pixel high
+_LEAST_SHARE = 0.004  # a smaller share makes a band less than a pixel high
 _ROWS_AT_ONCE = 72_000  # an hour of frames
-_HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
-_POINT = 2.0  # points of the screen
+_HEAT_SQUARE = 6.5  # half the side: squares overlap from afar, and are apart in close-ups
+_POINT = 2.0  # screen points
 _DARK_TO_BRIGHT = np.array(  # through purple and red, as matplotlib's magma
     [(0, 0, 4), (59, 15, 112), (140, 41, 129), (222, 73, 104), (254, 159, 109), (252, 253, 191)]
 )
@@ -29,7 +29,7 @@ _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
 class Canvas:
     """Draws arrays into a recording. Times are nanoseconds of UTC, shape (n,).
 
-    Rerun has axes of UTC only; so it is told, as if it were UTC, what the clock of the home shows.
+    Rerun has axes of UTC only, so it receives the home's local time as if it were UTC.
     """
 
     def __init__(self, recording: rr.RecordingStream, clock: HomeClock) -> None:
@@ -39,12 +39,12 @@ class Canvas:
     def draw_strips(
         self, entity: str, places: tuple[float, float], spans: Spans, name: str, colour: Colour
     ) -> None:
-        """Draw spans as strips, which round ends keep visible from afar.
+        """Draw spans as strips, whose round ends stay visible from afar.
 
         Parameters
         ----------
         spans : Spans
-            At least one, in the order of time.
+            At least one, in time order.
         colour : Colour
             Red, green and blue, 0 to 255.
         """
@@ -60,20 +60,20 @@ class Canvas:
         self.recording.send_columns(entity, [self._time_column(times)], column)
 
     def hide(self, entity: str) -> None:
-        """Show strips no more; a recording cannot forget what it was told."""
+        """Hide strips; a recording cannot delete data."""
         self.recording.log(entity, rr.SeriesLines(visible_series=[False]), static=True)
 
     def begin(self, entity: str, time: int) -> None:
-        """Put an empty text at a time (ns of UTC): a viewer's cursor begins where data does."""
+        """Put an empty text at a time (ns of UTC): a viewer's cursor starts with the data."""
         text = rr.TextDocument.columns(text=[""])
         self.recording.send_columns(entity, [self._time_column(np.array([time]))], text)
 
     def write(self, entity: str, text: str) -> None:
-        """Set the text of an entity that shows one."""
+        """Set the text of a text entity."""
         self.recording.log(entity, rr.TextDocument(text), static=True)
 
     def configure_states(self, entity: str, colours: Mapping[str, Colour]) -> None:
-        """Give the states of a lane their colours, and names in words.
+        """Set the colours and displayed names of the states of a lane.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class Canvas:
         self.recording.log(entity, style, static=True)
 
     def change_states(self, entity: str, times: Int64, states: Sequence[str | None]) -> None:
-        """Put a lane into a state at each time.
+        """Set the state of a lane at each time.
 
         Parameters
         ----------
@@ -99,12 +99,12 @@ class Canvas:
         self.recording.send_columns(entity, [self._time_column(times)], column)
 
     def configure_bands(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set names and colours of the bands of an entity.
+        """Set the names and colours of the bands of an entity.
 
         Parameters
         ----------
         colours : sequence of Colour
-            Of each: red, green and blue, 0 to 255.
+            Red, green and blue of each band, 0 to 255.
         """
         widths = [_STROKE_WIDTH] * len(names)
         style = rr.SeriesLines(
@@ -137,12 +137,12 @@ class Canvas:
         self.draw_lines(entity, places.ravel(), ends.reshape(-1, shares.shape[1]))
 
     def configure_lines(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set names and colours of the lines of an entity.
+        """Set the names and colours of the lines of an entity.
 
         Parameters
         ----------
         colours : sequence of Colour
-            Of each: red, green and blue, 0 to 255.
+            Red, green and blue of each line, 0 to 255.
         """
         style = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
         self.recording.log(entity, style, static=True)
@@ -182,12 +182,12 @@ class Canvas:
     ) -> None:
         """Draw frames as lines, interrupted where frames are missing.
 
-        A frame whose values are those of both its neighbours is left out.
+        A frame equal to both its neighbours is skipped.
 
         Parameters
         ----------
         parts : iterable of FrameValues
-            Each of at least one frame.
+            Each with at least one frame.
         """
         for part in parts:
             times, values = _with_holes(part, names)
@@ -234,16 +234,16 @@ class Canvas:
             self.recording.send_columns(entity, [self._time_column(lines.times)], column)
 
     def show_clips(self, entity: str, clips: Sequence[SoundClip], start: int) -> None:
-        """Add clips of sound, each at its start; between them is a moment of silence.
+        """Add clips of sound at their starts, separated by a moment of silence.
 
-        A viewer shows what came last, however long ago, and an error where nothing came yet.
+        A viewer shows the latest data, however old, and an error before the first data.
 
         Parameters
         ----------
         clips : sequence of SoundClip
-            At least one, in the order of time.
+            At least one, in time order.
         start : int
-            From when on the viewer looks, in nanoseconds of UTC.
+            Start of the view, in nanoseconds of UTC.
         """
         rate = clips[0].rate
         silence = np.zeros(rate // 10, np.int16)
@@ -269,7 +269,7 @@ class Canvas:
 
 
 def _with_holes(part: FrameValues, names: Sequence[str]) -> tuple[Int64, Float64]:
-    """Bring frames to the named columns, and insert a row of NaN where frames are missing."""
+    """Align frames to the named columns, and insert a row of NaN where frames are missing."""
     values = np.full((len(part.times), len(names)), np.nan)
     values[:, [names.index(name) for name in part.names]] = part.values
     length = int(np.median(np.diff(part.times))) if len(part.times) > 1 else 0

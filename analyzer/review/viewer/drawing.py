@@ -1,4 +1,4 @@
-"""Entities of a Rerun recording for a timeline, and the views that show them."""
+"""Rerun entities of a timeline, and the views that show them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -30,24 +30,24 @@ from hearthlog.schemas.messages.topics import LIVE
 
 LINES, CLIP, WORDS = "events", "clip", "words"
 NOTHING = "words/nothing"  # an empty text
-CLOSE_UP = "/close_up"  # behind the name of a microphone
+CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_WORDS = "asked", "words/asked"
 _CLOSE_KINDS = SHARES, LEVEL  # of plots
-_SHARE_STEP, _LEVEL_STEP = 0.01, 0.1  # less is not seen
-_CLOSE_STROKES, _ASKED_STROKES = 1_200, 600  # of a band
+_SHARE_STEP, _LEVEL_STEP = 0.01, 0.1  # smaller steps are invisible
+_CLOSE_STROKES, _ASKED_STROKES = 1_200, 600  # maximum strokes of a band
 _ASKED: Colour = (245, 240, 225)
 
-_THICK, _THIN = 12.0, 8.0  # in points of the screen
+_THICK, _THIN = 12.0, 8.0  # in screen points
 _Strip = tuple[int, int, str]
 
 
 class DrawnLane:
-    """A lane as it is drawn; what is drawn can be hidden, but not changed.
+    """A lane in the viewer; drawn states can be hidden, but not changed.
 
     Parameters
     ----------
     long : int
-        Nanoseconds: what is shorter is drawn thinner, or many short sounds look like a long one.
+        Nanoseconds: shorter spans are drawn thinner, or many short sounds look like a long one.
     """
 
     def __init__(self, root: str, height: float, long: int) -> None:
@@ -56,7 +56,7 @@ class DrawnLane:
         self._count = 0
 
     def show(self, lane: Lane, canvas: Canvas) -> None:
-        """Draw what is new, and hide what is gone; long sounds lie under short ones."""
+        """Draw new spans and hide removed ones; long sounds lie under short ones."""
         starts, ends, texts = lane.spans
         wanted = set(zip(starts.tolist(), ends.tolist(), texts, strict=True))
         for entity, part in list(self._parts.items()):
@@ -66,7 +66,7 @@ class DrawnLane:
         fresh = wanted.difference(*self._parts.values())
         parts = self._divide(fresh).items()
         for (is_long, text), strips in sorted(parts, key=lambda part: -_length(part[1])):
-            layer = 0 if text == REVIEWED else 1  # the viewer draws in the order of names
+            layer = 0 if text == REVIEWED else 1  # the viewer draws in name order
             places = self._height, _THICK if is_long else _THIN
             entity = f"{self._root}/{layer}/{self._count:06}"
             times = np.array(sorted(strip[:2] for strip in strips))
@@ -83,7 +83,7 @@ class DrawnLane:
 
 
 class LanePlace(NamedTuple):
-    """Where a lane is: its entity, that of its name, and its height in the view, a unit each."""
+    """Place of a lane: its entity, the entity of its name, and its height in units of the view."""
 
     entity: str
     name: str
@@ -91,7 +91,7 @@ class LanePlace(NamedTuple):
 
 
 def lane_places(lanes: Sequence[Lane]) -> list[LanePlace]:
-    """Find a place for each lane: those of the labellings of a microphone are in the same ones."""
+    """Assign a place to each lane; all labellings of a microphone share the same places."""
     names: dict[str, dict[str, None]] = {}
     for lane in lanes:
         names.setdefault(lane.microphone, {})[lane.name] = None
@@ -106,22 +106,22 @@ def lane_places(lanes: Sequence[Lane]) -> list[LanePlace]:
 
 
 def lanes_entity(microphone: str, labelling: str) -> str:
-    """Name the entity of the lanes of a labelling, or, without one, of those beside all."""
+    """Return the entity of the lanes of a labelling, or, without one, of the shared lanes."""
     return f"{microphone}/lanes/{_word(labelling) or 'all'}"
 
 
 def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]:
-    """Draw all of a timeline but the single frames.
+    """Draw a timeline, except single frames.
 
     Returns
     -------
     dict of (str, str) to DrawnLane
-        By microphone and name: what is reviewed, to show it again when there is more of it.
+        Reviewed lanes by microphone and name, to redraw them when reviewed spans are added.
 
     Raises
     ------
     DataError
-        If there is no such time zone as the timeline's.
+        If the timeline's time zone is unknown.
     """
     reviewed = {}
     lanes = list(timeline_lanes(timeline))
@@ -143,7 +143,7 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]
 
 
 def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
-    """Write beside the classes of the recorder how many of its sounds were right in this home."""
+    """Write next to the recorder's classes how many of their sounds were right in this home."""
     lanes = list(timeline_lanes(timeline))
     for lane, place in zip(lanes, lane_places(lanes), strict=True):
         known = checked.get((lane.microphone, lane.name))
@@ -152,7 +152,7 @@ def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
 
 
 def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
-    """Draw what close-ups show of a short timeline beside the longer timeline around it."""
+    """Draw the close-ups of a short timeline next to the longer timeline around it."""
     strokes = -(-_CLOSE_STROKES // timeline.grid.count)
     for plot in timeline_plots(timeline):
         if plot.kind in _CLOSE_KINDS:
@@ -165,12 +165,12 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
 
 
 def draw_asked(number: int, start: int, end: int, text: str, canvas: Canvas) -> None:
-    """Draw which span is asked, in place of the one before.
+    """Draw the requested span, in place of the previous one.
 
     Parameters
     ----------
     start, end : int
-        Of the span, in nanoseconds of UTC.
+        In nanoseconds of UTC.
     """
     if number:
         canvas.hide(f"{ASKED}/{number - 1}")
@@ -188,7 +188,7 @@ def draw_frames(
     Parameters
     ----------
     start, end : int, optional
-        In nanoseconds of UTC: frames that begin from `start` on, before `end`; by default all.
+        In nanoseconds of UTC, for the first samples of frames; `end` is excluded. By default all.
     """
     for microphone in timeline.microphones.values():
         for labelling in microphone.labellings:
@@ -207,7 +207,7 @@ def draw_frames(
 
 
 def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
-    """Set names and colours of what a plot shows."""
+    """Set the names and colours of the series of a plot."""
     if plot.kind.style is Style.BANDS:
         words = [in_words(name) for name in plot.names]
         canvas.configure_bands(entity, words, [colour(name) for name in plot.names])
@@ -220,7 +220,7 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
 
 
 def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> None:
-    """Draw values into a plot that is configured."""
+    """Draw values into a configured plot."""
     if plot.kind.style is Style.BANDS:
         canvas.add_bands(entity, plot.times, plot.values, plot.length, strokes)
     elif plot.kind.style is Style.HEAT_MAP:
@@ -230,19 +230,19 @@ def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> No
 
 
 def plot_entity(plot: Plot, close_up: str = "") -> str:
-    """Name the entity of a plot."""
+    """Return the entity of a plot."""
     labelling = f"/{_word(plot.labelling)}" if plot.labelling else ""
     return f"{plot.microphone}{close_up}{labelling}/{plot.kind.name}"
 
 
 def text_entity(plot: Plot) -> str:
-    """Name the entity of the words beside a plot, and beside others in the same view."""
+    """Return the entity of the text next to a plot; plots in the same view share it."""
     labelling = f"/{_word(plot.labelling)}" if plot.kind.style is Style.BANDS else ""
     return f"{plot.microphone}/{WORDS}/{_word(plot.kind.view)}{labelling}"
 
 
 def frames_entity(microphone: str, name: str) -> str:
-    """Name the entity of the frames of a labelling, or of the level."""
+    """Return the entity of the frames of a labelling, or of the level."""
     return f"{microphone}/frames/{_word(name)}"
 
 
@@ -270,7 +270,7 @@ def _between(
 
 
 def _level_means(part: FrameValues) -> FrameValues:
-    """Average the level over each fifth of a second: a room's noise has no use for more."""
+    """Average the level over each fifth of a second, enough to show the noise of a room."""
     fifths = part.times // (NANOSECONDS // 5)
     first = np.flatnonzero(np.diff(fifths, prepend=-1))
     sizes = np.diff(first, append=len(part.times))
@@ -279,29 +279,29 @@ def _level_means(part: FrameValues) -> FrameValues:
 
 
 def _word(name: str) -> str:
-    """Replace the characters that would have to be escaped in the name of an entity."""
+    """Replace the characters that need escaping in the name of an entity."""
     return name.removeprefix("relabel/").replace("/", "-").replace(" ", "_")
 
 
 APPLICATION = "hearthlog"
-# The viewer keeps the range that linked time axes share under this name.
+# The viewer keeps the shared range of linked time axes under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
-# In points of a screen of 1366 x 768; on others they are in relation to each other.
+# In points of a screen of 1366 x 768; on other screens they are relative heights.
 _LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 60
-_NEAR = -60.0, 300.0  # seconds from the cursor, which stands at the start of what is asked
-_BELOW = 0.65  # of a lane: the axis of time
-_COLUMNS = (2, 10)  # of words, and of what they stand beside
+_NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
+_BELOW = 0.65  # height of the time axis, in lanes
+_COLUMNS = (2, 10)  # widths of the text and of the plot
 Boundary = rr.encodings.TimeRangeBoundary
-Row = tuple[int, rrb.View | rrb.Container]  # with its height in relation to others
+Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
 
 class TimelineBlueprint(rrb.Blueprint):
-    """Views, whose linked time axes begin with a range.
+    """Blueprint with linked time axes that start at a range.
 
     Parameters
     ----------
     start, end : Boundary
-        The range: times, or seconds from the cursor.
+        Times, or seconds from the cursor.
     """
 
     def __init__(
@@ -316,24 +316,24 @@ class TimelineBlueprint(rrb.Blueprint):
 
 
 def stack(rows: Sequence[Row], name: str | None = None) -> rrb.Vertical:
-    """Put views one below the other."""
+    """Stack views vertically."""
     heights = [height for height, _ in rows]
     return rrb.Vertical(*(view for _, view in rows), row_shares=heights, name=name)
 
 
 def tabs(views: Iterable[rrb.View | rrb.Container]) -> rrb.View | rrb.Container:
-    """Put views one behind the other; a single one needs no tab."""
+    """Put views into tabs; a single view needs no tab."""
     views = list(views)
     return views[0] if len(views) == 1 else rrb.Tabs(*views)
 
 
 def states_view(root: str, name: str) -> rrb.View:
-    """Make a view of all lanes of states below an entity."""
+    """Make a view of all state lanes below an entity."""
     return rrb.StateTimelineView(origin=root, name=name, time_view=_axis())
 
 
 def lines_view() -> rrb.View:
-    """Make a view of the lines that the recorder logged."""
+    """Make a view of the lines logged by the recorder."""
     return rrb.TextLogView(origin=LINES, name="Events")
 
 
@@ -343,9 +343,9 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
     Parameters
     ----------
     plots : sequence of Plot
-        At least one; the names of the last with the most of them count.
+        At least one; the last of the plots with the most names sets the names.
     entities : sequence of str
-        Of the plots, at least one.
+        Entities of the plots, at least one.
     """
     plot = max(reversed(plots), key=lambda one: len(one.names))
     kind = plots[0].kind
@@ -385,7 +385,7 @@ def review_layout(
 ) -> TimelineBlueprint:
     """Lay out the views of a review.
 
-    Raise `DataError` if there is no such time zone as the timeline's.
+    Raise `DataError` if the timeline's time zone is unknown.
     """
     clock = timeline.clock
     plots: dict[str, list[Plot]] = {name: [] for name in timeline.microphones}
@@ -427,7 +427,7 @@ def _note(timeline: Timeline) -> str:
 def _lane_views(
     microphone: MicrophoneTimeline, places: Sequence[tuple[str, LanePlace]], count: int, note: str
 ) -> list[rrb.Horizontal]:
-    """Show the lanes of each labelling, beside their names."""
+    """Show the lanes of each labelling next to their names."""
     labellings = [(one.name, labelling_in_words(one.name)) for one in labellings_of(microphone)]
     views = []
     for labelling, words in labellings or [("", "")]:
@@ -450,7 +450,7 @@ def _text(entity: str) -> rrb.View:
 def _plot_views(
     microphone: MicrophoneTimeline, plots: Sequence[Plot], timeline: Timeline, *, close_up: bool
 ) -> list[rrb.View | rrb.Container]:
-    """Show the plots of a microphone but the level; of close-ups what is drawn of them."""
+    """Show the plots of a microphone except the level; for close-ups, their drawn part."""
     first = [plot for plot in plots if plot.kind is SHARES]
     if close_up:
         first += [plot for plot in plots if plot.kind is LEVEL]
@@ -473,7 +473,7 @@ def _asked_view() -> rrb.Container:
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:
-    """Show what is drawn close up near the cursor only: all of it makes the viewer grow."""
+    """Show a close-up only near the cursor: a complete one makes the viewer grow."""
     view = plot_view([plot], [plot_entity(plot, CLOSE_UP)])
     before, after = (Boundary.cursor_relative(seconds=seconds) for seconds in _NEAR)
     near = rr.VisibleTimeRange(clock, start=before, end=after)
@@ -486,7 +486,7 @@ def _all(plots: Sequence[Plot]) -> rrb.Container:
 
 
 def _beside(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Container:
-    """Put a view of plots of one title beside words on what they show."""
+    """Put a view of plots with one title next to a text that explains them."""
     labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
     return rrb.Horizontal(
         _text(text_entity(plots[0])),

@@ -1,4 +1,4 @@
-"""The program of Rerun's viewer as a process that only this machine reaches, without statistics."""
+"""Process of Rerun's viewer, reachable from this machine only, without usage statistics."""
 
 import json
 import os
@@ -22,13 +22,13 @@ _WAIT_SECONDS = 60
 _STOP_SECONDS = 5
 _GRAPHICS_CARDS = ("dri/renderD*", "nvidia[0-9]*", "dxg")
 # The Vulkan of Mesa 22.3 compiles shaders for each picture and frees none: 2 MB more a second.
-# Its OpenGL does not, but conceals that it draws into textures of floats, which the viewer needs.
+# Its OpenGL does not, but hides its support of float textures, which the viewer needs.
 _OPENGL = {"WGPU_BACKEND": "gl", "MESA_EXTENSION_OVERRIDE": "+GL_ARB_color_buffer_float"}
 _BACKTRACE = re.compile(r"\s*\d+: ")
 
 
 def program() -> Path:
-    """Return the path of the viewer's program, as the installed `rerun` package has it.
+    """Return the path of the viewer's program in the installed `rerun` package.
 
     Raise `DataError` if it is not installed.
     """
@@ -40,25 +40,23 @@ def program() -> Path:
 
 
 def hidden_options() -> str:
-    """Return options of `rerun` with which no web page finds the viewer that a user starts.
+    """Return options of `rerun` that hide a viewer started by the user from web pages.
 
-    By itself it listens to the whole network, and tells every web page that finds it what it shows.
+    By default it listens to the complete network, and shows its data to every web page that finds
+    it.
     """
     address = hidden_address()
     return f"--bind {address} --port {free_port(bind=address)}"
 
 
 def has_display() -> bool:
-    """Return whether a window can be opened: on Linux by a display of X11 or Wayland."""
+    """Return whether a window can be opened (on Linux: an X11 or Wayland display exists)."""
     names = ("DISPLAY", "WAYLAND_DISPLAY")
     return not sys.platform.startswith("linux") or any(map(os.environ.get, names))
 
 
 def check_display(instead: str) -> None:
-    """Raise DataError where no window can be opened.
-
-    Raise `DataError` if this is Linux without a display of X11 or Wayland.
-    """
+    """Raise DataError on Linux without an X11 or Wayland display."""
     if not has_display():
         raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
 
@@ -82,7 +80,7 @@ class ViewerProcess:
                 stdout=log,
                 stderr=log,
                 env=_renderer() | os.environ | _own_configuration(Path(self._folder.name)),
-                start_new_session=True,  # Ctrl-C is for us: we close it in order
+                start_new_session=True,  # Ctrl-C is for the parent, which closes it
             )
 
     def __enter__(self) -> Self:
@@ -93,15 +91,15 @@ class ViewerProcess:
 
     @property
     def url(self) -> str:
-        """Where the viewer takes data: `rerun+http://…/proxy`."""
+        """Address for data: `rerun+http://…/proxy`."""
         return f"rerun+http://{self.address}:{self.port}/proxy"
 
     def is_running(self) -> bool:
-        """Tell whether the viewer runs; its user may have closed the window."""
+        """Return whether the viewer runs; its user may have closed the window."""
         return self._process.poll() is None
 
     def wait_until_it_listens(self) -> None:
-        """Wait until the viewer takes data.
+        """Wait until the viewer accepts data.
 
         Raise `DataError` if it ends instead, or takes longer than a minute.
         """
@@ -116,15 +114,12 @@ class ViewerProcess:
         raise self.failed()
 
     def check(self) -> None:
-        """Raise DataError if the viewer failed.
-
-        Raise `DataError` if it ended with an error; the message has the last one of its log.
-        """
+        """Raise DataError with the last error of the log, if the viewer ended with an error."""
         if (self._process.poll() or 0) > 0:
             raise self.failed()
 
     def failed(self) -> DataError:
-        """Return the error that says why the viewer does not run, by its log."""
+        """Return the error that explains from its log why the viewer does not run."""
         lines = self._log.read_text(errors="replace").splitlines()
         lines = [line for line in lines if not _BACKTRACE.match(line)]
         errors = [
@@ -136,7 +131,7 @@ class ViewerProcess:
         )
 
     def close(self) -> None:
-        """Stop the viewer, and delete its log."""
+        """Stop the viewer and delete its log."""
         self._process.terminate()
         try:
             self._process.wait(_STOP_SECONDS)
@@ -147,7 +142,7 @@ class ViewerProcess:
 
 
 def _renderer() -> dict[str, str]:
-    """Return an environment in which OpenGL draws where there is no graphics card."""
+    """Return environment variables that make OpenGL work without a graphics card."""
     has_card = any(any(Path("/dev").glob(pattern)) for pattern in _GRAPHICS_CARDS)
     if not sys.platform.startswith("linux") or has_card or find_library("EGL") is None:
         return {}
@@ -155,9 +150,9 @@ def _renderer() -> dict[str, str]:
 
 
 def _own_configuration(folder: Path) -> dict[str, str]:
-    """Return an environment in which the viewer has a configuration of its own.
+    """Return environment variables for a private viewer configuration.
 
-    It sends no statistics, and does not take over the layout of an earlier run.
+    It disables statistics, and does not restore the layout of an earlier run.
     """
     configuration = folder / "rerun" / "analytics.json"
     configuration.parent.mkdir()

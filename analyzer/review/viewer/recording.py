@@ -1,4 +1,4 @@
-"""A timeline as a Rerun recording: in a file, or on a server that viewers connect to."""
+"""Rerun recording of a timeline: in a file, or on a server for viewers."""
 
 import os
 import shutil
@@ -48,10 +48,10 @@ SUFFIX = ".rrd"
 
 
 def check_output(output: Path) -> None:
-    """Raise DataError unless a recording can be saved under this name.
+    """Check that a recording can be saved under this name.
 
-    Raise `DataError` if the name does not end in `.rrd`, the file exists, or its folder does
-    not exist or cannot be written.
+    Raise `DataError` if the name does not end in `.rrd`, the file exists, or its folder does not
+    exist or cannot be written.
     """
     if output.suffix != SUFFIX:
         raise DataError(f"{output}: the name of a Rerun recording must end in {SUFFIX}")
@@ -64,7 +64,7 @@ def check_output(output: Path) -> None:
 def save_timeline(timeline: Timeline, output: Path, checked: Checked | None = None) -> None:
     """Write a timeline into a Rerun recording (`.rrd`).
 
-    Only Rerun's viewer sends usage statistics and opens a port; this does neither.
+    This sends no usage statistics and opens no port; only Rerun's viewer does.
 
     Raise `DataError` if the name has another suffix, the file exists, or it cannot be written.
     """
@@ -77,8 +77,8 @@ def save_timeline(timeline: Timeline, output: Path, checked: Checked | None = No
 
 
 def _write(timeline: Timeline, output: Path, checked: Checked) -> None:
-    """Write a recording through a pipe: to a file, Rerun waits for ever where the disk is full."""
-    rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
+    """Write a recording through a pipe: writing to a file, Rerun hangs on a full disk."""
+    rr.set_strict_mode(True)  # otherwise its errors become warnings, and the file is wrong
     recording = rr.RecordingStream(APPLICATION)
     with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
         pipe = Path(folder, "recording")
@@ -104,39 +104,39 @@ def _copy(pipe: Path, output: Path) -> None:
             with output.open("wb") as file:
                 shutil.copyfileobj(source, file)
         except OSError:
-            while source.read(1 << 20):  # to its end, or nobody could close it
+            while source.read(1 << 20):  # to the end, otherwise nobody could close it
                 pass
             raise
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
-    """Set the start of a recording, and name it after its span."""
+    """Set the start and the name of a recording, from its span."""
     start, end = (timeline.clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
     recording.send_recording_start_time_nanos(start)
     recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")
 
 
-PORT = 9876  # where Rerun's viewer looks for a server if it is not told
-_APPLICATION = "hearthlog_watch"  # of its own: viewers keep the layout of each
+PORT = 9876  # default server port of Rerun's viewer
+_APPLICATION = "hearthlog_watch"  # separate: viewers keep the layout of each application
 _MEMORY = "20MB"
-_TOGETHER = 4 * NANOSECONDS  # at least, of a plot: each message costs a viewer kilobytes for ever
-_MOST_STROKES = 1_200  # of a band on the screen
+_TOGETHER = 4 * NANOSECONDS  # minimum per plot message: each costs a viewer kilobytes for ever
+_MOST_STROKES = 1_200  # maximum of a band on the screen
 _STATES = "lanes"  # entity of all lanes
 _HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
-_MOST_STATES = 2_000  # of a lane that get the colours of their own
+_MOST_STATES = 2_000  # maximum of a lane's states with their own colours
 
-Plots = dict[str, list[Plot]]  # by entity: the first plot of each set of names that it shows
+Plots = dict[str, list[Plot]]  # by entity: the first plot of each set of names
 
 
 class LiveServer:
-    """Draws updates for all viewers that connect, and keeps the last of them for later ones.
+    """Draws updates for all connected viewers, and keeps recent data for later viewers.
 
     Lanes and lines are drawn at once, plots every few seconds.
 
     Parameters
     ----------
     memory : str, optional
-        How much is kept for viewers that come later, as `20MB`; then the oldest is dropped.
+        Maximum data kept for later viewers, as `20MB`; then the oldest is dropped.
 
     Raises
     ------
@@ -146,17 +146,17 @@ class LiveServer:
 
     def __init__(self, port: int, bind: str, minutes: float, memory: str = _MEMORY) -> None:
         free_port(port, bind)
-        rr.set_strict_mode(True)  # or its mistakes become warnings
+        rr.set_strict_mode(True)  # otherwise its errors become warnings
         self._recording = rr.RecordingStream(_APPLICATION)
         sink = rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=memory)
         self.url = sink.uri
         self._recording.set_sinks(sink)
         self._recording.send_recording_name("live")
-        self._canvas: Canvas | None = None  # until it is known what the clock of the home shows
+        self._canvas: Canvas | None = None  # None until the clock of the home is known
         self._minutes = minutes
         self._strokes = max(1, round(_MOST_STROKES / (60 * minutes)))
         self._plots: Plots = {}
-        self._waiting: dict[str, list[Plot]] = {}  # by entity: what is too short to be sent yet
+        self._waiting: dict[str, list[Plot]] = {}  # by entity: plots too short to be sent yet
         self._lanes: dict[str, dict[str, Colour]] = {}
         self._is_laid_out = True  # there is nothing to lay out
 
@@ -167,9 +167,9 @@ class LiveServer:
         self._recording.disconnect()
 
     def show(self, updates: Iterable[Update], zone: tzinfo = UTC) -> None:
-        """Draw updates, and lay out the views anew where there is a new plot.
+        """Draw updates, and redo the layout for each new plot.
 
-        Where the clock of the home is changed, an axis of the new time begins.
+        A change of the home's clock starts an axis of the new time.
         """
         for update in updates:
             times = update.changes.times if isinstance(update, StateLane) else update.times
@@ -199,7 +199,7 @@ class LiveServer:
         entity = f"{_STATES}/{lane.microphone}/{lane.kind.name}"
         states = {state for state in lane.changes.states if state is not None}
         if entity not in self._lanes and not states:
-            return  # a lane is there once it has something to show
+            return  # a lane appears with its first state
         colours = self._lanes.get(entity) or lane.kind.colours(lane.kind.states)
         if entity not in self._lanes or (states - colours.keys() and len(colours) < _MOST_STATES):
             self._lanes[entity] = lane.kind.colours(sorted(states)) | colours
@@ -207,7 +207,7 @@ class LiveServer:
         canvas.change_states(entity, *lane.changes)
 
     def _show_plot(self, plot: Plot, canvas: Canvas) -> None:
-        """Draw into the entity of the names; another model or feature set gets one of its own."""
+        """Draw into the entity of these names; another model or feature set has its own."""
         root = plot_entity(plot)
         same = self._plots.setdefault(root, [])
         names = [each.names for each in same]
@@ -243,7 +243,7 @@ def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
 
 
 def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
-    """Show the plots of a microphone; those whose kinds have one title share a view."""
+    """Show the plots of a microphone; kinds with the same title share a view."""
     rows: list[Row] = []
     for title in dict.fromkeys(kind.title for kind in PLOTS):
         shown = {

@@ -1,4 +1,4 @@
-"""A viewer of a timeline, in a window or under another control, with selections by the mouse."""
+"""Timeline viewer, in a window or under another control, with mouse selections."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ Blueprint = dict[str, Any]
 
 
 class ViewerState(NamedTuple):
-    """The state of a viewer, as it reports it.
+    """State reported by a viewer.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class ViewerState(NamedTuple):
 
 
 class ViewerControl(Protocol):
-    """Controls one kind of viewer; all methods may raise ConnectionError or TimeoutError."""
+    """Control of one kind of viewer; all methods may raise ConnectionError or TimeoutError."""
 
     process: ViewerProcess
 
@@ -58,7 +58,7 @@ class ViewerControl(Protocol):
         """Return the state of the viewer."""
 
     def blueprint(self) -> Blueprint:
-        """Return the blueprint of the viewer, which has the selection of the user."""
+        """Return the blueprint of the viewer, which holds the user's selection."""
 
     def set_blueprint(self, blueprint: Blueprint) -> None:
         """Replace the blueprint of the viewer.
@@ -66,35 +66,35 @@ class ViewerControl(Protocol):
         Parameters
         ----------
         blueprint : dict of str to object
-            As `blueprint` returns it, for JSON.
+            JSON-serializable, as returned by `blueprint`.
         """
 
     def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
-        """Put the cursor of the viewer on a time.
+        """Set the time cursor of the viewer.
 
         Parameters
         ----------
         axis : str
             Name of the clock of the home.
         nanoseconds : int
-            Of that clock.
+            Time on that clock.
         play : bool
             Whether the cursor runs from there on.
         """
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons, where there is a page.
+        """Show buttons, if there is a page.
 
         Parameters
         ----------
         keys : sequence of (str, str)
-            Of each button the key, and its text.
+            Key and text of each button.
         press : callable
-            Told the key of the button that is pressed.
+            Called with the key of the pressed button.
         """
 
     def say(self, text: str) -> None:
-        """Show a line, where there is a page.
+        """Show a line, if there is a page.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class Viewer:
         self._canvas = Canvas(self._recording, HomeClock("", 0))
         self._reviewed: dict[tuple[str, str], DrawnLane] = {}
         self._asked = 0
-        self._close = NONE  # what was drawn close up
+        self._close = NONE  # spans of the close-ups
         self._sent = False
 
     def __enter__(self) -> Self:
@@ -133,21 +133,18 @@ class Viewer:
         self._control.close()
 
     def is_open(self) -> bool:
-        """Tell whether the viewer runs; its user may have closed it."""
+        """Return whether the viewer runs; its user may have closed it."""
         return self._control.process.is_running()
 
     def check(self) -> None:
-        """Raise DataError if the viewer failed.
-
-        Raise `DataError` if it ended with an error.
-        """
+        """Raise DataError if the viewer ended with an error."""
         self._control.process.check()
 
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
         """Show a timeline.
 
-        Raise `DataError` if the viewer has ended, or does not take data within a minute, or
-        there is no such time zone as the timeline's.
+        Raise `DataError` if the viewer has ended, does not take data within a minute, or the
+        timeline's time zone is unknown.
         """
         process = self._control.process
         process.wait_until_it_listens()
@@ -171,15 +168,15 @@ class Viewer:
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC: frames that begin from `start` on, before `end`.
+            In nanoseconds of UTC, for the first samples of frames; `end` is excluded.
         """
         draw_frames(timeline, self._canvas, start, end)
         self._flush()
 
     def draw_close_up(self, timeline: Timeline) -> None:
-        """Draw a short timeline beside the longer one that it is a part of.
+        """Draw a short timeline next to the longer timeline that contains it.
 
-        What was drawn close up before is left out: a viewer forgets nothing, and would draw both.
+        Earlier close-ups are not drawn again: a viewer keeps all data, and would draw both.
         """
         draw_close_up(timeline, self._close, self._canvas)
         starts, ends = self._close
@@ -188,7 +185,7 @@ class Viewer:
         self._flush()
 
     def ask(self, start: int, end: int, text: str) -> None:
-        """Draw which span is asked, in place of the one before."""
+        """Draw the requested span, in place of the previous one."""
         draw_asked(self._asked, start, end, text, self._canvas)
         self._asked += 1
         self._flush()
@@ -196,32 +193,32 @@ class Viewer:
     def redraw_marks(
         self, microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
     ) -> None:
-        """Draw what is reviewed of a microphone again.
+        """Redraw the reviewed spans of a microphone.
 
         Parameters
         ----------
         microphone, scenario : str
-            Their names; the second is empty for the sounds of the home.
+            Their names; the scenario is empty for the sounds of the home.
         marks, reviewed : LabelledSpans
-            All that it has now; what was drawn before and is not among them goes away.
+            All current ones; earlier drawn spans that are missing here are hidden.
         """
         lane = reviewed_lane(microphone, scenario, marks, reviewed)
         self._reviewed[microphone, lane.name].show(lane, self._canvas)
         self._flush()
 
     def wait_until_drawn(self, is_over: Callable[[], bool] = bool) -> ViewerState | None:
-        """Wait until the viewer shows what was sent to it; for a page, until somebody opens it.
+        """Wait until the viewer has drawn its data; for a page, until somebody opens it.
 
         Returns
         -------
         ViewerState or None
-            None if nobody will.
+            None if the wait was ended by `is_over`.
 
         Raises
         ------
         DataError
-            If the viewer ends, if a window takes longer than a minute, or if the viewer is of
-            another version than the package.
+            If the viewer ends, if a window takes longer than a minute, or if the viewer's version
+            differs from the package's.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while self.address or time.monotonic() < deadline:
@@ -248,12 +245,12 @@ class Viewer:
         return self._control.state()
 
     def selection(self) -> tuple[int, int] | None:
-        """Return the span that is selected on the time ruler.
+        """Return the span selected on the time ruler.
 
         Returns
         -------
         (int, int) or None
-            Start and end in nanoseconds of UTC; None if nothing is selected.
+            Start and end in nanoseconds of UTC; None without a selection.
 
         Raises
         ------
@@ -265,7 +262,7 @@ class Viewer:
         return span and (self._clock.utc(span[0]), self._clock.utc(span[1]))
 
     def cursor(self) -> int | None:
-        """Return the time of the cursor, in nanoseconds of UTC; None if there is no cursor.
+        """Return the time of the cursor, in nanoseconds of UTC; None without a cursor.
 
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
@@ -296,14 +293,14 @@ class Viewer:
         self._control.set_time(self._clock.name, start, play=False)
 
     def play(self, start: int) -> None:
-        """Let the cursor run from a time on.
+        """Start the cursor running from a time.
 
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         self._control.set_time(self._clock.name, self._clock.shown(start), play=True)
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons in the page of the viewer, if it has one."""
+        """Show buttons in the page of the viewer, if it has one."""
         self._control.offer(keys, press)
 
     def say(self, text: str) -> None:
@@ -315,22 +312,22 @@ class Viewer:
         return self._canvas.clock
 
     def _flush(self) -> None:
-        if self.is_open():  # or it would wait for ever
+        if self.is_open():  # otherwise it would wait for ever
             self._recording.flush(timeout_sec=_FLUSH_SECONDS)
 
 
 def check_version(version: str) -> None:
-    """Raise DataError if a viewer is of another version than the package.
+    """Raise DataError if a viewer's version differs from the package's.
 
     Parameters
     ----------
     version : str
-        As the viewer reports it; empty if it does not.
+        As reported by the viewer; empty if unknown.
 
     Raises
     ------
     DataError
-        If it is not that of the installed `rerun` package.
+        If it differs from the version of the installed `rerun` package.
     """
     if version != rr.__version__:
         raise DataError(
@@ -348,11 +345,11 @@ def _span(selection: Any) -> tuple[int, int] | None:
     return start, end
 
 
-_MEMORY = "800MB"  # of a viewer that data comes to for days; then it drops the oldest
+_MEMORY = "800MB"  # of a viewer with days of incoming data; then it drops the oldest
 
 
 class _WindowControl:
-    """Controls a viewer by Rerun's own client, over gRPC."""
+    """Controls a viewer over gRPC with Rerun's own client."""
 
     def __init__(self, process: ViewerProcess) -> None:
         self.process = process
@@ -391,17 +388,17 @@ class _WindowControl:
         )
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer nothing: keys are those of the terminal."""
+        """Ignore buttons: the keys are typed in the terminal."""
 
     def say(self, text: str) -> None:
-        """Say nothing: lines are those of the terminal."""
+        """Ignore lines: they are printed in the terminal."""
 
     def close(self) -> None:
         self.process.close()
 
 
 class WindowViewer(Viewer):
-    """A viewer in a window of its own."""
+    """A viewer in its own window."""
 
     def __init__(self, process: ViewerProcess) -> None:
         self._window = _WindowControl(process)

@@ -1,4 +1,4 @@
-"""The viewer in a browser: a page of this machine that relays requests in protobuf to it."""
+"""Browser viewer: a local page that relays protobuf requests to the viewer."""
 
 import json
 import queue
@@ -19,8 +19,8 @@ from hearthlog.analyzer.network import HOST, free_port
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
-# Messages of Rerun's viewer control (0.41), which the page in a browser takes; a viewer in a window
-# has Rerun's own client. A field is a head, 8 * number + kind, and a value.
+# Messages of Rerun's viewer control (0.41), accepted by the page in a browser; a viewer in a
+# window has Rerun's own client. A field is a head, 8 * number + kind, and a value.
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _SIZES = {_FIXED64: 8, _FIXED32: 4}
 _STATE, _SET_TIME, _BLUEPRINT, _SET_BLUEPRINT = 3, 6, 12, 14  # operations
@@ -31,29 +31,29 @@ Value = int | bytes
 
 
 def get_state() -> bytes:
-    """Make the request for what the viewer shows."""
+    """Encode the request for the viewer's state."""
     return _field(_STATE, b"")
 
 
 def get_blueprint() -> bytes:
-    """Make the request for the blueprint, which has the selection of the user."""
+    """Encode the request for the blueprint, which holds the user's selection."""
     return _field(_BLUEPRINT, b"")
 
 
 def set_blueprint(blueprint: str) -> bytes:
-    """Make the request to replace the blueprint by another one."""
+    """Encode the request to replace the blueprint."""
     return _field(_SET_BLUEPRINT, _field(2, blueprint.encode()) + _field(_ON_RECORDING, b""))
 
 
 def set_time(axis: str, nanoseconds: int, *, play: bool) -> bytes:
-    """Make the request to put the cursor on a time."""
+    """Encode the request to set the cursor."""
     timeline = _field(2, _field(1, axis.encode()))
     time = _field(3, _field(1, nanoseconds))
     return _field(_SET_TIME, timeline + time + _field(5, _PLAYING if play else _PAUSED))
 
 
 def read_blueprint(answer: bytes) -> str:
-    """Read the JSON of a blueprint.
+    """Extract the JSON of a blueprint.
 
     Returns
     -------
@@ -63,25 +63,25 @@ def read_blueprint(answer: bytes) -> str:
     Raises
     ------
     ValueError
-        If the answer is no message of protobuf.
+        If the answer is no protobuf message.
     """
     return _text(_message(answer, _BLUEPRINT), 2)
 
 
 def read_state(answer: bytes) -> tuple[str, list[list[str]], int | None]:
-    """Read what a viewer says of its state.
+    """Decode the state of a viewer.
 
     Returns
     -------
     version : str
         Of the viewer; empty if the answer has none.
     cursor : int or None
-        In nanoseconds of the axis of time; None if there is no cursor.
+        In nanoseconds of the time axis; None without a cursor.
 
     Raises
     ------
     ValueError
-        If the answer is no message of protobuf.
+        If the answer is no protobuf message.
     """
     state = _message(answer, _STATE)
     reports = [
@@ -101,7 +101,7 @@ def _field(number: int, value: Value) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Write a number in groups of seven bits, the lowest first."""
+    """Encode a number in groups of seven bits, the lowest first."""
     groups = bytearray()
     while value > 0x7F:
         groups.append(value & 0x7F | 0x80)
@@ -112,7 +112,7 @@ def _varint(value: int) -> bytes:
 def _fields(content: bytes) -> Iterator[tuple[int, Value]]:
     """Yield number and value of each field.
 
-    Raise `ValueError` if it is no message.
+    Raise `ValueError` if the content is no protobuf message.
     """
     place = 0
     while place < len(content):
@@ -148,7 +148,7 @@ def _read_varint(content: bytes, place: int) -> tuple[int, int]:
 
 
 def _last(content: bytes, field: int) -> Value | None:
-    """Return the last value of a field, which counts; None if there is none."""
+    """Return the last, effective value of a field; None if there is none."""
     values = [value for number, value in _fields(content) if number == field]
     return values[-1] if values else None
 
@@ -168,13 +168,13 @@ def _text(content: bytes, field: int) -> str:
 
 _POLL_SECONDS = 20.0
 _ANSWER_SECONDS = 15.0
-_LIMIT = 16 << 20  # bytes of an answer
+_LIMIT = 16 << 20  # maximum bytes of an answer
 _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 
 @dataclass
 class Relay:
-    """Requests to a page, and its answers."""
+    """Queue of requests to a page, with its answers."""
 
     keys: Sequence[tuple[str, str]] = ()
     press: Callable[[str], None] = lambda _: None
@@ -184,10 +184,10 @@ class Relay:
     _last: int = 0
 
     def ask(self, request: bytes) -> bytes:
-        """Ask the page, and wait for its answer.
+        """Send a request to the page, and wait for its answer.
 
-        Raise `TimeoutError` if there is no answer within 15 seconds. Raise `ConnectionError` if
-        the viewer in the page refused.
+        Raise `TimeoutError` if there is no answer within 15 seconds. Raise `ConnectionError` if the
+        viewer in the page refused.
         """
         self._last += 1
         number, answer = self._last, Future[bytes]()
@@ -209,12 +209,12 @@ class Relay:
         with suppress(queue.Empty):
             while True:
                 number, request = self.requests.get(timeout=_POLL_SECONDS)
-                if number in self.answers:  # somebody still waits for it
+                if number in self.answers:  # a caller still waits for it
                     return number, request
         return 0, b""
 
     def answer(self, number: int, content: bytes | None) -> None:
-        """Take the answer to a request.
+        """Deliver the answer to a request.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ class _Server(ThreadingHTTPServer):
         self.data = data
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Pass over what a page that was closed took no more; print other errors."""
+        """Ignore broken connections of closed pages; print other errors."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
@@ -253,7 +253,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers requests of the page."""
+    """Handler of the page's requests."""
 
     protocol_version = "HTTP/1.1"
 
@@ -262,7 +262,7 @@ class _Handler(BaseHTTPRequestHandler):
         return cast(_Server, self.server)
 
     def log_message(self, *_: object) -> None:
-        """Keep quiet."""
+        """Disable request logging."""
 
     def do_GET(self) -> None:
         """Send the page, the files of the viewer, the next request or the next text."""
@@ -285,7 +285,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def do_POST(self) -> None:
-        """Take an answer, or a key."""
+        """Receive an answer, or a key."""
         name = self._name()
         content = self._content()
         relay = self._page.relay
@@ -300,7 +300,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(b"", "text/plain")
 
     def _policy(self) -> str:
-        """Allow the page to reach this machine only: the viewer would send usage statistics."""
+        """Limit the page to this machine; otherwise the viewer would send usage statistics."""
         allowed = self._page.data.removeprefix("rerun+").removesuffix("/proxy")
         return (
             "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; "
@@ -308,7 +308,7 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _name(self) -> str | None:
-        """Return the path behind the secret; None if the secret or the host is another one."""
+        """Return the path after the secret; None for a wrong secret or host."""
         secret, _, name = self.path.removeprefix("/").partition("/")
         hosts = {f"{host}:{self._page.server_port}" for host in (HOST, "localhost")}
         is_ours = secrets.compare_digest(secret.encode(), self._page.secret.encode())
@@ -353,10 +353,10 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class _WebControl:
-    """Controls a viewer through the page that it is in."""
+    """Controls a viewer through its page."""
 
     def __init__(self, process: ViewerProcess, server: _Server) -> None:
-        self.process = process  # it hands out the data and the files of the viewer
+        self.process = process  # serves the data and the files of the viewer
         self._relay = server.relay
         self._server = server
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -389,7 +389,7 @@ class _WebControl:
 
 
 def open_page(port: int | None = None, data: str | None = None) -> Viewer:
-    """Serve the viewer as a page of this machine.
+    """Serve the viewer as a local page.
 
     Raise `DataError` if the viewer is not installed, or the port is in use.
     """
