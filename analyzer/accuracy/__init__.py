@@ -1,1 +1,1 @@
-"""Accuracy of the labels in a home, by minutes drawn at random."""
+"""Accuracy of the labels in a home, estimated from minutes drawn at random."""

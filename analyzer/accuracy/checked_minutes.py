@@ -1,4 +1,4 @@
-"""Checked minutes: reviewed labels, and minutes drawn at random with their true events."""
+"""Checked minutes: reviewed labels, and random minutes with their true events."""
 
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
@@ -44,14 +44,14 @@ _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
 class ReviewedLabels(NamedTuple):
-    """A reviewed span, and the labels in it and in the ten minutes before and after.
+    """A reviewed span, with the labels in it and in the ten minutes before and after.
 
     Attributes
     ----------
     model : str
         SHA-256 of the model that labelled; empty if unknown.
     undecided : Spans
-        What a person could not decide: the labels there are neither right nor wrong.
+        Undecided spans: the labels there are neither right nor wrong.
     """
 
     span: ReviewedSpan
@@ -62,7 +62,7 @@ class ReviewedLabels(NamedTuple):
 
 
 def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
-    """Count the spans that a person has looked at, but not because they were drawn at random."""
+    """Count the reviewed spans that were not drawn at random."""
     spans = [one for one in reviewed if one.span.chosen != RANDOM and not _is_undecided(one)]
     return sum(2 * _changed(one) < one.span.end - one.span.start for one in spans), len(spans)
 
@@ -73,7 +73,7 @@ def _is_undecided(reviewed: ReviewedLabels) -> bool:
 
 
 def _changed(reviewed: ReviewedLabels) -> int:
-    """Measure for how long another label is true in a span than was labelled."""
+    """Return how long the true label of a span differs from its labelling."""
     parts = overlay([reviewed.labels, reviewed.true]).in_all()
     differs = reviewed.labels.labels[parts.rows[0]] != reviewed.true.labels[parts.rows[1]]
     spans = Spans(parts.starts[differs], parts.ends[differs])
@@ -88,12 +88,12 @@ def read_reviewed_labels(  # noqa: PLR0913, PLR0917
     losses: list[str],
     chosen: Collection[str] = CHOICES,
 ) -> Iterator[ReviewedLabels]:
-    """Read the labels of the spans that a person has gone through.
+    """Read the labels of the reviewed spans.
 
     Parameters
     ----------
     start, end : int
-        Nanoseconds of UTC, of the logs whose review layers are read.
+        Nanoseconds of UTC: time range of the logs to read.
     """
     found: list[tuple[Path, ReviewedSpan]] = []
     for layer in logs.between(start, end, REVIEW_LAYER):
@@ -120,9 +120,9 @@ def _lose(losses: list[str], error: Exception) -> None:
 
 
 def _joined_parts(found: list[tuple[Path, ReviewedSpan]]) -> list[tuple[Path, ReviewedSpan]]:
-    """Join spans that were cut where one log ends and the next begins."""
+    """Merge spans that were cut at the boundary of two logs."""
     whole: list[tuple[Path, ReviewedSpan]] = []
-    open_: dict[ReviewedSpan, tuple[int, Path]] = {}  # by the span that would go on: place, log
+    open_: dict[ReviewedSpan, tuple[int, Path]] = {}  # index and log by continuing span
     for log, span in found:
         place, before = open_.pop(span._replace(end=0), (len(whole), log))
         if place < len(whole) and before != log and _is_one(whole[place][1], span):
@@ -136,7 +136,7 @@ def _joined_parts(found: list[tuple[Path, ReviewedSpan]]) -> list[tuple[Path, Re
 
 
 def _is_one(before: ReviewedSpan, after: ReviewedSpan) -> bool:
-    """Tell two parts of a drawn minute from two minutes, both of which were drawn."""
+    """Return whether two spans are parts of one drawn minute rather than two drawn minutes."""
     return before.chosen != RANDOM or after.end - before.start <= MINUTE
 
 
@@ -149,7 +149,7 @@ def _reviewed_labels(
     models = {name: model_of(log, name) for name in {span.microphone for span in spans}}
     marks = [mark for path in near for mark in _marks(path)]
     for span in spans:
-        with suppress(LogError):  # nothing is labelled there
+        with suppress(LogError):  # no labels there
             around = span.start - AROUND * MINUTE, span.end + AROUND * MINUTE
             labels = unified(sources.read(span.microphone, name, *around).labelling)
             own = [mark for mark in marks if mark.microphone == span.microphone]
@@ -178,7 +178,7 @@ def _marks(log: Path) -> list[Mark]:
 
 
 def labelling_of_marks(marks: Iterable[Mark]) -> Labelling:
-    """Make a labelling of marks of one microphone."""
+    """Convert marks of one microphone to a labelling."""
     ordered = sorted(marks)
     return Labelling(
         np.array([mark.start for mark in ordered], np.int64),
@@ -188,12 +188,12 @@ def labelling_of_marks(marks: Iterable[Mark]) -> Labelling:
 
 
 class ClassCheck(NamedTuple):
-    """How right the labels of a class were in the checked minutes.
+    """Counts of correct and missed events of a class in the checked minutes.
 
     Attributes
     ----------
     in_quiet : int
-        Of the missed ones, those in minutes in which nothing sounds by the labels.
+        Missed events in minutes labelled as silent.
     """
 
     labelled: int
@@ -204,29 +204,30 @@ class ClassCheck(NamedTuple):
 
     @property
     def precision(self) -> tuple[float, float] | None:
-        """Where the share of right ones lies nine times in ten; None if nothing was labelled.
+        """90 % interval of the precision; None without a labelled event.
 
-        Every labelled event is in a minute with sound, and of those all are drawn alike.
+        Every labelled event is in a minute with sound, and all such minutes are equally likely to
+        be drawn.
         """
         return _interval(self.right, self.labelled)
 
     def miss_rate(self, weight: float) -> tuple[float, float] | None:
-        """Return where the share of missed ones lies nine times in ten; None of no true event.
+        """Return the 90 % interval of the miss rate; None without a true event.
 
         Parameters
         ----------
         weight : float
-            Of a quiet minute, as of `quiet_weight`.
+            Weight of a quiet minute, from `quiet_weight`.
         """
         if not self.true:
             return None
         more, squares = (weight - 1) * self.in_quiet, (weight**2 - 1) * self.in_quiet
-        effective = (self.true + more) ** 2 / (self.true + squares)  # size, as Kish defines it
+        effective = (self.true + more) ** 2 / (self.true + squares)  # Kish's effective sample size
         return _interval(effective * (self.missed + more) / (self.true + more), effective)
 
 
 def _interval(some: float, whole: float) -> tuple[float, float] | None:
-    """Return the central 90 % of a beta distribution, with the prior of Jeffreys."""
+    """Return the central 90 % of a beta distribution with Jeffreys prior."""
     if not whole:
         return None
     low, high = (beta_quantile(some + 0.5, whole - some + 0.5, share) for share in (0.05, 0.95))
@@ -235,15 +236,15 @@ def _interval(some: float, whole: float) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, eq=False)
 class CheckedMinutes:
-    """Events of each class in minutes that were drawn at random and gone through.
+    """Events of each class in reviewed minutes drawn at random.
 
     Attributes
     ----------
     labelled, right, true, missed : dict of str to np.ndarray [shape=(n,)], int64
-        By class, of the events that begin in each minute: labelled ones, those of them that have a
-        part in it that is true, true ones, and those of them of which nothing in it was labelled.
+        By class, number of events that start in each minute: labelled events, labelled events that
+        are true in part, true events, and true events without any labelled part.
     sounding, television : np.ndarray [shape=(n,)], bool
-        Whether anything sounds, and whether it sounds like a television, by the labels.
+        Whether the labels show any sound, and whether they resemble a television.
     models : list of str
         SHA-256 of the model that labelled each minute; empty if unknown.
     """
@@ -260,7 +261,7 @@ class CheckedMinutes:
         return len(self.models)
 
     def of_model(self, model: str) -> "CheckedMinutes":
-        """Return the minutes that a model labelled; all of them if they are too few."""
+        """Return the minutes that a model labelled; all minutes if those are too few."""
         rows = np.flatnonzero([each == model for each in self.models])
         if len(rows) < FEWEST:
             return self
@@ -279,7 +280,7 @@ class CheckedMinutes:
         )
 
     def check(self, name: str) -> ClassCheck:
-        """Return how right the labels of a class were."""
+        """Return the counts of correct and missed events of a class."""
         kept = self._kept(name)
         columns = (self.labelled, self.right, self.true, self.missed)
         none = np.zeros(len(self), np.int64)
@@ -293,7 +294,7 @@ class CheckedMinutes:
         Parameters
         ----------
         share : float
-            Of the class among all labelled events, 0 to 1.
+            Share of the class among all labelled events, 0 to 1.
         """
         kept = self._kept(name)
         none = np.zeros(len(self), np.int64)
@@ -307,21 +308,21 @@ class CheckedMinutes:
 def read_checked_minutes(
     logs: HomeLogs, labelling: str, start: int, end: int, losses: list[str]
 ) -> CheckedMinutes:
-    """Read the minutes that were drawn at random, and gone through by a person.
+    """Read the reviewed minutes that were drawn at random.
 
-    What is true of them are the labels that were looked at, overlaid with the marks.
+    The true labels are the reviewed labels, overlaid with the marks.
 
     Parameters
     ----------
     start, end : int
-        Nanoseconds of UTC: minutes that begin before or end after them are left out.
+        Nanoseconds of UTC: minutes that start before or end after them are skipped.
     """
     reviewed = read_reviewed_labels(logs, labelling, start, end, losses, {RANDOM})
     return checked_minutes(one for one in reviewed if start <= one.span.start < end)
 
 
 def checked_minutes(reviewed: Iterable[ReviewedLabels]) -> CheckedMinutes:
-    """Count the events of the minutes that were drawn at random, and gone through by a person."""
+    """Count the events of the reviewed minutes that were drawn at random."""
     minutes = [one for one in reviewed if one.span.chosen == RANDOM]
     names = {
         name for one in minutes for part in (one.labels, one.true) for name in set(part.labels)
@@ -353,10 +354,10 @@ def _like_television(minute: ReviewedLabels) -> bool:
 
 
 def _events(minute: ReviewedLabels, name: str) -> list[int]:
-    """Count the events that begin in a minute: labelled, right, true and missed ones.
+    """Count the events that start in a minute: labelled, right, true and missed ones.
 
-    Of what outlasts the minute only the part in it was looked at, and says whether it is right.
-    Where nobody could tell what sounds, no event is counted, and none makes another one right.
+    Only the part within the minute was reviewed, and decides for an event that outlasts the minute.
+    Undecided spans contain no event, and make no event right.
     """
     start, end = minute.span.start, minute.span.end
     labelled, true = events_of(minute.labels, name), events_of(minute.true, name)
@@ -367,7 +368,7 @@ def _events(minute: ReviewedLabels, name: str) -> list[int]:
 
 
 def _begun(events: Spans, minute: ReviewedLabels) -> Spans:
-    """Return the events that begin in a minute, and end with it at the latest."""
+    """Return the events that start in a minute, cut at its end."""
     span = minute.span
     first, last = np.searchsorted(events.starts, [span.start, span.end])
     begun = Spans(events.starts[first:last], np.minimum(events.ends[first:last], span.end))
@@ -376,14 +377,13 @@ def _begun(events: Spans, minute: ReviewedLabels) -> Spans:
 
 
 _DAY = 1440 * MINUTE
-_MOST = 7  # days: more would hardly change the share, and take their time
+_MOST = 7  # days: more would cost time and hardly change the share
 
 
 def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
-    """Tell for how many quiet minutes one checked stands, where one with sound stands for one.
+    """Return the number of quiet minutes per checked one, relative to minutes with sound.
 
-    That is the weight of Horvitz and Thompson, by the last seven days of which minutes were
-    checked.
+    This is the weight of Horvitz and Thompson, over the last seven days with checked minutes.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
     Returns
     -------
     float
-        1 if only minutes of one kind were checked, or are there.
+        1 if only one kind of minutes was checked, or exists.
     """
     kinds = [sounding for day in _days(logs, labelling) for sounding in _sounding(logs, *day)]
     sounding = np.concatenate([*kinds, np.empty(0, bool)])
@@ -410,14 +410,14 @@ def _days(logs: HomeLogs, labelling: str) -> list[tuple[int, str, str]]:
         try:
             spans = read_reviewed(log_of_layer(layer.path))
         except LogError:
-            continue  # whoever reads the minutes says so
+            continue  # the reader of the minutes reports this
         own = (s for s in spans if s.chosen == RANDOM and s.corrects == labelling)
         days |= {(span.start // _DAY * _DAY, span.microphone, labelling) for span in own}
     return sorted(days)[-_MOST:]
 
 
 def _sounding(logs: HomeLogs, start: int, microphone: str, labelling: str) -> Iterator[Bool]:
-    """Tell which minutes of a day sound; those that are not labelled are left out."""
+    """Return which minutes of a day have sound; unlabelled minutes are dropped."""
     paths = [entry.path for entry in logs.between(start, start + _DAY) if entry.path.exists()]
     name = labelling if labelling == LIVE else relabelling(labelling)
     edges = start + np.arange(0, _DAY + 1, MINUTE)

@@ -13,27 +13,27 @@ from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
 MINUTE = 60 * NANOSECONDS
-SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which a television has, too
-AROUND = 10  # minutes before and after one, in which a television would be heard
+SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which also occur on a television
+AROUND = 10  # minutes before and after, in which a television would still be on
 _PAUSE = 10 * NANOSECONDS
-_ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # a person who cries for long is no television
+_ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # long crying is no television
 _SHARE = 0.1  # of the time
 _CHANGES = 2  # in a minute
 
 
 def events_of(labels: Labelling, name: str) -> Spans:
-    """Return the events of a class: its spans, joined across pauses of at most ten seconds."""
+    """Return the events of a class: its spans, merged across pauses of at most ten seconds."""
     own = labels.labels == name
     return joined(labels.starts[own], labels.ends[own], _PAUSE)
 
 
 def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
-    """Tell in which minutes there is anything but silence.
+    """Return which minutes have any sound.
 
     Parameters
     ----------
     edges : np.ndarray [shape=(n + 1,)], int64
-        Of the minutes.
+        Edges of the minutes.
 
     Returns
     -------
@@ -44,16 +44,16 @@ def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
 
 
 def television_minutes(labels: Labelling, edges: Int64) -> Bool:
-    """Tell in which minutes something sounds like a television, a radio or company.
+    """Return which minutes resemble a television, a radio or company.
 
-    That is where, in the ten minutes before and after, two sounds a minute begin, and where those
-    that are neither coughing nor crying nor shouting fill a tenth of the time. Which ones they are
-    does not matter, for a model may take a television for anything.
+    In the ten minutes before and after, two sounds a minute start, and sounds other than coughing,
+    crying and shouting fill a tenth of the time. Their classes do not matter, because a model may
+    take a television for anything.
 
     Parameters
     ----------
     edges : np.ndarray [shape=(n + 1,)], int64
-        Of successive minutes.
+        Edges of successive minutes.
 
     Returns
     -------
@@ -69,17 +69,17 @@ def television_minutes(labels: Labelling, edges: Int64) -> Bool:
 
 
 def _around(amounts: Int64) -> Int64:
-    """Sum up the amounts of each minute and of those around it."""
+    """Return the sum over each minute and the minutes around it."""
     return np.convolve(amounts, np.ones(2 * AROUND + 1, np.int64))[AROUND : AROUND + len(amounts)]
 
 
 def events_by_minute(events: Spans, edges: Int64) -> Int64:
-    """Count the events that begin in each minute.
+    """Count the events that start in each minute.
 
     Parameters
     ----------
     edges : np.ndarray [shape=(n + 1,)], int64
-        Of the minutes.
+        Edges of the minutes.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def events_by_minute(events: Spans, edges: Int64) -> Int64:
 
 
 def overlapping(events: Spans, others: Spans) -> Bool:
-    """Tell which events have a part in common with one of others.
+    """Return which events overlap one of others.
 
     Returns
     -------
@@ -105,9 +105,9 @@ def overlapping(events: Spans, others: Spans) -> Bool:
 FEWEST = 5  # minutes
 _DRAWS = 2000
 _SEED = 20_261_123
-_ENDS = (5.0, 95.0)  # percentiles: nine times in ten the count is between them
-# Events, and minutes or labelled events, that are added to what was checked, so that few minutes
-# promise little.
+_ENDS = (5.0, 95.0)  # percentiles: the limits of the 90 % range
+# Prior: events, and minutes or labelled events, added to the checked ones, so that few minutes
+# give a wide range.
 _MISSED_IN_QUIET = (0.5, 60.0)  # of all classes together
 _MISSED_IN_SOUND = (1.0, 5.0)  # of all classes together
 _RIGHT, _WRONG = 0.3, 0.7
@@ -115,12 +115,12 @@ _PRECISION = 1e-15  # of a share of a beta distribution
 
 
 class Strata(NamedTuple):
-    """What labels say of a class, in minutes of two kinds.
+    """Label counts of a class in quiet minutes and in minutes with sound.
 
     Attributes
     ----------
     quiet, sounding : int
-        Minutes in which nothing sounds, and in which anything does.
+        Number of minutes without and with sound.
     """
 
     quiet: int = 0
@@ -136,7 +136,7 @@ NO_MINUTES = Strata()
 
 
 def strata_of(labelled: Int64, sounding: Bool) -> Strata:
-    """Count minutes of both kinds, and the events in them.
+    """Count quiet minutes and minutes with sound, and the events in them.
 
     Parameters
     ----------
@@ -150,14 +150,14 @@ def strata_of(labelled: Int64, sounding: Bool) -> Strata:
 
 @dataclass(frozen=True, eq=False)
 class CheckedRates:
-    """How many labelled events of a class are true, and how many are missed in a minute.
+    """Rates of correct labelled events and of missed events per minute of a class.
 
     Attributes
     ----------
     right : np.ndarray [shape=(draws,)], float64
-        Share of labelled events, drawn from its distribution.
+        Share of correct labelled events, drawn from its distribution.
     missed : np.ndarray [shape=(draws, 2)], float64
-        True events without a labelled one, in a quiet minute and in one that sounds.
+        Missed events per minute, in quiet minutes and in minutes with sound.
     """
 
     right: Float64
@@ -166,12 +166,12 @@ class CheckedRates:
     occurs: bool
 
     def range_of(self, strata: Strata) -> tuple[int, int]:
-        """Return the range that the number of events lies in nine times in ten.
+        """Return the 90 % range of the number of events.
 
         Parameters
         ----------
         strata : Strata
-            Of minutes that were not checked.
+            Of unchecked minutes.
         """
         rng = np.random.default_rng(_SEED)
         minutes = np.array([strata.quiet, strata.sounding], np.float64)
@@ -183,26 +183,26 @@ class CheckedRates:
 def checked_rates(
     labelled: Int64, true: Int64, sounding: Bool, share: float
 ) -> CheckedRates | None:
-    """Draw rates of a class, given minutes that a person went through.
+    """Draw rates of a class, given checked minutes.
 
-    A hot deck with a Bayesian prior: minutes are drawn again with replacement, for events come in
+    Hot deck with a Bayesian prior: minutes are resampled with replacement, because events come in
     bouts; then the share of right events is drawn from a beta distribution, and rates of missed
-    ones from gamma distributions. Of quiet and of sounding minutes each, those that were checked
-    must be drawn at random, but not the same share of both.
+    events from gamma distributions. Within quiet minutes and within minutes with sound, checked
+    minutes must be drawn at random, but the sampled share of the two kinds may differ.
 
     Parameters
     ----------
     labelled, true : np.ndarray [shape=(n,)], int64
-        Labelled and true events that begin in each checked minute.
+        Labelled and true events that start in each checked minute.
     sounding : np.ndarray [shape=(n,)], bool
-        Whether labels say that anything sounds.
+        Whether labels show any sound.
     share : float
-        Of the class among all labelled events, 0 to 1.
+        Share of the class among all labelled events, 0 to 1.
 
     Returns
     -------
     CheckedRates or None
-        None of fewer than five minutes.
+        None for fewer than five minutes.
     """
     if len(labelled) < FEWEST:
         return None
@@ -224,16 +224,16 @@ def checked_rates(
 
 
 def beta_quantile(a: float, b: float, share: float) -> float:
-    """Return a quantile of a beta distribution, as `scipy.special.betaincinv` does.
+    """Return a quantile of a beta distribution, like `scipy.special.betaincinv`.
 
-    The recorder's machine reads how right its labels are, and has no scipy.
+    The recorder's machine uses this for label precision, and has no scipy.
 
     Parameters
     ----------
     a, b : float
-        Of the distribution, more than 0.
+        Parameters of the distribution, more than 0.
     share : float
-        Of the distribution below the quantile, 0 to 1.
+        Probability below the quantile, 0 to 1.
     """
     low, high = 0.0, 1.0
     while low < (middle := (low + high) / 2) < high:
@@ -245,8 +245,8 @@ def beta_quantile(a: float, b: float, share: float) -> float:
 
 
 def _beta_share(a: float, b: float, x: float) -> float:
-    """Return the share of a beta distribution below x, between 0 and 1 (the continued fraction)."""
-    if x > (a + 1) / (a + b + 2):  # where it converges slowly
+    """Return the beta distribution function at x, between 0 and 1 (continued fraction)."""
+    if x > (a + 1) / (a + b + 2):  # the fraction converges slowly there
         return 1 - _beta_share(b, a, 1 - x)
     density = exp(lgamma(a + b) - lgamma(a) - lgamma(b) + a * log(x) + b * log1p(-x))
     numerator, denominator = 1.0, 1 / (1 - (a + b) * x / (a + 1))

@@ -1,4 +1,4 @@
-"""Manifests of collections: categories mapped to labels, and the parts with one label."""
+"""Manifests of collections: categories mapped to labels, and parts with a single label."""
 
 import csv
 import io
@@ -35,14 +35,14 @@ SEVERAL = "several sounds at once"
 
 
 class Decision(NamedTuple):
-    """What categories that are heard together are in a manifest.
+    """Label of simultaneous categories in a manifest.
 
     Attributes
     ----------
     label : str
-        Empty if they are left out.
+        Empty if skipped.
     reason : str
-        Why they are left out; empty if they are not.
+        Reason for skipping; empty otherwise.
     """
 
     label: str
@@ -60,10 +60,10 @@ class LabelMap:
     keep: bool = False
 
     def decide(self, categories: Iterable[str]) -> Decision:
-        """Return the label of categories that are heard together.
+        """Return the label of simultaneous categories.
 
-        Broad ones are passed over. The others must all have one label; without one in the map it
-        is `other_negative`, or the category itself.
+        Broad categories are ignored. The others must all have the same label; a category outside
+        the map becomes `other_negative`, or its own name.
         """
         told = [name for name in categories if name not in self.broad]
         detail = " + ".join(sorted(set(told)))
@@ -78,9 +78,9 @@ class LabelMap:
         return Decision(labels.pop(), detail)
 
     def with_classes(self, folder: Path, names: Iterable[str]) -> "LabelMap":
-        """Return this map, with names of categories that are names of classes, too.
+        """Return this map extended by class names as categories.
 
-        Raise `DataError` if one of them is in this map nowhere, and is no name of a class.
+        Raise `DataError` if a name is neither in this map nor a class name.
         """
         known = self.label_of.keys() | self.broad | self.skip
         classes = {name: find_class(name) for name in sorted(set(names) - known)}
@@ -99,7 +99,7 @@ class LabelMap:
 
 
 def shipped_map(name: str) -> str:
-    """Return the map of a collection that comes with hearthlog, as TOML."""
+    """Return the map of a collection that is part of hearthlog, as TOML."""
     return _shipped(name).read_text("utf-8")
 
 
@@ -143,13 +143,13 @@ def _categories(path: Path, key: str, value: object) -> list[str]:
     return value
 
 
-_SHORTEST = 1.0  # seconds, from which `train` cuts a segment
+_SHORTEST = 1.0  # seconds, minimum length for `train` to cut a segment
 
 _Span = tuple[float, float]
 
 
 class LabelledPart(NamedTuple):
-    """A part of a file with one label; `end` is infinite for the rest of the file."""
+    """A part of a file with one label; an infinite `end` is the end of the file."""
 
     label: str
     detail: str
@@ -160,16 +160,16 @@ class LabelledPart(NamedTuple):
 def labelled_parts(
     sounds: Sequence[CategorySpan], seconds: float, label_map: LabelMap
 ) -> tuple[list[LabelledPart], Counter[tuple[str, str]]]:
-    """Return the parts of a file in which one label is heard alone.
+    """Return the parts of a file with a single label.
 
-    A sound shorter than a second is extended evenly to one. What overlaps a sound of another label,
-    or of one that the map leaves out, is left out; what overlaps a sound of the same label is
-    joined with it.
+    A sound shorter than a second is extended evenly to one second. Sounds that overlap a sound of
+    another label, or of a label that the map skips, are dropped; overlapping sounds of the same
+    label are merged.
 
     Parameters
     ----------
     seconds : float
-        Length of the file; infinite if it is not known.
+        Length of the file; infinite if unknown.
     """
     decided = [(sound, label_map.decide(sound.categories)) for sound in sounds]
     told = [(sound, what) for sound, what in decided if what.reason != BROAD]
@@ -213,13 +213,13 @@ def _reason(span: _Span, what: Decision, joined: Mapping[str, list[_Span]]) -> s
 
 
 def _overlaps(span: _Span, others: list[_Span]) -> bool:
-    """Whether a span overlaps one of others, which are sorted and overlap nowhere."""
+    """Whether a span overlaps one of others, which are sorted and disjoint."""
     place = bisect_left(others, (span[1],))
     return place > 0 and others[place - 1][1] > span[0]
 
 
 def _joined(spans: Iterable[_Span]) -> list[_Span]:
-    """Sort spans, and join those that touch or overlap."""
+    """Sort spans, and merge touching or overlapping ones."""
     joined: list[_Span] = []
     for start, end in sorted(spans):
         if joined and start <= joined[-1][1]:
@@ -237,12 +237,12 @@ _NOT_UTF_8 = "its name is not UTF-8"
 
 @dataclass
 class ManifestSummary:
-    """What is in a manifest, and what is not.
+    """Counts of the clips in a manifest, and of skipped ones.
 
     Attributes
     ----------
     files, missing : int
-        Number of files that the collection lists, and of those that are not there.
+        Number of listed files, and of missing ones.
     """
 
     clips: Counter[str] = field(default_factory=Counter)
@@ -272,9 +272,9 @@ def make_manifest(  # noqa: PLR0913, PLR0917
     output : Path
         The manifest; must not exist. Paths in it are relative to its folder.
     progress : callable
-        Is told the share of the files that was looked at, 0 to 1.
+        Receives the completed share of the files, 0 to 1.
     source, licence : str
-        Of a folder of one's own; the source is the folder's name if it is empty.
+        For your own folder; an empty source becomes the name of the folder.
 
     Raises
     ------
@@ -327,7 +327,7 @@ def _labelled(
     summary: ManifestSummary,
     progress: Progress,
 ) -> Iterator[tuple[CollectionClip, LabelledPart]]:
-    """Yield what belongs into the manifest, and count it and all else."""
+    """Yield the parts for the manifest, and count them and all skipped parts."""
     seen: set[tuple[Path, float, float]] = set()
     for number, clip in enumerate(clips):
         progress(number / len(clips))
@@ -345,7 +345,7 @@ def _labelled(
 def _parts_of_clip(
     clip: CollectionClip, label_map: LabelMap, summary: ManifestSummary
 ) -> Iterator[LabelledPart]:
-    """Yield the parts of a file that belong into the manifest, and count all others."""
+    """Yield the parts of a file for the manifest, and count all others."""
     parts, left_out = labelled_parts(clip.sounds, clip.seconds, label_map)
     if clip.left_out:
         summary.left_out[clip.left_out] += 1
@@ -406,5 +406,5 @@ def _is_utf_8(path: Path) -> bool:
 
 
 def _seconds_text(value: float) -> str:
-    """Write a time; nothing for the start and the end of a file."""
+    """Format a time; empty for the start and the end of a file."""
     return "" if value in {0.0, math.inf} else f"{value:.3f}".rstrip("0").rstrip(".")

@@ -1,4 +1,4 @@
-"""Readers of public collections of labelled sound: a function each, and the table of them."""
+"""Readers of public collections of labelled sound, and the table of collections."""
 
 import json
 import math
@@ -16,12 +16,12 @@ from hearthlog.schemas.files import read_whole
 
 
 class CategorySpan(NamedTuple):
-    """What is heard in a file, or in a part of it.
+    """Category of a file, or of a part of it.
 
     Attributes
     ----------
     start, end : float
-        Seconds; `end` is infinite for the rest of the file.
+        Seconds; an infinite `end` is the end of the file.
     """
 
     categories: tuple[str, ...]
@@ -35,10 +35,10 @@ class CollectionClip(NamedTuple):
     Attributes
     ----------
     source_group : str
-        The original recording or speaker, with a prefix for where its number is from: groups of
+        The original recording or speaker, with a prefix for the origin of its number: groups of
         two collections are the same only if their recordings are.
     left_out : str
-        Why the clip is of no use; empty if it is.
+        Reason for skipping the clip; empty otherwise.
     """
 
     path: Path
@@ -56,12 +56,12 @@ _JSON_LIMIT = 256 << 20
 def read_table(
     path: Path, columns: Sequence[str], delimiter: str = ","
 ) -> Iterator[tuple[str, list[str]]]:
-    """Yield some columns of a table whose first line names them.
+    """Yield some columns of a table with a header line.
 
     Parameters
     ----------
     delimiter : str
-        Between fields.
+        Field separator.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def read_table(
 
 
 def read_json(path: Path) -> dict[str, object]:
-    """Read an object of JSON.
+    """Read a JSON object.
 
     Raise `DataError` if the file cannot be read, is larger than 256 MB, or is no object of
     JSON.
@@ -104,7 +104,7 @@ def read_json(path: Path) -> dict[str, object]:
 def path_inside(where: str, folder: Path, name: str) -> Path:
     """Return the path of a file that a table names.
 
-    Raise `DataError` if the name leads out of the folder, or none can be called so.
+    Raise `DataError` if the path is outside the folder, or is no valid name.
     """
     pure = PurePosixPath(name)
     if not name or pure.is_absolute() or ".." in pure.parts or "\0" in name:
@@ -113,7 +113,7 @@ def path_inside(where: str, folder: Path, name: str) -> Path:
 
 
 def audio_by_name(folder: Path) -> dict[str, Path]:
-    """Find audio files by their names, wherever they are in a folder."""
+    """Find audio files by name anywhere in a folder."""
     found: dict[str, Path] = {}
     for path in files_below(folder):
         if is_audio(path.name):
@@ -139,7 +139,7 @@ def read_seconds(where: str, *texts: str) -> list[float]:
 def read_esc50(folder: Path) -> Iterator[CollectionClip]:
     """ESC-50: 2,000 clips of five seconds, fifty categories.
 
-    Layout and licence as its repository says, https://github.com/karolpiczak/ESC-50, in version 2:
+    Layout and licence from its repository, https://github.com/karolpiczak/ESC-50, version 2:
     `meta/esc50.csv` with `filename,fold,target,category,esc10,src_file,take`, and `audio/`.
     `src_file` is the number of the recording at Freesound. The clips of the subset ESC-10 are CC
     BY, all others CC BY-NC.
@@ -162,7 +162,7 @@ _PUBLIC_DOMAIN = re.compile(r"https?://creativecommons\.org/publicdomain/zero/[\
 def read_fsd50k(folder: Path) -> Iterator[CollectionClip]:
     """FSD50K: 51,197 clips of 0.3 to 30 seconds, 200 categories of AudioSet's ontology.
 
-    Layout and licences as `FSD50K.doc/README.md` in it says, https://zenodo.org/records/4060432:
+    Layout and licences from its `FSD50K.doc/README.md`, https://zenodo.org/records/4060432:
     `FSD50K.ground_truth/dev.csv` with `fname,labels,mids,split`, `eval.csv` without `split`; audio
     in `FSD50K.dev_audio` and `FSD50K.eval_audio`, called by its number at Freesound; title,
     uploader and licence of each clip in `FSD50K.metadata/dev_clips_info_FSD50K.json` and
@@ -191,13 +191,13 @@ def read_fsd50k(folder: Path) -> Iterator[CollectionClip]:
 
 
 def _fsd50k_about(clip: object) -> tuple[str, str]:
-    """Return uploader and licence of a clip."""
+    """Return the uploader and licence of a clip."""
     known = clip if isinstance(clip, dict) else {}
     return str(known.get("uploader") or "").strip(), short_licence(str(known.get("license")))
 
 
 def short_licence(address: str) -> str:
-    """Return the short name of a licence of Creative Commons; `unstated` for another.
+    """Return the short name of a Creative Commons licence; `unstated` for others.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ _FOREGROUND = "1"
 def read_urbansound8k(folder: Path) -> Iterator[CollectionClip]:
     """UrbanSound8K: 8,732 clips of at most four seconds, ten categories of city sound.
 
-    Layout and licence as `UrbanSound8K_README.txt` in it says,
+    Layout and licence from its `UrbanSound8K_README.txt`,
     https://urbansounddataset.weebly.com/urbansound8k.html: `metadata/UrbanSound8K.csv` with
     `slice_file_name,fsID,start,end,salience,fold,classID,class`, and `audio/fold1` to
     `audio/fold10`. `fsID` is the number of the recording at Freesound. Salience 2 is a sound in the
@@ -246,16 +246,16 @@ _DESED_NAME = re.compile(r"Y?([\w-]{11})_([\d.]+)_([\d.]+)\.wav", re.ASCII)
 def read_desed(folder: Path) -> Iterator[CollectionClip]:
     """DESED: sounds of homes, with times; ten categories.
 
-    Layout as its repository says, https://github.com/turpaultn/DESED, and its user
+    Layout from its repository, https://github.com/turpaultn/DESED, and its user
     https://github.com/DCASE-REPO/DESED_task: below `metadata/train`, `metadata/validation` and
     `metadata/eval` lie tables with `filename`, `onset`, `offset`, `event_label`, separated by tabs,
     in which a file without any of the ten has empty fields; tables of other columns are weak labels
     or none. Audio lies below `audio`, called `Y<YouTube id>_<from>_<to>.wav`, in `eval/public`
     without the Y. Several tables have the same files.
 
-    Synthetic soundscapes, which have no YouTube id, are mixed from sounds that they share, and
-    could not be told apart as sources: they are left out. The sound of the others is of YouTube,
-    without a statement of a licence.
+    Synthetic soundscapes, without a YouTube id, are mixed from shared sounds, so they
+    are not separate sources and are skipped. The other audio is from YouTube,
+    without a stated licence.
 
     Raise `DataError` if a table of the collection cannot be read, or there is none with times.
     """
@@ -284,7 +284,7 @@ def read_desed(folder: Path) -> Iterator[CollectionClip]:
 
 
 def _desed_tables(folder: Path) -> list[Path]:
-    """List the tables with times."""
+    """Return the tables with times."""
     found = []
     for path in files_below(folder / "metadata"):
         if path.suffix == ".tsv":
@@ -303,7 +303,7 @@ _VOCALSOUND_NAME = re.compile(r"([fm]\d+)_\d+_([a-z]+)\.wav")
 def read_vocalsound(folder: Path) -> Iterator[CollectionClip]:
     """VocalSound: 21,024 clips of laughter, sighs, coughs, throat clearing, sneezes and sniffs.
 
-    Layout and licence as its repository says, https://github.com/YuanGongND/vocalsound:
+    Layout and licence from its repository, https://github.com/YuanGongND/vocalsound:
     `audio_16k`, or `audio_44k` with the same clips, called `f0003_0_cough.wav` for speaker, session
     and category; `datafiles/all.json` lists them as `{"data": [{"wav": "…/f0003_0_cough.wav", …},
     …]}`.
@@ -348,13 +348,13 @@ _AUDIOSET_NAMES_LIMIT = 1 << 20
 def read_audioset_strong(folder: Path) -> Iterator[CollectionClip]:
     """AudioSet with times: 456 categories, in ten-second pieces of YouTube's videos.
 
-    Layout as https://research.google.com/audioset/download_strong.html says: tables
+    Layout from https://research.google.com/audioset/download_strong.html: tables
     `audioset_train_strong.tsv` and `audioset_eval_strong.tsv` with `segment_id`,
     `start_time_seconds`, `end_time_seconds`, `label`, separated by tabs; a segment is `<YouTube
     id>_<from, in milliseconds>`, a label is an id that `mid_to_display_name.tsv` names. The
-    collection has no audio. People keep theirs as `<YouTube id>.wav` or with times behind it, in
-    seconds or milliseconds, with or without a leading Y, in any format: all of this is found,
-    anywhere in the folder. It is of YouTube, without a statement of a licence.
+    collection has no audio. Common file names are `<YouTube id>.wav`, or with times after it, in
+    seconds or milliseconds, with or without a leading Y, in any format: all of these are found,
+    anywhere in the folder. The audio is from YouTube, without a stated licence.
 
     Raise `DataError` if a table of the collection cannot be read, or there is none with times.
     """
@@ -393,7 +393,7 @@ def _audioset_names(path: Path) -> dict[str, str]:
 
 
 def _audioset_audio(folder: Path) -> dict[tuple[str, float | None], Path]:
-    """Find audio by the id of the video and the time in the name of a file."""
+    """Find audio by video id and time in the file name."""
     audio: dict[tuple[str, float | None], Path] = {}
     for path in files_below(folder):
         found = _AUDIOSET_FILE.fullmatch(path.stem) if is_audio(path.name) else None
@@ -413,7 +413,7 @@ _RAVDESS_EMOTIONS = (
 def read_ravdess(folder: Path) -> Iterator[CollectionClip]:
     """RAVDESS: 1,440 spoken and 1,012 sung sentences of 24 actors, each in up to eight emotions.
 
-    Layout and licence as its record says, https://zenodo.org/records/1188976: folders `Actor_01` to
+    Layout and licence from its record, https://zenodo.org/records/1188976: folders `Actor_01` to
     `Actor_24`, wherever they are, with files called `03-01-05-01-02-01-12.wav` for modality,
     channel, emotion, intensity, statement, repetition and actor.
 
@@ -447,7 +447,7 @@ _EMODB_EMOTIONS = {
 def read_emodb(folder: Path) -> Iterator[CollectionClip]:
     """EmoDB, the Berlin database of emotional speech: 535 sentences of ten actors, seven emotions.
 
-    Layout as its page says, http://emodb.bilderbar.info/docu: `wav` with files called `03a01Fa.wav`
+    Layout from its page, http://emodb.bilderbar.info/docu: `wav` with files named `03a01Fa.wav`
     for the actor, the text, the letter of the emotion in German, and the version. Its page states
     no licence.
 
@@ -468,15 +468,15 @@ def read_emodb(folder: Path) -> Iterator[CollectionClip]:
 
 _VOXCELEB_PERSON = re.compile(r"id\d{5}")
 _VOXCELEB_VIDEO = re.compile(r"[\w-]{11}", re.ASCII)
-_VOXCELEB_PLACE = 3  # of the person in a path, from its end
+_VOXCELEB_PLACE = 3  # index of the person in a path, from the end
 
 
 def read_voxceleb(folder: Path) -> Iterator[CollectionClip]:
     """VoxCeleb 1 and 2: speech of 1,251 and of 6,112 people in videos.
 
-    Layout as its page says, https://www.robots.ox.ac.uk/~vgg/data/voxceleb: `wav` (of VoxCeleb 2
+    Layout from its page, https://www.robots.ox.ac.uk/~vgg/data/voxceleb: `wav` (of VoxCeleb 2
     `aac`) with files called `id10001/1zcIwhmdeo4/00001.wav` for the person, the video at YouTube,
-    and the piece. Of the sound the page states no licence; the lists are CC BY 4.0.
+    and the piece. The page states no licence for the sound; the lists are CC BY 4.0.
 
     The category is the person, the source the video.
     """
@@ -500,12 +500,12 @@ _TAKE = re.compile(r"(?:[ _.-]\d{1,3}| ?\(\d{1,3}\))$")
 
 
 def read_folder(folder: Path) -> Iterator[CollectionClip]:
-    """Folder of one's own: a sub-folder for each label, any audio in it.
+    """Your own folder: a sub-folder for each label, with audio files in any format.
 
-    In a sub-folder, what is in a further folder is of one source: `coughing/anna/a.wav` and
-    `speech/anna/b.wav` are of `anna`. A file without such a folder is of the source that its name
-    says, without the number of a take at its end: `kettle_001.wav`, `kettle-2.wav` and `kettle
-    (3).wav` are of `kettle`.
+    Within a sub-folder, a further folder is one source: `coughing/anna/a.wav` and
+    `speech/anna/b.wav` have source `anna`. The source of a file outside such a folder is its name
+    without a trailing take number: `kettle_001.wav`, `kettle-2.wav` and `kettle (3).wav` have
+    source `kettle`.
 
     The name of each sub-folder is the category.
     """
@@ -529,7 +529,7 @@ class CollectionFormat(NamedTuple):
     Attributes
     ----------
     markers : tuple of str
-        Files or folders, or patterns of them, of which one is in every folder of the collection;
+        Files, folders or patterns; every folder of the collection has at least one of them;
         empty for any folder.
     """
 
@@ -562,15 +562,14 @@ NAMES = tuple(collection.name for collection in COLLECTIONS)
 
 
 def find_collection(name: str) -> CollectionFormat | None:
-    """Return the collection of a name; None if there is none."""
+    """Return a collection by name; None if there is none."""
     return next((each for each in COLLECTIONS if each.name == name), None)
 
 
 def check_folder(folder: Path, collection: CollectionFormat) -> None:
-    """Check that a folder looks as that of a collection.
+    """Check that a folder has the layout of a collection.
 
-    Raise `DataError` if there is no such folder, or it looks as another, or another version of
-    it.
+    Raise `DataError` if the folder is missing, or has the layout of another collection or version.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder")

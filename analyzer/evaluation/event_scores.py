@@ -35,18 +35,18 @@ class Events:
         return self.taken(np.flatnonzero(self.labels == label))
 
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
-        """Return some of the spans.
+        """Return a selection of the spans.
 
         Parameters
         ----------
         rows : np.ndarray, bool [shape=(n,)] or int [shape=(m,)]
-            Whether each is taken, or the rows of those that are, in their new order.
+            Boolean mask, or row numbers in their new order.
         """
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
 
 
 def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
-    """Return the spans of a labelling, with their labels as indices."""
+    """Return the spans of a labelling, with labels as indices."""
     indices = {name: i for i, name in enumerate(classes)}
     labels = np.fromiter(map(indices.__getitem__, labelling.labels), np.int64, len(labelling))
     return Events(labelling.starts, labelling.ends, labels)
@@ -54,7 +54,7 @@ def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
 
 @dataclass(frozen=True)
 class Detection:
-    """How well something was detected; None where it has no meaning."""
+    """Detection scores; None where undefined."""
 
     precision: float | None
     recall: float | None
@@ -65,9 +65,9 @@ class Detection:
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """How well the classes were detected."""
+    """Detection scores of the classes."""
 
-    f1: float | None  # of all classes counted together
+    f1: float | None  # micro-average over all classes
     precision: float | None
     recall: float | None
     macro_f1: float | None  # mean over the classes of the reference
@@ -76,11 +76,11 @@ class DetectionScores:
 
 @dataclass(frozen=True)
 class Detections:
-    """How well events were detected in some time."""
+    """Detection of events in an evaluated time."""
 
     segment_based: DetectionScores
     event_based: DetectionScores
-    # events of a class that overlap none of that class in the reference, for 24 hours
+    # per 24 hours: events that overlap no event of their class in the reference
     false_alarms_per_day: dict[str, float]
 
 
@@ -94,14 +94,14 @@ def detect(
     Parameters
     ----------
     reference, predicted : Events
-        From 0 on, as `laid_out` makes them.
+        From 0 on, as returned by `laid_out`.
     duration : int
         Evaluated time in nanoseconds.
 
     Raises
     ------
     DataError
-        If so many events start together that this is no labelling.
+        If too many events start together for a labelling.
     """
     return Detections(
         segment_based(reference, predicted, classes),
@@ -111,15 +111,16 @@ def detect(
 
 
 def laid_out(events: Events, spans: Spans) -> Events:
-    """Cut events to spans of time, and lay the spans out as recordings one after the other.
+    """Clip events to spans of time, and place the spans one after the other as recordings.
 
-    Every span begins on a whole second, and at least one second after the end of the last: no event
-    is compared with one of another span.
+    Every span starts on a full second, at least one second after the end of the previous span, so
+    that events of different spans are never compared.
 
     Returns
     -------
     Events
-        In nanoseconds from 0 on, in the order of `events`; an event may come in several pieces.
+        In nanoseconds from 0 on, in the order of `events`; an event may be split into several
+        pieces.
     """
     seconds = -((spans.starts - spans.ends) // NANOSECONDS) + 1
     places = (np.cumsum(seconds) - seconds) * NANOSECONDS
@@ -129,15 +130,15 @@ def laid_out(events: Events, spans: Spans) -> Events:
 
 
 def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
-    """Score second by second: a class is active in each second that one of its events touches.
+    """Score by the second: a class is active in each second that one of its events touches.
 
     These are the segment-based metrics of Mesaros et al., "Metrics for Polyphonic Sound Event
-    Detection", 2016, with segments of a second.
+    Detection", 2016, with segments of one second.
 
     Parameters
     ----------
     reference, predicted : Events
-        From 0 on, as `laid_out` makes them.
+        From 0 on, as returned by `laid_out`.
     """
     counts = []
     for label in range(len(classes)):
@@ -147,12 +148,12 @@ def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) 
 
 
 def _seconds(events: Events) -> Spans:
-    """Return the whole seconds that events touch."""
+    """Return the full seconds that events touch."""
     return joined(events.starts // NANOSECONDS, -(-events.ends // NANOSECONDS))
 
 
 def event_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
-    """Score event by event; each event is matched with at most one.
+    """Score by the event; each event is matched with at most one other.
 
     These are the event-based metrics of Mesaros et al. (2016). Two events match if their onsets are
     at most 0.2 s apart, and their offsets at most 0.2 s or half the length of the reference's,
@@ -161,12 +162,12 @@ def event_based(reference: Events, predicted: Events, classes: Sequence[str]) ->
     Parameters
     ----------
     reference, predicted : Events
-        From 0 on, as `laid_out` makes them.
+        From 0 on, as returned by `laid_out`.
 
     Raises
     ------
     DataError
-        If so many events start together that this is no labelling.
+        If too many events start together for a labelling.
     """
     counts = []
     for label in range(len(classes)):
@@ -203,14 +204,14 @@ def false_alarms_per_day(
     Parameters
     ----------
     reference, predicted : Events
-        From 0 on, as `laid_out` makes them.
+        From 0 on, as returned by `laid_out`.
     duration : int
         Evaluated time in nanoseconds, more than 0.
 
     Returns
     -------
     dict of str to float
-        By class: how many there are in 24 hours of evaluated time.
+        By class, per 24 hours of evaluated time.
     """
     alarms = (_false_alarms(reference.of(i), predicted.of(i)) for i in range(len(classes)))
     return {name: n * _DAY / duration for name, n in zip(classes, alarms, strict=True)}
@@ -224,7 +225,7 @@ def _false_alarms(reference: Events, predicted: Events) -> int:
 
 
 def _scores(counts: list[tuple[int, int, int]], classes: Sequence[str]) -> DetectionScores:
-    """Make scores of (right, in the reference, predicted) for each class."""
+    """Return scores from (correct, in the reference, predicted) for each class."""
     right, reference, predicted = np.sum(counts, axis=0).tolist()
     every = _detection(right, reference, predicted)
     per_class = {name: _detection(*c) for name, c in zip(classes, counts, strict=True)}
@@ -253,7 +254,7 @@ _MINUTE = 60 * NANOSECONDS
 
 
 class LabelRuns(NamedTuple):
-    """Time in which both labels stay what they are."""
+    """Runs of time with constant labels on both sides."""
 
     starts: Int64  # shape (n,)
     ends: Int64
@@ -261,63 +262,63 @@ class LabelRuns(NamedTuple):
     b: Int64
 
     def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "LabelRuns":
-        """Return some of the runs.
+        """Return a selection of the runs.
 
         Parameters
         ----------
         which : np.ndarray, bool [shape=(n,)] or int [shape=(m,)]
-            Whether each is taken, or the rows of those that are, in their new order.
+            Boolean mask, or row numbers in their new order.
         """
         return LabelRuns(*(column[which] for column in self))
 
 
 @dataclass(frozen=True)
 class ClassAmounts:
-    """How much of a class each side has in the time that both label."""
+    """Amounts of a class on each side, in the time that both label."""
 
     minutes_a: float
     minutes_b: float
-    minutes_both: float  # where both sides have it
+    minutes_both: float  # both sides have this class
     events_a: int  # segments
     events_b: int
 
 
 @dataclass(frozen=True)
 class Amounts:
-    """Agreement in some time that both label."""
+    """Agreement in the time that both label."""
 
     minutes: float
-    agreement: float  # share of it in which both say the same
-    kappa: float | None  # Cohen's; None where both say the same single class throughout
+    agreement: float  # share of time with the same label
+    kappa: float | None  # Cohen's; None if both have the same single class throughout
     per_class: dict[str, ClassAmounts]  # of the classes that occur
 
 
 @dataclass(frozen=True)
 class LabellingDifference:
-    """Two labellings compared."""
+    """Comparison of two labellings."""
 
     a: str  # name of the first labelling
     b: str
-    minutes_a: float  # what the first labels
+    minutes_a: float  # labelled by the first
     minutes_b: float
-    only_a: list[str]  # classes that the other does not know
+    only_a: list[str]  # classes that the other lacks
     only_b: list[str]
     classes: list[str]
     total: Amounts
     confusion: list[list[float]]  # minutes; the classes of a in rows, those of b in columns
-    days: dict[str, Amounts]  # by UTC day; an event belongs to the day it begins in
+    days: dict[str, Amounts]  # by UTC day; an event belongs to the day of its start
     disagreements: LabelRuns  # where they differ, longest first
 
 
 def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDifference:
     """Compare two labellings where both have a label.
 
-    What b has by another name (see `hearthlog.models.classes`) is called as a calls it.
+    Synonyms in b (see `hearthlog.models.classes`) take the names of a.
 
     Returns
     -------
     LabellingDifference
-        With Cohen's kappa; the classes are those of a, then those that only b has.
+        With Cohen's kappa; classes of a first, then classes only in b.
 
     Raises
     ------
@@ -352,7 +353,7 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDiffere
 
 
 def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
-    """Join successive pieces of two labellings while both labels stay the same.
+    """Merge successive pieces of two labellings with the same pair of labels.
 
     Parameters
     ----------
@@ -360,7 +361,7 @@ def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
         Of `a` and `b`, where both have a span; at least one piece. Pieces of a run may be a frame
         apart.
     a, b : Events
-        The spans behind its rows, labels as indices of the same classes.
+        The spans of its rows, with labels as indices of the same classes.
     """
     label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
     new = np.ones(len(pieces.starts), bool)
@@ -395,7 +396,7 @@ class _Counts:
         return _added(a, b, self._lengths, (self._classes, self._classes)) / _MINUTE
 
     def amounts(self, classes: Sequence[str], days: int | slice) -> Amounts:
-        """Sum up a day, or all of them."""
+        """Return the totals of one day, or of all days."""
         a, b, both, events_a, events_b = (
             np.atleast_2d(table[days]).sum(axis=0)
             for table in (*self._minutes, self._both, *self._events)
@@ -419,7 +420,7 @@ class _Counts:
 
 
 def _added(row: Int64, column: Int64, weight: Int64 | None, shape: tuple[int, int]) -> Float64:
-    """Add up weights, or count, in a table."""
+    """Sum weights, or counts, into a table."""
     places = row * shape[1] + column
     return np.bincount(places, weight, shape[0] * shape[1]).astype(np.float64).reshape(shape)
 

@@ -1,4 +1,4 @@
-"""A labelled log against a reference labelling of the same time."""
+"""Scores of a labelled log against a reference labelling of the same time."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,17 +37,17 @@ _LATEST = 1 << 62  # nanoseconds
 
 @dataclass(frozen=True)
 class LogEvaluation:
-    """How a labelled log fits a reference."""
+    """Scores of a labelled log against a reference."""
 
     # of frames of 50 ms; the groups are blocks of five minutes, or more in long references
     scores: Scores
     detections: Detections
-    reference_seconds: float  # what the reference labels
-    evaluated_seconds: float  # what of it the log has labelled too
-    # what of that has two labels in the reference; no part of the scores of frames
+    reference_seconds: float  # labelled by the reference
+    evaluated_seconds: float  # labelled by both
+    # evaluated seconds with two reference labels; excluded from frame scores
     ambiguous_seconds: float
-    # labels of the reference that the log does not know, and for how many evaluated seconds; no
-    # part of the scores of frames; whatever is predicted there is a false alarm
+    # evaluated seconds by reference label outside the log's classes; excluded from frame
+    # scores; any prediction there is a false alarm
     unknown_labels: Mapping[str, float]
 
 
@@ -56,9 +56,8 @@ def evaluate_labelling(
 ) -> LogEvaluation:
     """Compare labels where both the reference and the log have some.
 
-    Raise `DataError` if the two have no time in common; if the reference has no label that the
-    log knows, or no frame with a single one; or if so many events start together that this is
-    no labelling.
+    Raise `DataError` if the two have no time in common, if the reference has no label in the log's
+    classes or no frame with a single label, or if too many events start together for a labelling.
     """
     covered = joined(reference.starts, reference.ends, FRAME_NANOSECONDS)
     spans = common(covered, joined(predicted.starts, predicted.ends, FRAME_NANOSECONDS))
@@ -96,10 +95,9 @@ def evaluate_labelling(
 def _frames(
     reference: Events, predicted_events: Events, classes: Sequence[str]
 ) -> tuple[Scores, int]:
-    """Score the frames; return also how many have several labels in the reference.
+    """Score the frames; also return the number of frames with several reference labels.
 
-    Between two successive times at which anything changes, all frames are alike: they are
-    counted, not made.
+    Labels are constant between two successive change times, so frames are counted, not created.
     """
     end = int(reference.ends.max())
     block = max(_BLOCK, -(-end // _MOST_BLOCKS))
@@ -113,7 +111,7 @@ def _frames(
     )
     target, several = _single(reference, times, len(classes))
     predicted, _ = _single(predicted_events, times, len(classes))
-    # A frame belongs where its middle is.
+    # A frame belongs to the interval that contains its middle.
     weight = np.diff((times + FRAME_NANOSECONDS // 2 - 1) // FRAME_NANOSECONDS)
     ambiguous = int(weight[several & (predicted >= 0)].sum())
     rows = (target >= 0) & (target < len(classes)) & ~several & (predicted >= 0) & (weight > 0)
@@ -122,9 +120,9 @@ def _frames(
 
 
 def _single(events: Events, times: Int64, classes: int) -> tuple[Int64, NDArray[np.bool_]]:
-    """Return the label between each time and the next, and where there are several.
+    """Return the label between successive times, and where there are several.
 
-    It is -1 for none, and the number of classes for any that is none of them.
+    -1 means no label; the number of classes means a label outside the classes.
     """
     events = replace(events, labels=np.minimum(events.labels, classes))
     label = np.full(len(times) - 1, -1)
@@ -153,12 +151,12 @@ def _between(labelling: Labelling) -> str:
 
 @dataclass(frozen=True)
 class TopicLabelling:
-    """The labelling that some logs have on a topic of segments."""
+    """Labelling of some logs from one topic of segments."""
 
     topic: str
-    classes: tuple[str, ...]  # the labels there may be
+    classes: tuple[str, ...]  # possible labels
     labelling: Labelling
-    unfinished: tuple[Path, ...]  # logs that were not completed
+    unfinished: tuple[Path, ...]  # incomplete logs
 
     @property
     def microphone(self) -> str:
@@ -175,12 +173,13 @@ class TopicLabelling:
 def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     """Read the segments of a log, or of a folder of logs, and of their layers.
 
-    `Labellings.read` leaves out a damaged log; here it is an error, for scores do not show it.
+    `Labellings.read` skips a damaged log; here it is an error, because scores would not show the
+    gap.
 
     Parameters
     ----------
     topic : str, optional
-        The topic of the segments, such as `/mic/segment`; by default that of the only microphone.
+        Topic of the segments, such as `/mic/segment`; by default that of the only microphone.
 
     Raises
     ------
@@ -215,12 +214,12 @@ def _segment_topic(selection: LogSelection, asked: str | None) -> str:
 
 
 def read_reference(source: str, path: Path, microphone: str, scenario: str = "") -> Labelling:
-    """Read what a log is to be compared with.
+    """Read the reference for a log.
 
     Parameters
     ----------
     scenario : str, optional
-        Whose marks in the review layers are meant; empty for those of the sounds of the home.
+        Scenario of the marks in the review layers; empty for the sounds of the home.
 
     Raises
     ------

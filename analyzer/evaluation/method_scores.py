@@ -1,4 +1,4 @@
-"""Scores of a method of learning, cross-validated."""
+"""Cross-validated scores of a training method."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """How good a way to learn is."""
+    """Cross-validated scores."""
 
     folds: int
     scores: Scores
@@ -41,22 +41,22 @@ class CrossValidation:
 def evaluate_method(
     data: Dataset, method: Method, kind: Kind, progress: Progress
 ) -> CrossValidation:
-    """Cross-validate a way to learn.
+    """Cross-validate a training method.
 
     Parameters
     ----------
     kind : str
-        What is never on both sides of a fold: a `segment` (the paper's folds, which flatter, since
-        segments of one recording are alike), a `source`, or a `collection`, which is what a new
-        home is.
+        Unit that is never on both sides of a fold: a `segment` (the paper's folds, optimistic since
+        segments of one recording are alike), a `source`, or a `collection`, which is like a new
+        home.
     progress : callable
-        Told the share of the folds that is done, 0 to 1.
+        Receives the completed share of the folds, 0 to 1.
 
     Raises
     ------
     DataError
-        If all segments are alike, if the method wants augmented copies and its feature set has
-        none, and as `divide`.
+        If all segments are equal, if the method needs augmented copies and its feature set has
+        none, and as for `divide`.
     """
     check_varied(data)
     folds = divide(data, kind)
@@ -74,7 +74,7 @@ def evaluate_method(
 
 
 def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Float64) -> Float64:
-    """Return the probabilities of a classifier and heads together."""
+    """Return the probabilities of the mix of a classifier and heads."""
     inverse = inverse_temperature(decisions, data.target)
     known = np.array([name != UNKNOWN for name in data.classes])[data.target]
     way = Tried(folds, inverse * decisions, known)
@@ -82,12 +82,12 @@ def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Floa
 
 
 def divide(data: Dataset, kind: Kind) -> list[Fold]:
-    """Divide segments into folds that learn from some and are tried on the others.
+    """Divide segments into folds of training and test segments.
 
     Parameters
     ----------
     kind : str
-        What is never on both sides of a fold: a `segment`, a `source` or a `collection`.
+        Unit that is never on both sides of a fold: a `segment`, a `source` or a `collection`.
 
     Raises
     ------

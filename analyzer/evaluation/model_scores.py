@@ -1,4 +1,4 @@
-"""Scores of a model on labelled clips, and of two models compared."""
+"""Scores of a model on labelled clips, and comparison of two models."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -55,33 +55,33 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
 _LEAST = 1e-30
-_ROOM_SECONDS = 2  # longer than any label lasts by its window
+_ROOM_SECONDS = 2  # longer than the window extends any label
 _ROOM_DBFS = -80.0
 
 
 @dataclass(frozen=True)
 class ModelEvaluation:
-    """How good a model is on labelled clips."""
+    """Scores of a model on labelled clips."""
 
     scores: Scores  # of segments of a second; the groups are the source groups
     expected_calibration_error: float
     reliability: list[Bin]
     detections: Detections  # of clips in a quiet room
-    evaluated_seconds: float  # of what the detections are about
-    skipped: Mapping[str, int]  # why clips gave no segment, and how many
-    sources_learned: int  # sources of which the model has learned from a segment
-    left_out: Sequence[SkippedClip] = ()  # clips that could not be read, which `skipped` counts too
+    evaluated_seconds: float  # evaluated time of the detections
+    skipped: Mapping[str, int]  # number of clips without a segment, by reason
+    sources_learned: int  # sources in the model's training set
+    left_out: Sequence[SkippedClip] = ()  # unreadable clips, also counted in `skipped`
 
 
 def evaluate_model(
     model: Model, clips: Sequence[LabelledClip], scenario: Scenario, progress: Progress
 ) -> ModelEvaluation:
-    """Run a model on clips, and compare what it says with their labels.
+    """Run a model on clips, and compare its output with their labels.
 
     Parameters
     ----------
     progress : callable
-        Told the share of the clips that is done, 0 to 1.
+        Receives the completed share of the clips, 0 to 1.
 
     Raises
     ------
@@ -119,17 +119,17 @@ def evaluate_model(
 
 
 def fitted(scenario: Scenario, model: Model) -> Scenario:
-    """Return a scenario with the classes in the order of a model's probabilities.
+    """Return a scenario with classes in the order of a model's probabilities.
 
     Parameters
     ----------
     model : Model
-        Its class `unknown` is added where the scenario has none.
+        Class `unknown` of the model is added if the scenario lacks it.
 
     Raises
     ------
     DataError
-        As `check_classes`.
+        As for `check_classes`.
     """
     check_classes(model, scenario)
     labels = {**scenario_of(model).classes, **scenario.classes}
@@ -138,10 +138,7 @@ def fitted(scenario: Scenario, model: Model) -> Scenario:
 
 
 def check_classes(model: Model, scenario: Scenario) -> None:
-    """Raise DataError unless a model has the classes of a scenario, in any order.
-
-    Raise `DataError` if one of the two has a class that the other lacks.
-    """
+    """Raise `DataError` unless a model has the classes of a scenario, in any order."""
     lacking = [name for name in scenario.classes if name not in {*model.classes, UNKNOWN}]
     other = [name for name in model.classes if name not in {*scenario.classes, UNKNOWN}]
     if lacking or other:
@@ -157,12 +154,12 @@ def check_classes(model: Model, scenario: Scenario) -> None:
 
 
 def heads_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
-    """Return what the heads of a classifier say of segments, as `Classifier.classify` takes it.
+    """Return the outputs of heads for segments, as input of `Classifier.classify`.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64, or None
-        NaN of segments without an embedding; None without heads.
+        NaN for segments without an embedding; None without heads.
     """
     heads = classifier.embedding_heads
     if heads is None or not data.is_embedded.any():
@@ -178,19 +175,19 @@ def segment_probabilities(
     evidence: Float64 | None = None,
     by_heads: Float64 | None = None,
 ) -> Float64:
-    """Compute the probability of each class in each segment, by all windows in it.
+    """Compute the probability of each class in each segment over all its windows.
 
     Parameters
     ----------
     inputs : np.ndarray [shape=(n, places, width)], float32
-        As of `of_segments`.
+        As from `of_segments`.
     evidence, by_heads : np.ndarray [shape=(n, C)], float64, optional
-        As of `Classifier.classify`: of directions, and of heads.
+        As for `Classifier.classify`: from directions, and from heads.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
-        Geometric means over the windows, which sum to 1.
+        Geometric means over the windows, normalised to sum 1.
     """
     if evidence is not None:
         evidence = evidence.repeat(inputs.shape[1], axis=0)
@@ -202,10 +199,11 @@ def segment_probabilities(
 
 
 class _Listener:
-    """Collects the events of recordings that are laid out one after the other.
+    """Collects the events of recordings placed one after the other.
 
-    Each is played in a quiet room, so that a label which begins late or goes on after the sound is
-    an error. Silence is judged in the recording only; a model without it hears no room.
+    Each recording is played in a quiet room, so that a label that starts late or outlasts the sound
+    is an error. Silence is scored in the recording only; for a model without silence there is no
+    room.
 
     Attributes
     ----------
@@ -227,7 +225,7 @@ class _Listener:
         self._predicted: list[tuple[int, int, int]] = []
 
     def overhear(self, recordings: Iterable[Recording], scenario: Scenario) -> Iterator[Recording]:
-        """Add recordings that are on their way."""
+        """Add recordings, passing them through."""
         for recording in recordings:
             name = scenario.find(recording.label)
             if name is not None:
@@ -235,7 +233,7 @@ class _Listener:
             yield recording
 
     def _listen(self, recording: Recording, label: str) -> None:
-        """Add a recording of one label."""
+        """Add a recording with one label."""
         features = np.concatenate([self._room, recording.features, self._room])
         stamps = np.arange(len(features)) * FRAME_NANOSECONDS
         length = len(features) * FRAME_NANOSECONDS
@@ -254,14 +252,14 @@ class _Listener:
             else:
                 self._add(self._predicted, one.start, one.end, one.label)
         self.duration += length
-        self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # a second between two of them
+        self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # one second between recordings
 
     def _add(self, events: list[tuple[int, int, int]], start: int, end: int, label: int) -> None:
         if start < end:
             events.append((self._place + start, self._place + end, label))
 
     def _heard(self, recording: Recording, stamps: Int64) -> Embeddings:
-        """Return what a network hears of a recording, at the frames of the room around it."""
+        """Return the embeddings of a recording, at the frames of the room around it."""
         if recording.embedded is None or self._source is None:
             return NO_EMBEDDINGS
         windows = recording.embedded
@@ -281,7 +279,7 @@ class _Listener:
         return Floors(floors, floors, sound, converged=True)
 
     def detections(self) -> Detections:
-        """Score all of them."""
+        """Return the detection scores of all recordings."""
         reference, predicted = (
             Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._predicted)
         )
@@ -289,37 +287,36 @@ class _Listener:
 
 
 def _quiet_room(features: FeatureSet) -> Float32:
-    """Return the features of two seconds of a room in which nothing can be heard."""
+    """Return the features of two seconds of a silent room."""
     samples = _ROOM_SECONDS * SAMPLE_RATE
     return captured(steady_noise(samples, _ROOM_DBFS, np.random.default_rng(0)), features)
 
 
 @dataclass(frozen=True)
 class ComparedModel:
-    """One of the models."""
+    """Scores of one of the compared models."""
 
     name: str
     sha256: str
     scores: Scores
     expected_calibration_error: float
-    sources_learned: int  # sources of the data that it has learned from
+    sources_learned: int  # sources of the data in its training set
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two models on the same clips.
+    """Comparison of two models on the same clips.
 
     Attributes
     ----------
-    a, b : ComparedModel
     difference : F1Difference
         Macro F1 of b minus that of a.
     sources_left_out : int
-        One of the models has learned from these.
+        Number of sources in the training set of either model.
     held_out : bool
-        False if there are no others, and all were used.
+        False if there are no other sources, and all were used.
     skipped : mapping of str to int
-        Why recordings gave no segment, and how many.
+        Number of recordings without a segment, by reason.
     """
 
     a: ComparedModel
@@ -331,7 +328,7 @@ class Comparison:
 
     @property
     def clear(self) -> bool:
-        """Whether one is better: the interval of the difference does not include 0."""
+        """Whether one model is better: the interval of the difference excludes 0."""
         interval = self.difference.interval
         return interval is not None and not interval[0] <= 0.0 <= interval[1]
 
@@ -339,13 +336,12 @@ class Comparison:
 def compare_models(
     a: Model, b: Model, recordings: Iterable[Recording], scenario: Scenario
 ) -> Comparison:
-    """Run two models on the same segments of a second.
+    """Run two models on the same segments of one second.
 
-    Sources that one of them has learned from are left out.
+    Sources in the training set of either model are excluded.
 
     Parameters
     ----------
-    a, b : Model
     recordings : iterable of Recording
         With features of the set of both models.
     scenario : Scenario
@@ -401,10 +397,7 @@ def compare_models(
 
 
 def check_features(a: Model, b: Model) -> None:
-    """Check that two models can be compared on the same features.
-
-    Raise `DataError` if they are for different feature sets.
-    """
+    """Raise `DataError` if two models are for different feature sets."""
     own, theirs = (one.description.feature_set for one in (a, b))
     if own != theirs:
         raise DataError(

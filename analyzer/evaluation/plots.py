@@ -1,4 +1,4 @@
-"""Plots of scores, and of scenes."""
+"""Plots of scores and scenes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,7 +40,7 @@ def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) 
 
 
 def new_figure(inches: tuple[float, float], title: str) -> Figure:
-    """Make an empty figure of a width and a height."""
+    """Return an empty figure of a width and a height."""
     figure = Figure(figsize=inches, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
@@ -57,7 +57,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def plot_names(classes: Sequence[str]) -> list[str]:
-    """Return the names of classes as they stand in figures."""
+    """Return class names as printed in figures."""
     return [shortened(name, _NAME_WIDTH).replace("$", r"\$") for name in classes]
 
 
@@ -121,7 +121,7 @@ _MOST_ROWS = 3
 
 
 def save_scenes(path: Path, title: str, found: ScenesEvaluation) -> None:
-    """Draw F1 and false alarms by class, and the first scene: the truth above its labels.
+    """Draw F1 and false alarms by class, and the first scene: truth above labels.
 
     Raise `LogError` if the file exists, or cannot be written.
     """
@@ -152,7 +152,7 @@ def save_scenes(path: Path, title: str, found: ScenesEvaluation) -> None:
 
 
 def _lane(axes: Any, found: ScenesEvaluation, row: int) -> None:
-    """Draw ten minutes of a scene."""
+    """Draw ten minutes of a labelled scene."""
     for base, labelling in ((1, found.truth), (0, found.found)):
         for name in set(labelling.labels) - {SILENCE}:
             spans = _minutes(labelling, name)

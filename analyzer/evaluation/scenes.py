@@ -1,4 +1,4 @@
-"""Scenes: clips over steady noise, recorded as by a microphone, and scores of a model on them."""
+"""Scenes: clips over steady noise as a microphone records them, and model scores on them."""
 
 import random
 import tempfile
@@ -52,17 +52,17 @@ _SINGLE_SECONDS = 0.3
 _SLOPES = {"pink": 0.5, "brown": 1.0}
 _LOWEST_HERTZ = np.float32(20.0)  # below it the spectrum is flat
 _AT_ONCE = 1 << 20
-_SECONDS = (3.0, 10.0)  # of a sound at most
+_SECONDS = (3.0, 10.0)  # limits of the maximum length of a sound
 _PAUSES = (0.5, 2.0, 6.0)  # seconds between two sounds
 _SINGLE_PAUSES = (2.0, 8.0)
 _MOST_SINGLE = 120
 _BEFORE, _AFTER = 2.0, 5.0  # seconds of noise before the first sound and after the last
-_LAST = 12.0  # seconds before the end in which no sound begins
-_TAPER = 0.1  # power of a Hann window: faded in and out without losing loudness
+_LAST = 12.0  # seconds before the end without a start of a sound
+_TAPER = 0.1  # power of a Hann window: fades in and out without loss of loudness
 
 
 class Span(NamedTuple):
-    """What sounds in some time; seconds from the start of the scene."""
+    """A labelled span; seconds from the start of the scene."""
 
     start: float
     end: float
@@ -70,14 +70,14 @@ class Span(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Sound whose labels are known.
+    """Sound with its true labels.
 
     Attributes
     ----------
     samples : np.ndarray [shape=(n,)], float32
         At 16 kHz, -1 to 1.
     truth : list of Span
-        One after the other without gaps; silence lies between the sounds.
+        Successive spans without gaps; silence lies between the sounds.
     """
 
     samples: Float32
@@ -85,12 +85,12 @@ class Scene(NamedTuple):
 
     @property
     def sounds(self) -> list[Span]:
-        """What is not silence."""
+        """Spans other than silence."""
         return [span for span in self.truth if span.label != SILENCE]
 
 
 def background(seconds: float, level: float, colour: Colour, seed: int) -> Float32:
-    """Make the noise of a scene.
+    """Generate the noise of a scene.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ def _parts(noise: Float32) -> list[Float32]:
 
 
 def _coloured(noise: Float32, slope: float) -> Float32:
-    """Let the amplitude of noise fall with the frequency to a power; the noise is overwritten."""
-    spectrum = rfft(noise, overwrite_x=True)  # in single precision, as an hour of noise is long
+    """Shape the amplitude of noise to fall with a power of the frequency, in place."""
+    spectrum = rfft(noise, overwrite_x=True)  # single precision, because an hour of noise is large
     frequencies = np.arange(len(spectrum), dtype=np.float32) * np.float32(SAMPLE_RATE / len(noise))
     spectrum /= np.maximum(frequencies, _LOWEST_HERTZ) ** np.float32(slope)
     coloured: Float32 = irfft(spectrum, len(noise), overwrite_x=True)
@@ -136,23 +136,23 @@ def compose(
     seed: int,
     gain: float = 0.0,
 ) -> Scene:
-    """Lay clips over noise, 0.5, 2 or 6 s apart, 3 to 10 s of each at most.
+    """Place clips over noise, 0.5, 2 or 6 s apart, at most 3 to 10 s of each.
 
     Parameters
     ----------
     clips : mapping of str to sequence
-        The clips of each label, which are all as likely; at least one label, each with a clip.
+        Clips by label; labels are equally likely. At least one label, each with a clip.
     read : callable
-        Gives the samples of a clip at 16 kHz, not none; one clip is held at a time.
+        Returns the samples of a clip at 16 kHz, at least one; one clip is in memory at a time.
     noise : np.ndarray [shape=(n,)], float32
-        As of `background`; it is overwritten.
+        As from `background`; overwritten.
     gain : float
-        Of the clips, in dB.
+        Gain of the clips in dB.
 
     Raises
     ------
     DataError
-        If there is no time for a sound.
+        If the scene is too short for a sound.
     """
     rng = random.Random(seed)  # noqa: S311  no secret
 
@@ -174,7 +174,7 @@ def compose_single(  # noqa: PLR0913, PLR0917
     seed: int,
     gain: float = 0.0,
 ) -> Scene:
-    """Lay up to 120 single short sounds of one label over noise, 2 to 8 s apart.
+    """Place up to 120 single short sounds of one label over noise, 2 to 8 s apart.
 
     Each is the loudest 0.3 s of a clip.
 
@@ -186,13 +186,13 @@ def compose_single(  # noqa: PLR0913, PLR0917
     Raises
     ------
     DataError
-        If there is no time for a sound.
+        If the scene is too short for a sound.
     """
     rng = random.Random(seed)  # noqa: S311  no secret
 
     def sounds() -> Iterator[tuple[str, Float32, float]]:
         while True:
-            rng.choice([label])  # the same draws as of a scene
+            rng.choice([label])  # same random draws as for a scene
             sound = loudest(read(rng.choice(clips)), _SINGLE_SECONDS)
             yield label, sound, rng.uniform(*_SINGLE_PAUSES)
 
@@ -200,7 +200,7 @@ def compose_single(  # noqa: PLR0913, PLR0917
 
 
 def loudest(sound: Float32, seconds: float) -> Float32:
-    """Return the loudest part of a sound, faded in and out.
+    """Return the loudest part of a sound with fades at both ends.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def loudest(sound: Float32, seconds: float) -> Float32:
 
 
 def _laid(sounds: Iterator[tuple[str, Float32, float]], noise: Float32, gain: float) -> Scene:
-    """Lay (label, samples, seconds of pause behind it) over noise, while there is time."""
+    """Place (label, samples, seconds of pause after it) over noise until the scene is full."""
     last, now = len(noise) / SAMPLE_RATE - _LAST, _BEFORE
     if last <= now:
         raise DataError(
@@ -225,7 +225,7 @@ def _laid(sounds: Iterator[tuple[str, Float32, float]], noise: Float32, gain: fl
             f"than {_BEFORE + _LAST:g} s"
         )
     truth: list[Span] = []
-    end = 0.0  # of the sound before
+    end = 0.0  # end of the previous sound
     while now < last and (drawn := next(sounds, None)):
         label, sound, pause = drawn
         start = int(now * SAMPLE_RATE)
@@ -239,25 +239,25 @@ def _laid(sounds: Iterator[tuple[str, Float32, float]], noise: Float32, gain: fl
     return Scene(samples, [*truth, Span(end, len(samples) / SAMPLE_RATE, SILENCE)])
 
 
-_START = 1_772_323_200 * NANOSECONDS  # of every scene; any full hour does
+_START = 1_772_323_200 * NANOSECONDS  # of every scene; any full hour works
 _APART = 24 * 3600 * NANOSECONDS
 _WRITTEN_AT_ONCE = 1 << 20  # samples
 _HOURS_A_DAY = 24
-_MOST_SECONDS = 60  # of a clip that are read
+_MOST_SECONDS = 60  # read from a clip
 
 Clips = dict[str, list[LabelledClip]]
 
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """How scenes are composed.
+    """Options of scene composition.
 
     Attributes
     ----------
     floor : float
         Level of the noise in dBFS.
     gain : float
-        Of the clips, in dB.
+        Gain of the clips in dB.
     """
 
     scenes: int = 3
@@ -270,7 +270,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class SceneScores:
-    """How good the labels of one scene are."""
+    """Scores of the labels of one scene."""
 
     seed: int
     macro_f1: float  # of frames
@@ -280,12 +280,12 @@ class SceneScores:
 
 @dataclass(frozen=True)
 class SingleCoughs:
-    """What became of single coughs of 0.3 s.
+    """Detection of single coughs of 0.3 s.
 
     Attributes
     ----------
     found : float
-        Share of them that a label of coughing overlaps.
+        Share of coughs that overlap a label of coughing.
     """
 
     coughs: int
@@ -296,16 +296,16 @@ class SingleCoughs:
 
 @dataclass(frozen=True)
 class ScenesEvaluation:
-    """How good a model is on scenes.
+    """Scores of a model on scenes.
 
     Attributes
     ----------
     scores : Scores
         Of frames of 50 ms in all scenes; the groups are blocks of five minutes.
     coughs : SingleCoughs or None
-        None where the model has no such class, or there is no clip of it.
+        None without a class or a clip of coughing.
     truth, found : Labelling
-        Of the first scene, for pictures; in nanoseconds from its start.
+        Of the first scene, for plots; in nanoseconds from its start.
     """
 
     scores: Scores
@@ -337,13 +337,13 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
     Parameters
     ----------
     progress : callable
-        Told the share of the scenes that is done, 0 to 1.
+        Receives the completed share of the scenes, 0 to 1.
 
     Raises
     ------
     DataError
-        If the classes of the model are not those of the scenario, if no clip can be laid, or if a
-        scene has no time for a sound.
+        If the classes of the model are not those of the scenario, if no clip can be placed, or if a
+        scene is too short for a sound.
     LogError, OSError
         If there is no room for a scene in the folder of temporary files.
     """
@@ -367,7 +367,7 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
         recorder = _Recorder(watch, progress, options.scenes * (2 if coughs else 1))
         for seed in range(options.seed, options.seed + options.scenes):
             noise = partial(background, options.seconds, options.floor, options.colour, seed)
-            # Made in the call, so that one scene is held at a time.
+            # Created in the call, so that one scene is in memory at a time.
             spans, found = recorder.record(compose(by_label, _read, noise(), seed, options.gain))
             sounds += len(_without_silence(spans))
             truth = [span._replace(label=scenario.find(span.label) or silence) for span in spans]
@@ -408,14 +408,14 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
 
 
 def alarms_per_hour(detections: Detections) -> float:
-    """Return the false alarms of all classes in an hour."""
+    """Return the false alarms of all classes per hour."""
     return sum(detections.false_alarms_per_day.values()) / _HOURS_A_DAY
 
 
 def _usable(
     clips: Sequence[LabelledClip], scenario: Scenario
 ) -> tuple[Clips, dict[str, int], list[SkippedClip]]:
-    """Return the clips that are laid, by label, how many others there are, and which are faulty."""
+    """Return usable clips by label, the number of other clips, and the faulty clips."""
     chosen: Clips = {}
     left_out: list[SkippedClip] = []
     skipped: Counter[str] = Counter()
@@ -437,7 +437,7 @@ def _usable(
 
 
 def _fault(clip: LabelledClip) -> str:
-    """Say why the part of a clip that is laid cannot be read; empty if it can."""
+    """Return the read error of the used part of a clip; empty if there is none."""
     faults: list[str] = []
     end = min(clip.end, clip.start + _MOST_SECONDS)
     try:
@@ -459,14 +459,14 @@ def _read(clip: LabelledClip) -> Float32:
 
 
 def _sources_learned(model: Model, clips: Sequence[LabelledClip], scenario: Scenario) -> int:
-    """Count the source groups of which a model has learned from a segment."""
+    """Count the source groups with a segment in a model's training set."""
     features = feature_set(model.description.feature_set)
     recordings = clip_recordings(clips, scenario, ignore_progress, features)
     return len(learned_groups(model, cut_recordings(recordings, scenario, features)))
 
 
 class _Recorder:
-    """Records scenes with one model, and reports how much of all of them is done."""
+    """Records scenes with one model, and reports the progress over all scenes."""
 
     def __init__(self, watch: ModelWatch, progress: Progress, scenes: int) -> None:
         self._watch = watch
@@ -475,7 +475,7 @@ class _Recorder:
         self._done = 0
 
     def record(self, scene: Scene) -> tuple[list[Span], Labelling]:
-        """Return the truth of a scene, and what is labelled in it, in ns from its start."""
+        """Return the true and the predicted labels of a scene, in ns from its start."""
 
         def report(share: float) -> None:
             self._progress((self._done + share) / self._scenes)
@@ -522,7 +522,7 @@ def _moved(labelling: Labelling, by: int) -> Labelling:
 
 
 def _apart(labellings: Sequence[Labelling]) -> Labelling:
-    """Make one labelling of those of several scenes, which have no time in common."""
+    """Merge the labellings of several scenes into one, without overlap in time."""
     moved = [_moved(one, number * _APART) for number, one in enumerate(labellings)]
     starts, ends, labels = (
         np.concatenate([getattr(one, name) for one in moved])
@@ -532,7 +532,7 @@ def _apart(labellings: Sequence[Labelling]) -> Labelling:
 
 
 def _single_coughs(scenes: Sequence[tuple[list[Span], Labelling]], silence: str) -> SingleCoughs:
-    """Look for single coughs in what was labelled."""
+    """Find single coughs in a labelling."""
     count, others, lengths = 0, 0, []
     for spans, found in scenes:
         coughs = _without_silence(spans)

@@ -1,1 +1,1 @@
-"""Gate: the changes a model would make in a home, checked for damage before it labels there."""
+"""Gate: checks of the changes by a model in a home, before the model labels there."""

@@ -1,4 +1,4 @@
-"""Comparison of two models in a home: over its recent time, and of a candidate on trial."""
+"""Comparison of two models in a home: over its recent time, and for a candidate on trial."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -48,20 +48,20 @@ from hearthlog.schemas.messages.topics import CANDIDATE, LIVE
 
 SURE = 0.9  # probability
 _REFERENCE_SECONDS = 3_600.0
-_LEARNED_SECONDS = 900.0  # of the marks that a new class is from, and of what was left alone
+_LEARNED_SECONDS = 900.0  # of the marks of a new class, and of confirmed labels
 _NEAR = 60 * NANOSECONDS
 _MOST = 0.5  # of a sound
 
 
 class PairedAccuracy(NamedTuple):
-    """Known sounds, and how many of them each model gives the right label for most of their time.
+    """Sounds of known label, and those labelled correctly for most of their time by each model.
 
     Attributes
     ----------
     before, after : int
-        Right in the first model, in the second.
+        Correct in the first model, in the second.
     gained, lost : int
-        Right in the second alone, in the first alone.
+        Correct in the second alone, in the first alone.
     """
 
     sounds: int = 0
@@ -85,21 +85,21 @@ class HomeComparison:
     Attributes
     ----------
     recorded : float
-        Minutes that there are in all.
+        Total recorded minutes.
     changes : LabelChanges
-        From the first model to the second, in a mean day, or in all if less than a day is recorded.
+        From the first model to the second, per mean day, or in total if less than a day is
+        recorded.
     sure : np.ndarray [shape=(C, C)], float64
-        As `changes.minutes`, of the time in which the first model is sure.
+        As `changes.minutes`, for the time in which the first model is sure.
     random, marks : PairedAccuracy
-        Sounds of the minutes that were drawn at random; of other marks that neither has learned
-        from.
+        Sounds of the minutes drawn at random; of other marks outside both training sets.
     quiet : PairedAccuracy
-        The silences of the minutes that were drawn at random.
+        Silences of the minutes drawn at random.
     taught : frozenset of str
-        Classes that the second model has from marks of the home, and the first has not.
+        Classes that the second model has from marks of the home, and the first lacks.
     known : mapping of (str, str, str) to int
-        Known sounds, also those that were learned from, by the class that a person gives them, and
-        those of the first and of the second model; empty if the second has not learned here.
+        Sounds of known label, including training sounds, by reviewed class, class of the first
+        model and class of the second; empty if the second was not trained here.
     """
 
     minutes: float
@@ -120,14 +120,14 @@ def gather_evidence(
     logs: Sequence[RecentLog],
     progress: Progress = ignore_progress,
 ) -> HomeComparison:
-    """Run two models over a sample of the recent time of a home, and over its known sounds.
+    """Run two models over a sample of a home's recent time, and over its known sounds.
 
     Parameters
     ----------
     before, after : Model
-        Of the same feature set; the second would take the place of the first.
+        Of the same feature set; the second would replace the first.
     progress : callable, optional
-        Is told the share of the sound that is done, 0 to 1.
+        Receives the completed share of the sound, 0 to 1.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def gather_evidence(
 
 
 def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> PairedAccuracy:
-    """Run two models over the sounds of the minutes that were drawn at random alone.
+    """Run two models over the sounds of the minutes drawn at random only.
 
     Raise `ModelError` as `gather_evidence`.
     """
@@ -192,7 +192,7 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> P
 
 
 def _taught(models: TwoModels, after: Model) -> frozenset[str]:
-    """Name the classes that the second model has from marks of the home, and the first has not."""
+    """Return the classes that the second model has from marks of the home, and the first lacks."""
     training = after.description.training_data
     of_home, elsewhere = (
         {name for name, amount in amounts.items() if amount.segments}
@@ -208,7 +208,7 @@ def _is_in(spans: Spans, sound: KnownSound) -> bool:
 def _places(
     known: KnownSounds, most: float = _REFERENCE_SECONDS
 ) -> list[tuple[LogSpan, list[KnownSound]]]:
-    """Join sounds that are near each other, so that they are labelled at once; the latest ones."""
+    """Merge nearby sounds, to label them at once; the latest ones."""
     places: list[tuple[LogSpan, list[KnownSound]]] = []
     by_microphone = (
         (log.path, name, [sound for sound in sounds if sound.microphone == name])
@@ -221,14 +221,14 @@ def _places(
         for row, (start, end) in enumerate(zip(*(edge.tolist() for edge in times), strict=True)):
             inside = [sound for sound, own in zip(sounds, rows, strict=True) if own == row]
             places.append((LogSpan(log, start, end, microphone), inside))
-    # What was drawn at random goes first, then the latest.
+    # Random minutes first, then the latest.
     places.sort(key=lambda place: (any(s.random for s in place[1]), place[0].start), reverse=True)
     seconds = np.cumsum([(part.end - part.start) / NANOSECONDS for part, _ in places])
     return places[: int(np.searchsorted(seconds, most, side="right"))]
 
 
 class _Outcome(NamedTuple):
-    """A known sound: its class, and the one that each model gives it for most of its time."""
+    """A known sound: its true class, and the class by each model for most of its time."""
 
     random: bool
     label: str
@@ -239,9 +239,9 @@ class _Outcome(NamedTuple):
 def _outcomes(
     sounds: Sequence[KnownSound], frames: PairedFrames, classes: Sequence[str]
 ) -> Iterator[_Outcome]:
-    """Yield what two models make of known sounds that were labelled; classes are `classes`' names.
+    """Yield the outcomes of two models for labelled known sounds; named as in `classes`.
 
-    A name is empty where no class has most of the sound.
+    A name is empty if no class has most of the sound.
     """
     names = translation({sound.label for sound in sounds}, classes)
     for sound in sounds:
@@ -259,7 +259,7 @@ def _outcomes(
 
 
 def _right(outcomes: Iterable[_Outcome]) -> PairedAccuracy:
-    """Count the sounds that each model is right about."""
+    """Count the sounds that each model labels correctly."""
     pairs = [(one.before == one.label, one.after == one.label) for one in outcomes]
     return PairedAccuracy(
         len(pairs),
@@ -280,9 +280,9 @@ class Trial:
     Attributes
     ----------
     random, marks : PairedAccuracy
-        Known sounds of the minutes that were drawn at random, and other marks.
+        Known sounds of the minutes drawn at random, and other marks.
     quiet : PairedAccuracy
-        The silences of the minutes that were drawn at random.
+        Silences of the minutes drawn at random.
     """
 
     champion: str
@@ -297,7 +297,7 @@ class Trial:
 
 
 def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> Trial:
-    """Compare the latest candidate with the champion beside which it labelled last.
+    """Compare the latest candidate with the champion that labelled next to it last.
 
     Raise `DataError` if no candidate labelled in these logs, or both models not long enough for
     a segment, or there are several microphones. Raise `LogError` if there is no log.
@@ -344,10 +344,10 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
 
 
 def gain_interval(right: PairedAccuracy) -> tuple[float, float]:
-    """Return the 95 % interval of how often the second model is the one that is right.
+    """Return the 95 % interval of the share of sounds that only the second model gets right.
 
-    Of the sounds on which one model alone is right; by a beta distribution with the prior of
-    Jeffreys. 0.5 is no difference.
+    The share is of sounds that exactly one model labels correctly; beta distribution with Jeffreys
+    prior. 0.5 means no difference.
     """
     low, high = (beta_quantile(right.gained + 0.5, right.lost + 0.5, share) for share in _ENDS)
     return low, high
@@ -369,7 +369,7 @@ def _records(folders: Sequence[Path], losses: list[str]) -> Iterable[tuple[Path,
 def _right_on_trial(
     sounds: Sequence[KnownSound], before: Labelling, after: Labelling
 ) -> PairedAccuracy:
-    """Count the sounds whose label a model gives to most of their time, as far as it labelled."""
+    """Count the sounds that a model labels correctly for most of the time that it labelled."""
     first, second = (_agrees(sounds, labels) for labels in (before, after))
     both = _labelled(sounds, before) & _labelled(sounds, after)
     first, second = first[both], second[both]
@@ -398,7 +398,7 @@ def _labelled(sounds: Sequence[KnownSound], labels: Labelling) -> Bool:
 
 
 def _mostly(sounds: Sequence[KnownSound], starts: Int64, ends: Int64) -> Bool:
-    """Tell whether spans cover more than half of each sound."""
+    """Return whether spans cover more than half of each sound."""
     spans = joined(starts, ends)
     covered = [
         int(lengths(spans, np.array([sound.start, sound.end]))[0]) if len(spans.starts) else 0

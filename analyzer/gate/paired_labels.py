@@ -36,22 +36,22 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 _FLOOR_WARM_UP = 150 * NANOSECONDS
 _LABELS_WARM_UP = 5 * NANOSECONDS
-_BEHIND = 5 * NANOSECONDS  # sound after the part that its last labels depend on
+_BEHIND = 5 * NANOSECONDS  # sound after the part that influences its last labels
 
 
 class PairedFrames(NamedTuple):
-    """Frames that two models have labelled.
+    """Frames with labels of two models.
 
     Attributes
     ----------
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
     before, after : np.ndarray [shape=(n,)], int
-        Indices of the classes of the segments of each model that the frames lie in.
+        Class indices of the segments of each model around the frames.
     confidence : np.ndarray [shape=(n,)], float32
-        Probability that the first model gives to its label.
+        Probability of the first model's label.
     weight : np.ndarray [shape=(n,)], float64
-        How many frames of the home's time each stands for.
+        Number of frames of the home's time that each frame represents.
     """
 
     stamps: Int64
@@ -71,7 +71,7 @@ NO_FRAMES = PairedFrames(
 
 
 def joined_frames(several: Sequence[PairedFrames]) -> PairedFrames:
-    """Put frames behind each other."""
+    """Concatenate frames."""
     columns = zip(NO_FRAMES, *several, strict=True)
     return PairedFrames(*(np.concatenate(column) for column in columns))
 
@@ -82,7 +82,7 @@ class TwoModels:
     Attributes
     ----------
     classes : list of str
-        Those of the first model, then others of the second.
+        Classes of the first model, then other classes of the second.
     """
 
     def __init__(self, before: Model, after: Model) -> None:
@@ -149,19 +149,19 @@ def _labelled(
 
 
 A_DAY = " a day"
-_LEAST_MINUTES = 0.5  # of a change that is told
+_LEAST_MINUTES = 0.5  # of a reported change
 
 
 class LabelChange(NamedTuple):
-    """Time that one labelling gives to a class and the other to another class."""
+    """Time with one class in one labelling and another class in the other."""
 
     before: str
     after: str
     minutes: float
-    each: str  # a word for the time they are of, as in `LabelChanges`
+    each: str  # time unit of the minutes, as in `LabelChanges`
 
     def __str__(self) -> str:
-        """Say it: `20 h 15 min a day from silence to household sounds`."""
+        """Format it as `20 h 15 min a day from silence to household sounds`."""
         before, after = class_words(self.before), class_words(self.after)
         return f"{time_words(self.minutes)}{self.each} from {before} to {after}"
 
@@ -173,9 +173,9 @@ class LabelChanges:
     Attributes
     ----------
     minutes : np.ndarray [shape=(C, C)], float64
-        That have the class of the row in the first labelling and that of the column in the second.
+        With the row's class in the first labelling and the column's class in the second.
     each : str, optional
-        ` a day` if the minutes are of a mean day; empty if they are of all that was recorded.
+        ` a day` for minutes of a mean day; empty for the total recorded minutes.
     """
 
     classes: Sequence[str]
@@ -193,7 +193,7 @@ class LabelChanges:
         return self.minutes.sum(axis=0)
 
     def pairs(self) -> list[LabelChange]:
-        """List the changes of half a minute or more, the longest first."""
+        """Return the changes of half a minute or more, the longest first."""
         told = (self.minutes >= _LEAST_MINUTES) & ~np.eye(len(self.classes), dtype=bool)
         places = np.argwhere(told)
         changes = [
@@ -203,7 +203,7 @@ class LabelChanges:
         return sorted(changes, key=lambda change: -change.minutes)
 
     def words(self, minutes: float) -> str:
-        """Write some of the minutes: `20 h 15 min a day`."""
+        """Format minutes as `20 h 15 min a day`."""
         return time_words(minutes) + self.each
 
 
@@ -221,7 +221,7 @@ def changes_of_frames(
     before, after : np.ndarray [shape=(n,)], int
         Indices of the classes of the same frames in both labellings.
     minutes : np.ndarray [shape=(n,)], float64
-        That each frame stands for.
+        Minutes that each frame represents.
     """
     counts = np.bincount(before * len(classes) + after, minutes, len(classes) ** 2)
     table = counts.reshape(len(classes), len(classes)).astype(np.float64)
@@ -229,19 +229,19 @@ def changes_of_frames(
 
 
 def changes_of_labellings(difference: LabellingDifference) -> LabelChanges:
-    """Count the changes of two labellings that were compared, in a mean day of what both label."""
+    """Count the changes between two compared labellings, per mean day that both label."""
     minutes = np.array(difference.confusion, np.float64)
     return LabelChanges(difference.classes, minutes / len(difference.days))
 
 
 def class_words(name: str) -> str:
-    """Name a class in the middle of a sentence."""
+    """Format a class name for the middle of a sentence."""
     row = None if name == SILENCE else find_class(name)
     return name.replace("_", " ") if row is None else row.words.lower()
 
 
 def time_words(minutes: float) -> str:
-    """Write a length of time: `20 h 15 min`, `0.7 min`."""
+    """Format a duration: `20 h 15 min`, `0.7 min`."""
     if minutes < 10:
         return f"{minutes:.1f} min"
     hours, rest = divmod(round(minutes), 60)
@@ -252,7 +252,7 @@ KnownSounds = list[tuple[RecentLog, list[KnownSound]]]
 
 
 def known_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
-    """Read the sounds of each log whose labels are known."""
+    """Read the sounds of known label of each log."""
     known, paths = [], [log.path for log in logs]
     for place, log in enumerate(logs, 1):
         try:
@@ -263,7 +263,7 @@ def known_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
 
 
 def learned_by(before: Model, after: Model, known: KnownSounds) -> Spans:
-    """Return the time that one of two models has learned from."""
+    """Return the training time of two models together."""
     chosen = [(s.start, s.end) for _, sounds in known for s in sounds if not s.random]
     marked = spans_of(chosen)
     both = [learned_time(model, marked) for model in (before, after)]
@@ -272,19 +272,19 @@ def learned_by(before: Model, after: Model, known: KnownSounds) -> Spans:
 
 
 def unlearned_sample(logs: Sequence[RecentLog], learned: Spans) -> list[WeightedPart]:
-    """Choose parts of the time that no model has learned from."""
+    """Choose parts of the time outside the training set of any model."""
     return choose(unlearned_time(logs, learned), sounding_time(logs))
 
 
 def label_parts(
     models: TwoModels, parts: Sequence[WeightedPart], losses: list[str], progress: Progress
 ) -> Iterator[PairedFrames]:
-    """Label one part after the other; of one that cannot be read there are no frames.
+    """Label one part after the other; an unreadable part has no frames.
 
     Parameters
     ----------
     progress : callable
-        Is told the share of the parts that is done, 0 to 1.
+        Receives the completed share of the parts, 0 to 1.
     """
     for i, (part, weight) in enumerate(parts):
         try:
@@ -299,12 +299,12 @@ def label_parts(
 def changes_of_sample(
     classes: Sequence[str], frames: PairedFrames, logs: Sequence[RecentLog], sure: float = 0.0
 ) -> LabelChanges:
-    """Count what changes in a mean day, or in all if less than a day is recorded.
+    """Count the changes per mean day, or in total if less than a day is recorded.
 
     Parameters
     ----------
     sure : float, optional
-        Probability: only frames count of which the first model is as sure.
+        Minimum probability of the first model's label for a frame to count.
     """
     share = frames.weight / max(frames.weight.sum(), 1.0)
     day = minutes_a_day(logs)
@@ -316,13 +316,13 @@ def changes_of_sample(
 
 @dataclass(frozen=True, eq=False)
 class ChangedTime:
-    """Where two models differ, in the sample that a model is judged by.
+    """Spans in which two models differ, in the sample for the promotion check.
 
     Attributes
     ----------
     spans : Events
-        In the order of time; the label is the row of the first model's class in `changes` times
-        their number, and the column of the second one's.
+        In order of time; the label is the row of the first model's class in `changes` times
+        the number of classes, plus the column of the second model's class.
     """
 
     spans: Events
@@ -337,12 +337,12 @@ def find_changed_time(
     microphone: str,
     progress: Progress = ignore_progress,
 ) -> ChangedTime:
-    """Run two models over the sample of the recent time of a home, as `gather_evidence` does.
+    """Run two models over the sample of a home's recent time, as `gather_evidence` does.
 
     Parameters
     ----------
     progress : callable, optional
-        Is told the share of the sound that is done, 0 to 1.
+        Receives the completed share of the sound, 0 to 1.
 
     Raises
     ------
@@ -362,7 +362,7 @@ def find_changed_time(
 
 
 def _differing(frames: PairedFrames, classes: int) -> Events:
-    """Join successive frames that change in the same way."""
+    """Merge successive frames with the same change."""
     order = np.argsort(frames.stamps)
     stamps, before, after = (column[order] for column in frames[:3])
     pairs = before * classes + after

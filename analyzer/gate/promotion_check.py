@@ -34,28 +34,28 @@ from hearthlog.models.modelfile.registry import (
 from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 
-LEAST_MINUTES = 10.0  # of sound to judge by
+LEAST_MINUTES = 10.0  # minimum sound for a decision
 _SILENCE_FALLS = 0.10  # of the time
-_MUCH = 0.01  # of the time: a class that is worth a rule
+_MUCH = 0.01  # of the time: minimum for a class to have a rule
 _MUCH_OF_SOUND = 0.10  # of the time that is not silence
-_KEPT = 0.75  # of what the champion is sure of
+_KEPT = 0.75  # of the time in which the champion is sure
 _SOUND_LEFT = 0.5  # of the time that is not silence
-_MANY = 0.05  # of the time: a class that has become many times as much
+_MANY = 0.05  # of the time: limit for a class that grew manifold
 _TIMES = 4.0
 _CHANGED = 0.20  # of the time that is not silence
 _CHANGED_MINUTES = 10.0
 _SILENCE_OF_NEW = 0.5  # of the time of a new class
-_ROOM = 0.5  # of the time: a new class that is more is the room
-_MARKS_ALONE = 3  # that say a class was wrong, where no sound of that class is known
+_ROOM = 0.5  # of the time: a larger new class is the room itself
+_MARKS_ALONE = 3  # marks that show a wrong class, if no sound of that class is known
 
 
 def damages(evidence: HomeComparison, champion: str) -> list[str]:
-    """Say what a model would spoil.
+    """Return descriptions of the damage by a model.
 
     Returns
     -------
     list of str
-        A sentence for each damage, or that there is too little sound to tell; empty if there is no
+        A sentence for each damage, or one on too little sound for a decision; empty without
         damage.
     """
     if evidence.minutes < LEAST_MINUTES:
@@ -70,29 +70,29 @@ def damages(evidence: HomeComparison, champion: str) -> list[str]:
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
     right = evidence.random
     better = clearly_better(right.plus(evidence.quiet))
-    if not (better and right.sounds and right.gained >= right.lost):  # silence alone is too little
+    if not (better and right.sounds and right.gained >= right.lost):  # silence alone is not enough
         reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
         reasons += _swallowed(evidence, champion)
     return reasons
 
 
 def clearly_better(right: PairedAccuracy) -> bool:
-    """Tell whether the second model is right about more sounds, and chance hardly can be why."""
+    """Return whether the second model labels significantly more sounds correctly."""
     return right.gained - right.lost > 2 * np.sqrt(right.gained + right.lost)
 
 
 def is_worse(right: PairedAccuracy) -> bool:
-    """Tell whether the second model is right about fewer sounds, by more than a standard error."""
+    """Return whether the second model is worse by more than a standard error."""
     return bool(right.lost - right.gained > np.sqrt(right.gained + right.lost))
 
 
 def less_right(right: PairedAccuracy, name: str) -> str:
-    """Say about how many sounds a model is right, and the one that it is compared with.
+    """Format the numbers of correct sounds of a model and of its comparison model.
 
     Parameters
     ----------
     right : PairedAccuracy
-        Of the sounds of minutes that were drawn at random.
+        Sounds of the minutes drawn at random.
     """
     return (
         f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
@@ -110,7 +110,7 @@ def _silence_lost(evidence: HomeComparison) -> Iterator[str]:
 
 
 def _not_better(evidence: HomeComparison, champion: str) -> Iterator[str]:
-    """See whether it is right about fewer sounds, or about no more though it changes much."""
+    """Check for fewer correct sounds, or for no more although much changes."""
     right, changes = evidence.random, evidence.changes
     known, both = less_right(right, champion), right.plus(evidence.quiet)
     changed = changes.minutes.sum() - np.trace(changes.minutes)
@@ -132,7 +132,7 @@ def _not_better(evidence: HomeComparison, champion: str) -> Iterator[str]:
 
 
 def _sound(evidence: HomeComparison) -> float:
-    """Return the minutes that are not silence for both models."""
+    """Return the minutes other than silence in both models."""
     changes = evidence.changes
     silent = [changes.minutes[i, i] for i, name in enumerate(changes.classes) if name == SILENCE]
     return float(changes.minutes.sum() - sum(silent))
@@ -160,10 +160,10 @@ def _sure_lost(evidence: HomeComparison, champion: str) -> Iterator[str]:
 
 
 def _is_correction(evidence: HomeComparison, name: str, new: str) -> bool:
-    """See whether marks say that a class was wrong where it becomes another one.
+    """Check whether marks show that a class was wrong where it becomes another class.
 
-    None may say that it was right. What another old class takes is harder to tell from wrong marks:
-    there sounds have to be known that the first model calls so rightly, and the second too.
+    No mark may show that it was right. If the other class is an old one, wrong marks alone are
+    weaker evidence: sounds must be known that both models label correctly with the first class.
     """
     wrong = sum(n for (true, old, _), n in evidence.known.items() if (true, old) == (new, name))
     of_home = new in evidence.taught
@@ -178,7 +178,7 @@ def _is_correction(evidence: HomeComparison, name: str, new: str) -> bool:
 
 
 def _swallowed(evidence: HomeComparison, champion: str) -> Iterator[str]:
-    """See whether a new class takes what a person left as it was, mostly silence, or all day."""
+    """Check whether a new class takes confirmed labels, mostly silence, or most of the day."""
     changes = evidence.changes
     for new in sorted(evidence.taught):
         name, column = class_words(new), changes.minutes[:, changes.classes.index(new)]
@@ -204,7 +204,7 @@ def _swallowed(evidence: HomeComparison, champion: str) -> Iterator[str]:
 
 
 def _takes_silence(evidence: HomeComparison, new: str) -> bool:
-    """See whether a new class is mostly silence, and no silence that was left is known to stay."""
+    """Check whether a new class is mostly silence without a confirmed silence that stays."""
     changes = evidence.changes
     if SILENCE not in changes.classes:
         return False
@@ -216,7 +216,7 @@ def _takes_silence(evidence: HomeComparison, new: str) -> bool:
 
 
 def _taken(evidence: HomeComparison, new: str) -> Iterator[tuple[str, int, int]]:
-    """Count what the first model had right, and what of it is a new class, of all and by class."""
+    """Count the first model's correct sounds and those a new class takes: total and by class."""
     right = {
         name: Counter(
             {
@@ -235,7 +235,7 @@ def _taken(evidence: HomeComparison, new: str) -> Iterator[tuple[str, int, int]]
 
 
 def _out_of_proportion(evidence: HomeComparison) -> Iterator[str]:
-    """Find a class that becomes many times as much, and sound that becomes much less."""
+    """Check for a class that grows manifold, and for sound that shrinks much."""
     changes = evidence.changes
     total = changes.minutes.sum()
     for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True):
@@ -258,14 +258,14 @@ _LONGEST = 400  # characters of a reason
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The judgement of a model, and what it rests on.
+    """Result of the promotion check, with its evidence.
 
     Attributes
     ----------
     model, champion : str
-        Names; that of the champion is empty if nothing labels yet.
+        Names; empty for the champion if no model labels yet.
     evidence : HomeComparison or None
-        None if there is nothing to compare, or with.
+        None without anything to compare.
     """
 
     judgement: Judgement
@@ -277,20 +277,20 @@ class Verdict:
 def judge(
     folder: Path, model: Model, home: Sequence[Path], progress: Progress = ignore_progress
 ) -> Verdict:
-    """Compare a model with the one that labels a home now, and keep the judgement.
+    """Compare a model with the model that labels a home now, and store the result.
 
     Parameters
     ----------
     folder : Path
-        Of the model; its champion labels now, or else the model that labelled the latest logs.
+        Folder of the model; its champion labels now, or else the model of the latest logs.
     progress : callable, optional
-        Is told the share that is done, 0 to 1.
+        Receives the completed share, 0 to 1.
 
     Raises
     ------
     ModelError
         If the model that labels now cannot be found or used, a feature set is not installed, or the
-        judgement cannot be written.
+        result cannot be written.
     """
     champion = find_champion(folder, home, model)
     evidence, reasons = None, list[str]()
@@ -315,7 +315,7 @@ def judge(
 
 
 def other_features(champion: Model, model: Model) -> str:
-    """Say that two models cannot be compared, if they are of different feature sets."""
+    """Return a message if two models have different feature sets, so cannot be compared."""
     mine, theirs = (one.description.feature_set for one in (model, champion))
     if mine == theirs:
         return ""
@@ -329,10 +329,10 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
     Parameters
     ----------
     folder : Path
-        Folder of models, whose champion it is, unless that is the model that is judged or is gone.
+        Folder of models with the champion, unless that is the checked model or is missing.
     home : sequence of Path
-        Folders of logs, the latest of which it else has labelled; of several such models the one
-        that the model was adapted from goes first.
+        Folders of logs; the fallback is the model of the latest log. Of several such models, the
+        one from which the checked model was adapted takes precedence.
 
     Returns
     -------
@@ -342,7 +342,7 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
     Raises
     ------
     ModelError
-        If the model that labelled the latest log is gone.
+        If the model that labelled the latest log is missing.
     """
     with suppress(ModelError):
         champion = load(folder, CHAMPION)
@@ -366,7 +366,7 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
 def _worse_than_at_first(
     folder: Path, model: Model, champion: Model, home: Sequence[Path], logs: Sequence[RecentLog]
 ) -> list[str]:
-    """See whether models that each lost a little have lost what the first one of the home had."""
+    """Check for accumulated loss against the first model of the home."""
     first = _first_model(folder, home)
     if first is None or first.sha256 in {model.sha256, champion.sha256}:
         return []
@@ -377,7 +377,7 @@ def _worse_than_at_first(
 
 
 def _first_model(folder: Path, home: Sequence[Path]) -> Model | None:
-    """Find the model that labelled the first log of a home; None if it is gone."""
+    """Return the model that labelled the first log of a home; None if missing."""
     with suppress(LogError, ModelError):
         path = find_model(folder, find_home_logs(home).first_model())
         return None if path is None else load_model(path)
@@ -385,12 +385,12 @@ def _first_model(folder: Path, home: Sequence[Path]) -> Model | None:
 
 
 def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgement | None:
-    """Return the judgement that lets a model label, if it still holds.
+    """Return the stored result that permits a model to label, if it still holds.
 
-    It does if the model labels now, or was compared with the model that does. A refusal does not:
-    there may be more to judge by since.
+    It holds if the model labels now, or was compared with the model that does. A refusal does not
+    hold: more evidence may exist since.
 
-    Raise `ModelError` as `find_champion`.
+    Raise `ModelError` as `find_champion` does.
     """
     judgement = read_judgement(folder, model.sha256)
     if judgement is None or not judgement.may_label:

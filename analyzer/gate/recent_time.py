@@ -1,4 +1,4 @@
-"""Recent time of a home: the part a model has not learned from, and its sounds of known label."""
+"""Recent time of a home outside a model's training set, and its sounds of known label."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
@@ -26,15 +26,15 @@ from hearthlog.schemas.messages.topics import LIVE, parse_topic, relabelling
 
 _DAY = 86_400 * NANOSECONDS
 _RECENT = 14 * _DAY
-_LOUD = 36, 75 * NANOSECONDS  # number of spans that are labelled, and their length
+_LOUD = 36, 75 * NANOSECONDS  # number and length of the spans to label
 _QUIET = 16, 120 * NANOSECONDS
-_AROUND = 10 * NANOSECONDS  # a sound
-_SHORTEST_PART = 30 * NANOSECONDS  # time that is worth a look into a log
+_AROUND = 10 * NANOSECONDS  # around a sound
+_SHORTEST_PART = 30 * NANOSECONDS  # shortest time worth opening a log
 _SEED = 7
 
 
 class RecentLog(NamedTuple):
-    """A log, and when its messages are (ns of UTC)."""
+    """A log, and the time of its messages (ns of UTC)."""
 
     path: Path
     start: int
@@ -51,14 +51,14 @@ class LogSpan(NamedTuple):
 
 
 class WeightedPart(NamedTuple):
-    """A part that stands for more time like it."""
+    """A part that represents more time of the same kind."""
 
     part: LogSpan
-    weight: float  # how much more
+    weight: float  # represented time per time of the part
 
 
 def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
-    """Find the logs of the last two weeks of a home, in the order of time."""
+    """Return the logs of the last two weeks of a home, in order of time."""
     try:
         entries = find_home_logs(folders).between()
     except LogError:  # no log at all
@@ -75,7 +75,7 @@ def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
 
 
 def sounding_time(logs: Sequence[RecentLog]) -> Spans:
-    """Return when something else than silence was labelled by who recorded the logs."""
+    """Return the time that the recording models labelled as other than silence."""
     starts, ends = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for log in logs:
         with suppress(LogError):
@@ -89,13 +89,12 @@ def sounding_time(logs: Sequence[RecentLog]) -> Spans:
 
 
 def learned_time(model: Model, marked: Spans) -> Spans:
-    """Return the time of a home that a model has learned from, as far as that is known.
+    """Return the time of a home in a model's training set, as far as recorded.
 
     Parameters
     ----------
     marked : Spans
-        Marks of the home, from all of which an adapted model that says no time is taken to have
-        learned.
+        Marks of the home; an adapted model without recorded times is assumed to have used them all.
     """
     training = model.description.training_data
     if training.home_spans:
@@ -105,7 +104,7 @@ def learned_time(model: Model, marked: Spans) -> Spans:
 
 
 def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
-    """Return the time of logs that nothing was learned from, in the order of the logs."""
+    """Return the time of logs outside the training set, in the order of the logs."""
     parts = []
     for log in logs:
         whole = Spans(np.array([log.start]), np.array([log.end]))
@@ -116,7 +115,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
 
 
 def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list[WeightedPart]:
-    """Choose parts of the time to judge by: 45 minutes with sound at most, and 32 without."""
+    """Choose parts of the time for the check: at most 45 minutes with sound, and 32 without."""
     near = joined(sounding.starts - _AROUND, sounding.ends + _AROUND, _AROUND)
     loud: list[LogSpan] = []
     quiet: list[LogSpan] = []
@@ -130,15 +129,15 @@ def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list
 
 
 def sample(parts: Sequence[LogSpan], count: int, longest: int, seed: int = _SEED) -> list[LogSpan]:
-    """Choose spans of time, so many at most.
+    """Choose a limited number of spans of time.
 
-    One begins in each of as many equal shares of the time, at a moment that is drawn: so they are
-    of all days and of all times of day. The same time gives the same spans.
+    One span starts at a random moment in each of as many equal shares of the time, so that all days
+    and times of day are covered. Deterministic for the same time.
 
     Parameters
     ----------
     longest : int
-        Nanoseconds of each; one ends earlier where its part does.
+        Length of a span in nanoseconds; shorter at the end of its part.
     """
     lengths = np.array([part.end - part.start for part in parts], np.int64)
     total = int(lengths.sum())
@@ -151,7 +150,7 @@ def sample(parts: Sequence[LogSpan], count: int, longest: int, seed: int = _SEED
     chosen = []
     for row, moment in zip(rows.tolist(), moments.tolist(), strict=True):
         part = parts[row]
-        # Back from the end of its part, where it would else be cut short.
+        # Moved back from the end of its part, so that it is not cut short.
         start = max(min(part.start + moment - int(begins[row]), part.end - longest), part.start)
         chosen.append(part._replace(start=start, end=min(start + longest, part.end)))
     return chosen
@@ -164,32 +163,32 @@ def _weighted(parts: Sequence[LogSpan], count: int, longest: int, seed: int) -> 
 
 
 def recorded_minutes(logs: Sequence[RecentLog]) -> float:
-    """Return how much is recorded."""
+    """Return the recorded time in minutes."""
     return sum(log.end - log.start for log in logs) / (60 * NANOSECONDS)
 
 
 def minutes_a_day(logs: Sequence[RecentLog]) -> float | None:
-    """Return how much is recorded in a mean day on which there are logs, at most 24 hours.
+    """Return the recorded minutes of a mean day with logs, at most 24 hours.
 
-    None if less than a day is recorded in all, which says nothing of a mean day.
+    None if less than a day is recorded in total, which is too little for a mean day.
     """
     days = {log.start // _DAY for log in logs} | {(log.end - 1) // _DAY for log in logs}
     total, day = recorded_minutes(logs), _DAY / (60 * NANOSECONDS)
     return None if total < day else min(total / len(days), day)
 
 
-_SHORTEST_SOUND = NANOSECONDS // 2  # sound that counts
-_REMAINS = 2 * NANOSECONDS  # what is shorter beside a mark is the marked sound, not cut exactly
+_SHORTEST_SOUND = NANOSECONDS // 2  # shortest sound that counts
+_REMAINS = 2 * NANOSECONDS  # a shorter rest next to a mark belongs to the marked sound
 _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
 class KnownSound(NamedTuple):
-    """A sound whose label is known.
+    """A sound of known label.
 
     Attributes
     ----------
     random : bool
-        Whether it is of time that was drawn at random, and not chosen.
+        Whether its time was drawn at random rather than chosen.
     """
 
     start: int
@@ -200,17 +199,17 @@ class KnownSound(NamedTuple):
 
 
 def reference(log: Path, following: Sequence[Path] = ()) -> list[KnownSound]:
-    """Return the sounds of a log whose labels are known.
+    """Return the sounds of known label of a log.
 
     Returns
     -------
     list of KnownSound
-        Of half a second or more, by the start; first those of time that was drawn at random.
+        Of half a second or more, sorted by start; sounds of random time first.
 
     Raises
     ------
     LogError
-        If its review layer is damaged, or what was looked at has gone.
+        If its review layer is damaged, or the reviewed labelling is missing.
     """
     marks, drawn = read_marks(log), _drawn(read_reviewed(log))
     labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
@@ -218,19 +217,19 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[KnownSound]:
     others = [
         KnownSound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
         for mark in marks
-        if class_name(mark.label) != UNKNOWN  # whoever marked it could not tell
+        if class_name(mark.label) != UNKNOWN  # the reviewer could not decide
         and not any(_inside(mark, span) for span in drawn)
     ]
     return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST_SOUND]
 
 
 def left_alone(log: Path) -> list[KnownSound]:
-    """Return the sounds of a log that a person looked at, not by chance, and did not mark.
+    """Return the sounds of a log with confirmed labels: reviewed, not at random, and unmarked.
 
     Returns
     -------
     list of KnownSound
-        Of half a second or more, and of two beside a mark; none of what cannot be read.
+        Of half a second or more, two seconds next to a mark; unreadable labels are skipped.
     """
     sounds: list[KnownSound] = []
     with suppress(DataError, LogError):
@@ -251,16 +250,16 @@ def left_alone(log: Path) -> list[KnownSound]:
 
 
 def _least(sound: KnownSound, edges: AbstractSet[int]) -> int:
-    """Return how long a sound has to be to count."""
+    """Return the minimum length of a sound."""
     return _SHORTEST_SOUND if edges.isdisjoint((sound.start, sound.end)) else _REMAINS
 
 
 def _true(
     labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]
 ) -> Iterator[KnownSound]:
-    """Yield what is true of a reviewed span: the labelling, and the marks over it.
+    """Yield the true labels of a reviewed span: the labelling, overlaid with the marks.
 
-    What touches and has one label is one sound, however it was marked.
+    Touching spans with one label are one sound, independent of the marks.
     """
     parts: dict[str, list[KnownSound]] = {}
     for part in _parts(labellings, span, marks):
@@ -296,6 +295,6 @@ def _inside(mark: Mark, span: ReviewedSpan) -> bool:
 
 
 def spans_of(times: Sequence[tuple[int, int]], pause: int = 0) -> Spans:
-    """Join spans of time that overlap or are no more than a pause apart."""
+    """Merge spans of time that overlap or are no more than a pause apart."""
     array = np.array(times, np.int64).reshape(-1, 2)
     return joined(array[:, 0], array[:, 1], pause)

@@ -1,1 +1,1 @@
-"""Routines of a home over its weeks, and the anomaly of a day."""
+"""Weekly routines of a home, and the anomaly of a day."""

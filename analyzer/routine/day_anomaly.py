@@ -1,4 +1,4 @@
-"""Anomaly of a day: its figures and routines against the weeks before it."""
+"""Anomaly of a day: its figures and routines against the previous weeks."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,28 +31,28 @@ from hearthlog.models.classes import (
 )
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 
-_LOW, _HIGH = 0.1, 0.9  # of the days: the edges
-_PRIOR_DAYS = 7  # of which what is assumed of a figure counts as much as one day each
-# Assumed from the middle to an edge: so much, and a share of the middle.
+_LOW, _HIGH = 0.1, 0.9  # quantiles of the days at the edges
+_PRIOR_DAYS = 7  # weight of the prior of a figure, in days
+# Prior distance from the middle to an edge: a constant plus a share of the middle.
 _ASSUMED = {CLOCK: (45.0, 0.0), COUNT: (0.7, 0.0), LENGTH: (0.3, 0.2)}
 _FEWEST_OF_KIND = 6
-_SPREAD = 1.86  # error of a median for a median deviation of 1, times the root of the number
+_SPREAD = 1.86  # error of a median for a median deviation of 1, times the root of the count
 _TINY = 1e-9
-_HEARD = 0.1  # minutes in half an hour, of a class that is heard then
-_REGULAR = 0.9  # of the days on which it is
+_HEARD = 0.1  # minimum minutes of a class in half an hour for it to be present
+_REGULAR = 0.9  # minimum share of days for a regular hour
 _SHORTEST, _LONGEST, _MOST_HOURS = 2, 6, 3
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """What is usual, each array of shape (..., f), float64.
+    """Usual range of figures; each array has shape (..., f), float64.
 
     Attributes
     ----------
     low, middle, high : np.ndarray
-        On one day in ten a figure is below the low edge, on one above the high one.
+        Edges and median: one day in ten is below the low edge, one in ten above the high edge.
     below, above : np.ndarray
-        From the middle to the edges, never quite 0.
+        Distances from the middle to the edges, never exactly 0.
     """
 
     low: Float64
@@ -63,32 +63,32 @@ class Baseline:
     weekend: Float64
 
     def deviations(self, row: Float64, weekend: Bool) -> Float64:
-        """Measure how far the figures of a day are from the middle, in widths to the edge.
+        """Return the deviations of a day's figures from the middle, in units of the edge distance.
 
         Parameters
         ----------
         row : np.ndarray [shape=(..., f)], float64
-            As of `rooted`.
+            As from `rooted`.
         weekend : np.ndarray [shape=(...)], bool
 
         Returns
         -------
         np.ndarray [shape=(..., f)], float64
-            Above 0 for more, or later; NaN for what is not known.
+            Positive for more, or later; NaN for missing figures.
         """
         away = row - self.middle - weekend[..., np.newaxis] * self.weekend
         return away / np.where(away > 0, self.above, self.below)
 
 
 def fit_baseline(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) -> Baseline:
-    """Learn what is usual.
+    """Fit the usual range of figures.
 
     Parameters
     ----------
     table : np.ndarray [shape=(..., n, f)], float64
-        Figures of n days, as of `rooted`; NaN for what is not known.
+        Figures of n days, as from `rooted`; NaN for missing figures.
     weekend : np.ndarray [shape=(..., n)], bool
-        Which of the days are of a weekend.
+        Whether a day is at a weekend.
     """
     weekend = weekend[..., np.newaxis]
     offset = _weekend(table, weekend)
@@ -106,7 +106,7 @@ def fit_baseline(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) ->
 
 
 def _weekend(table: Float64, weekend: Bool) -> Float64:
-    """Return by how much more figures are at a weekend, less where that may be chance."""
+    """Return the weekend offset of figures, reduced where it may be chance."""
     at, apart = (_middle(np.where(own, table, np.nan)) for own in (weekend, ~weekend))
     more = at[0] - apart[0]
     sure = np.clip(1 - (at[1] + apart[1]) / np.maximum(more**2, _TINY), 0, 1)
@@ -115,7 +115,7 @@ def _weekend(table: Float64, weekend: Bool) -> Float64:
 
 
 def _middle(table: Float64) -> tuple[Float64, Float64, Int64]:
-    """Return the median of the days, the square of its error, and the number of days."""
+    """Return the median of the days, its squared error, and the number of days."""
     days = np.isfinite(table).sum(axis=-2)
     middle = quantile(table, 0.5)
     spread = quantile(np.abs(table - middle[..., np.newaxis, :]), 0.5)
@@ -123,7 +123,7 @@ def _middle(table: Float64) -> tuple[Float64, Float64, Int64]:
 
 
 def quantile(table: Float64, share: float) -> Float64:
-    """Return a quantile over the days of what is known.
+    """Return a quantile over the days, without missing values.
 
     Parameters
     ----------
@@ -134,9 +134,9 @@ def quantile(table: Float64, share: float) -> Float64:
     Returns
     -------
     np.ndarray [shape=(..., f)], float64
-        NaN where nothing is known.
+        NaN without any value.
     """
-    ascending = np.sort(table, axis=-2)  # NaN last
+    ascending = np.sort(table, axis=-2)  # NaN sorts last
     days = np.isfinite(table).sum(axis=-2, keepdims=True)
     place = share * np.maximum(days - 1, 0)
     below = np.floor(place).astype(np.int64)
@@ -146,17 +146,17 @@ def quantile(table: Float64, share: float) -> Float64:
 
 
 def regular_hours(days: Sequence[DayProfile], classes: Sequence[str]) -> list[DayFigure]:
-    """Find hours of the day in which a class is heard on nine of ten days.
+    """Find the hours of the day with sound of a class on nine of ten days.
 
     Parameters
     ----------
     classes : sequence of str
-        Of their half hours.
+        Classes of the half hours.
 
     Returns
     -------
     list of DayFigure
-        At most three for each class, with half an hour before and after.
+        At most three for each class, extended by half an hour before and after.
     """
     found = []
     for row, name in enumerate(classes):
@@ -166,7 +166,7 @@ def regular_hours(days: Sequence[DayProfile], classes: Sequence[str]) -> list[Da
 
 
 def _hours(minutes: Float64) -> list[tuple[int, int]]:
-    """Find the shortest spans of half hours that are regular; of shape (days, 48)."""
+    """Find the shortest regular spans of half hours; input has shape (days, 48)."""
     free = np.ones(BINS, bool)
     found: list[tuple[int, int]] = []
     for width in range(_SHORTEST, _LONGEST + 1):
@@ -182,14 +182,14 @@ def _hours(minutes: Float64) -> list[tuple[int, int]]:
 
 
 def _widened(free: Bool, first: int, last: int) -> tuple[int, int]:
-    """Add half an hour before and after, where no other span has it."""
+    """Extend spans by half an hour before and after, where no other span is."""
     before = first > 0 and free[first - 1]
     after = last < BINS and free[last]
     return first - int(before), last + int(after)
 
 
 def _regular(minutes: Float64, width: int) -> tuple[Float64, Float64]:
-    """Return on which share of the days each span of a width has sound, and how long on average."""
+    """Return the share of days with sound, and the mean length, for each span of a width."""
     sums = sliding_window_view(minutes, width, axis=1).sum(axis=-1)
     known = np.maximum(np.isfinite(sums).sum(axis=0), 1)
     amounts = np.nan_to_num(sums)
@@ -199,17 +199,17 @@ def _regular(minutes: Float64, width: int) -> tuple[Float64, Float64]:
 def figure_table(
     days: Sequence[DayProfile], classes: Sequence[str], hours: Sequence[DayFigure]
 ) -> Float64:
-    """Return the figures of days as rows: those of each profile, then those of regular hours.
+    """Return the figures of days as rows: profile figures, then regular hours.
 
     Parameters
     ----------
     classes : sequence of str
-        Of their half hours.
+        Classes of the half hours.
 
     Returns
     -------
     np.ndarray [shape=(n, f)], float64
-        NaN for what is not known.
+        NaN for missing figures.
     """
     places = [(classes.index(each.what), *(each.hours or (0, BINS))) for each in hours]
     return np.array(
@@ -218,7 +218,7 @@ def figure_table(
 
 
 def rooted(table: Float64, figures: Sequence[DayFigure]) -> Float64:
-    """Take the square root of counts and lengths.
+    """Return a table with the square root of counts and lengths.
 
     Parameters
     ----------
@@ -241,13 +241,13 @@ _BY_CLASS = {
     OBJECTS_ACTIVITY: HOUSEHOLD,
 }
 _MORNING_ENDS = 19  # half hours of the day
-_MOST = 6.0  # that the deviation of one figure counts
+_MOST = 6.0  # limit of the deviation of one figure
 _NARROWEST = 0.35
-_TOP = 3  # routines that make the score
+_TOP = 3  # routines in the score
 
 
 def routine_of(figure: DayFigure) -> str:
-    """Return the routine that a figure tells of."""
+    """Return the routine that a figure belongs to."""
     by_class = _BY_CLASS.get(figure.what, COMPANY)
     if by_class in {COUGHS, DISTRESS}:
         return by_class
@@ -262,21 +262,21 @@ def routine_of(figure: DayFigure) -> str:
 def routine_scores(
     own: Float64, others: Float64, figures: Sequence[DayFigure]
 ) -> tuple[float, Float64]:
-    """Score how far a day is from what is usual: the mean of its three farthest routines.
+    """Score the anomaly of a day: the mean of its three most deviating routines.
 
     Parameters
     ----------
     own : np.ndarray [shape=(f,)], float64
-        Deviations of the figures of a day; NaN for what is not known.
+        Deviations of the figures of a day; NaN for missing figures.
     others : np.ndarray [shape=(n, f)], float64
-        Those of other days, by which the widths of routines are measured.
+        Deviations of other days, which give the widths of routines.
 
     Returns
     -------
     score : float
-        Of the day.
+        Score of the day.
     scores : np.ndarray [shape=(n,)], float64
-        Of the other days.
+        Scores of the other days.
     """
     groups = _groups(figures)
     means = np.array([_mean(np.vstack([others, own])[:, rows] * sign) for rows, sign in groups]).T
@@ -289,7 +289,7 @@ def routine_scores(
 
 
 def _groups(figures: Sequence[DayFigure]) -> list[tuple[Int64, Float64]]:
-    """Return the places of the figures of each routine, and which way they point."""
+    """Return the indices and signs of the figures of each routine."""
     names = np.array([routine_of(figure) for figure in figures])
     signs = np.array([_sign(figure) for figure in figures])
     places = [np.flatnonzero(names == name) for name in _ROUTINES]
@@ -297,43 +297,43 @@ def _groups(figures: Sequence[DayFigure]) -> list[tuple[Int64, Float64]]:
 
 
 def _sign(figure: DayFigure) -> float:
-    """Return -1 for a figure that is less where the others of its routine are more."""
+    """Return -1 for a figure that falls when the others of its routine rise."""
     is_less = figure.what == QUIET or (routine_of(figure) == MORNING and figure.what != FIRST)
     return -1.0 if is_less else 1.0
 
 
 def _mean(deviations: Float64) -> Float64:
-    """Average the deviations of a routine; what is not known counts as usual."""
+    """Return the mean deviation of a routine; missing figures count as usual."""
     return np.clip(np.nan_to_num(deviations), -_MOST, _MOST).mean(axis=1)
 
 
-DAYS = 28  # that a day is compared with, at most
+DAYS = 28  # maximum number of days in the comparison
 FEWEST = 14
-SPAN = 3  # days that are judged together, too: what lasts is sooner seen so
-LONGEST = 365.0  # days: what comes more rarely cannot be told apart in four weeks
-_TAIL = 0.3  # share of the days by which the rare ones are judged
+SPAN = 3  # days that are also judged together: detects lasting changes sooner
+LONGEST = 365.0  # days: longer periods cannot be distinguished in four weeks
+_TAIL = 0.3  # share of the days that the tail is fitted to
 _TAIL_PRIOR_DAYS, _PRIOR_SHARE = (
     4,
     0.15,
 )  # of the tail: days, and their excess as a share of its edge
-# By how much the tail of days to come is longer than that of days that are left out, which lie
-# between those they are compared with; more where there are fewer than 28 of these. Fitted to
+# Factor of the tail of future days over the tail of held-out days, which lie
+# between the days they are compared with; greater with fewer than 28 of these. Fitted to
 # the false alarms of simulated homes, seeds 0 to 9 of `tools/lab/routine.py`.
 _LONGER = {1: 1.8, SPAN: 2.7}
 _DIFFERS = {1: 1.5, SPAN: 1.0}
 
 
 class FigureDifference(NamedTuple):
-    """A figure that was not as usual.
+    """A figure outside its usual range.
 
     Attributes
     ----------
     value : float
-        Of the day, or the median of three: a number of events, minutes, or those since midnight.
+        Of the day, or the median of three days: event count, minutes, or minutes since midnight.
     low, middle, high : float
-        On one day in ten it is below `low`, on one above `high`.
+        Usual range: one day in ten is below `low`, one in ten above `high`.
     deviation : float
-        From the middle, in widths from there to the edge; above 0 for more, or later.
+        From the middle, in units of the edge distance; positive for more, or later.
     """
 
     figure: DayFigure
@@ -346,16 +346,16 @@ class FigureDifference(NamedTuple):
 
 @dataclass(frozen=True)
 class DayAnomaly:
-    """How unusual a day was.
+    """Anomaly of a day.
 
     Attributes
     ----------
     once_in : float
-        Days in which one is expected that is as far from the usual, 1 to 365.
+        Return period of such a deviation in days, 1 to 365.
     span : int
-        Days of which the differences are typical: the day by itself, 1, or with the two before, 3.
+        Days that the differences cover: the day alone, 1, or with the two previous days, 3.
     days : int
-        How many days it is compared with.
+        Number of days in the comparison.
     """
 
     day: date
@@ -366,20 +366,20 @@ class DayAnomaly:
 
 
 class Routines:
-    """Judges days of a home by the weeks before each."""
+    """Computes the anomaly of days of a home against the previous weeks."""
 
     def __init__(self, profiles: Profiles) -> None:
         self._profiles = profiles
         self._known: dict[date, DayProfile | None] = {}
 
     def judge(self, day: date) -> DayAnomaly | None:
-        """Judge a day.
+        """Compute the anomaly of a day.
 
         Returns
         -------
         DayAnomaly or None
-            None if less than half of its figures are known, or there are fewer than 14 days to
-            compare with of which that many are.
+            None if less than half of its figures are present, or there are fewer than 14 days to
+            compare with that have as many.
         """
         span = self._between(day, SPAN - 1, 0)
         earlier = self.earlier(day)
@@ -389,7 +389,7 @@ class Routines:
         return judge(compared, day)
 
     def earlier(self, day: date) -> list[DayProfile]:
-        """Return the days to compare a day with: four weeks, up to the third day before."""
+        """Return the days for comparison: four weeks, up to the third day before."""
         return self._between(day, DAYS + SPAN - 1, SPAN)
 
     def _between(self, day: date, first: int, last: int) -> list[DayProfile]:
@@ -404,19 +404,19 @@ class Routines:
 
 
 class Compared(NamedTuple):
-    """Days beside what is usual.
+    """Days with their deviations from the baseline.
 
     Attributes
     ----------
     figures : sequence of DayFigure
-        That are known on half of the earlier days at least.
+        Present on at least half of the earlier days.
     rows : np.ndarray [shape=(k, f)], float64
-        Of the days, as of `rooted`; NaN for what is not known.
+        Figures of the days, as from `rooted`; NaN for missing figures.
     weekend : np.ndarray [shape=(k,)], bool
     own : np.ndarray [shape=(k, f)], float64
-        Their deviations.
+        Deviations of the days.
     others : np.ndarray [shape=(n, f)], float64
-        Those of each earlier day from the other ones.
+        Deviations of each earlier day from the other earlier days.
     """
 
     figures: Sequence[DayFigure]
@@ -433,16 +433,16 @@ def compare(
     figures: Sequence[DayFigure],
     classes: Sequence[str],
 ) -> Compared:
-    """Lay days beside earlier ones.
+    """Compare days with earlier days.
 
     Parameters
     ----------
     span : sequence of DayProfile
-        One at least.
+        At least one.
     earlier : sequence of DayProfile
-        14 at least.
+        At least 14.
     classes : sequence of str
-        Of their half hours.
+        Classes of the half hours.
     """
     hours = regular_hours(earlier, classes)
     every = [*figures, *hours]
@@ -458,14 +458,14 @@ def compare(
 
 
 def judge(compared: Compared, day: date) -> DayAnomaly:
-    """Say how unusual the last of some days was.
+    """Return the anomaly of the last of some days.
 
     Parameters
     ----------
     compared : Compared
-        The day, and those just before it.
+        The day and the days just before it.
     """
-    # Halved, for either may be rare by chance.
+    # Halved, because either may be rare by chance.
     alone, together = (
         float(np.clip(rarity(own, compared) / 2, 1, LONGEST))
         for own in (compared.own[-1:], compared.own)
@@ -477,21 +477,21 @@ def judge(compared: Compared, day: date) -> DayAnomaly:
 
 
 def _left_out(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) -> Float64:
-    """Return how far each day is from what is usual on the others."""
+    """Return the deviations of each day from the baseline of the other days."""
     days = len(table)
     others = np.array([np.delete(np.arange(days), row) for row in range(days)])
     return fit_baseline(table[others], weekend[others], figures).deviations(table, weekend)
 
 
 def rarity(own: Float64, compared: Compared) -> float:
-    """Return in how many days some are expected that are as far from the usual, on average.
+    """Return the return period of the deviations.
 
-    Beyond the score that three of ten days exceed, scores are taken to fall off exponentially.
+    Beyond the score that three of ten days exceed, scores are assumed to fall off exponentially.
 
     Parameters
     ----------
     own : np.ndarray [shape=(k, f)], float64
-        Deviations of one day or of successive ones.
+        Deviations of one day or of successive days.
 
     Returns
     -------
@@ -514,7 +514,7 @@ def rarity(own: Float64, compared: Compared) -> float:
 
 
 def _mean_of_known(rows: Float64) -> Float64:
-    """Average rows over what is known; NaN where nothing is."""
+    """Return the mean over rows without missing values; NaN without any value."""
     known = np.isfinite(rows)
     sums = np.where(known, rows, 0.0).sum(axis=0)
     return np.where(known.any(axis=0), sums / np.maximum(known.sum(axis=0), 1), np.nan)

@@ -1,4 +1,4 @@
-"""Profile of a day: its start, its longest quiet span, and events and minutes of each class."""
+"""Profile of a day: its start, longest quiet span, and events and minutes of each class."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spa
     Returns
     -------
     Spans
-        A single one; none if nothing was heard then.
+        A single span; empty without any sound in that time.
     """
     waking = one(at_hour(day, MORNING, zone), at_hour(day, EVENING, zone))
     quiet = without(common(coverage, waking), sound)
@@ -59,12 +59,12 @@ def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spa
 
 
 def stretches(sound: Spans, night: Spans) -> int:
-    """Count the stretches of sound in a night, with ten quiet minutes between them.
+    """Count the stretches of sound in a night, separated by ten quiet minutes.
 
     Returns
     -------
     int
-        Number of those with at least half a minute of sound.
+        Number of stretches with at least half a minute of sound.
     """
     inside = common(sound, night)
     found = joined(*inside, _QUIET_PAUSE)
@@ -79,12 +79,12 @@ STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "q
 BINS = 48  # of a day: half hours
 _NAMELESS = {SILENCE, OTHER, UNKNOWN}
 _AT_NIGHT = (FLUSHING_WATER, TAP_WATER, COUGHING, CRYING, YELLING)
-_LEAST = 0.9  # of a span has to be heard for what it has to be known
+_LEAST = 0.9  # recorded share of a span for its figures to be present
 _LEAST_FIGURES = 0.5
-_LEAST_BESIDE = 0.9  # of the time before what is said to be the first, or after the last
+_LEAST_BESIDE = 0.9  # recorded share before the first, or after the last, busy half hour
 _ONE = timedelta(days=1)
-_RISING = 4  # of the clock: what is busy before is still of the day before
-_BUSY, _HALF_HOUR = 5, 30 * MINUTE  # so many sounds begin in half an hour that is busy
+_RISING = 4  # o'clock: earlier activity belongs to the previous day
+_BUSY, _HALF_HOUR = 5, 30 * MINUTE  # number of sounds that start in a busy half hour
 _PAUSE = 10 * NANOSECONDS
 
 
@@ -94,11 +94,11 @@ class DayFigure(NamedTuple):
     Attributes
     ----------
     kind : str
-        `COUNT`, `LENGTH` (in minutes) or `CLOCK` (minutes from midnight on).
+        `COUNT`, `LENGTH` (in minutes) or `CLOCK` (minutes since midnight).
     night : bool
-        Whether it is of the night, 22:00 to 07:00; else of the day.
+        Whether it covers the night, 22:00 to 07:00, rather than the day.
     hours : (int, int) or None
-        Half hours of the day that it is about, the last one not included; None for all of it.
+        Range of half hours of the day, end exclusive; None for the complete day.
     """
 
     what: str
@@ -109,12 +109,12 @@ class DayFigure(NamedTuple):
 
 @dataclass(frozen=True)
 class HomeSegments:
-    """What was heard in a home.
+    """Labelled segments of a home.
 
     Attributes
     ----------
     labels : Labelling
-        Of all microphones, by their starts, with one name for each class; they may overlap.
+        Of all microphones, sorted by start, with one name per class; segments may overlap.
     """
 
     labels: Labelling
@@ -123,15 +123,15 @@ class HomeSegments:
 
 @dataclass(frozen=True)
 class DayProfile:
-    """What a day was like.
+    """Figures and half hours of a day.
 
     Attributes
     ----------
     values : np.ndarray [shape=(f,)], float64
-        Of the `figures` of its `Profiles`; NaN for what is not known.
+        Values of the `figures` of its `Profiles`; NaN for missing figures.
     half_hours : np.ndarray [shape=(c, 48)], float64
-        Minutes in each half hour of the day, for each of their `classes`; NaN for what is not
-        known.
+        Minutes in each half hour of the day, for each class of its `Profiles`; NaN if
+        missing.
     """
 
     day: date
@@ -140,24 +140,24 @@ class DayProfile:
 
     @property
     def is_known(self) -> bool:
-        """Whether at least half of the figures are, so that the day can be compared."""
+        """Whether at least half of the figures are present, so that the day can be compared."""
         return bool(np.isfinite(self.values).mean() >= _LEAST_FIGURES)
 
 
 class Profiles:
-    """Makes profiles of the days of a home.
+    """Computes profiles of the days of a home.
 
     Parameters
     ----------
     night_after : bool
-        Whether the night after a day belongs to it, and not the one before.
+        Whether the night after a day belongs to it, rather than the night before.
 
     Attributes
     ----------
     figures : list of DayFigure
         Of each day.
     classes : list of str
-        Whose half hours are counted.
+        Classes with half hours in the profile.
     """
 
     def __init__(self, home: HomeSegments, zone: tzinfo, *, night_after: bool) -> None:
@@ -222,7 +222,7 @@ class Profiles:
         return begins, at_hour(ends, MORNING, self._zone)
 
     def _busy(self, day: date, *, last: bool) -> float:
-        """Return when the first busy half hour begins, or the last ends, if that was heard."""
+        """Return the start of the first busy half hour, or the end of the last, if recorded."""
         begin, end = (at_hour(each, _RISING, self._zone) for each in (day, day + _ONE))
         starts = self._starts[slice(*np.searchsorted(self._starts, (begin, end)))]
         firsts, lasts = starts[: 1 - _BUSY], starts[_BUSY - 1 :]
@@ -236,13 +236,13 @@ class Profiles:
         return self._clock(time, day) if known else np.nan
 
     def _clock(self, time: int, day: date) -> float:
-        """Return what the clock shows, in minutes from the midnight of a day on."""
+        """Return the clock time in minutes since the midnight of a day."""
         local = datetime.fromtimestamp(time // NANOSECONDS, self._zone)
         return 60.0 * local.hour + local.minute + 1440.0 * (local.date() - day).days
 
 
 def _figures(names: list[str]) -> Iterator[DayFigure]:
-    """List the figures of a day, what matters most first."""
+    """Return the figures of a day, the most important first."""
     yield DayFigure(STRETCHES, COUNT, night=True)
     yield DayFigure(SOUND, LENGTH, night=True)
     for name in _AT_NIGHT:
@@ -258,7 +258,7 @@ def _figures(names: list[str]) -> Iterator[DayFigure]:
 
 
 def _television(labels: Labelling) -> Spans:
-    """Return the minutes in which something sounds like a television."""
+    """Return the minutes that resemble a television."""
     if not len(labels):
         return NONE
     first, last = int(labels.starts[0]) // MINUTE, -(-int(labels.ends.max()) // MINUTE)
@@ -268,7 +268,7 @@ def _television(labels: Labelling) -> Spans:
 
 
 def _outside(events: Spans, spans: Spans) -> Spans:
-    """Return the events that do not begin in some spans."""
+    """Return the events that do not start in some spans."""
     rows = np.searchsorted(spans.starts, events.starts, side="right") - 1
     ends = np.append(spans.ends, 0)[rows]
     apart = (rows < 0) | (ends <= events.starts)
@@ -276,7 +276,7 @@ def _outside(events: Spans, spans: Spans) -> Spans:
 
 
 def _half_hours(day: date, zone: tzinfo) -> Int64:
-    """Return when the clock shows each half hour; of one that is left out, nothing is between."""
+    """Return the start of each half hour by the clock; a skipped half hour is empty."""
     midnight = datetime(day.year, day.month, day.day)  # noqa: DTZ001  of the clock on the wall
     clock = [midnight + timedelta(minutes=30 * number) for number in range(BINS + 1)]
     times = np.array([int(each.replace(tzinfo=zone).timestamp()) for each in clock]) * NANOSECONDS

@@ -1,4 +1,4 @@
-"""Adaptation: adds a home's marks to the weights of a model."""
+"""Adaptation of a model to the marks of a home."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -60,15 +60,15 @@ from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int32
 from hearthlog.schemas.errors import ignore_progress
 
-_HEAD_PULL = 10.0  # to zero, of weights of inputs of one standard deviation
-_NEW_HEAD_PULL = 1.0  # of those of a class that the base has not: all of it is to be learned
-_CONFIRMED_WEIGHT = 1 / 3  # of a window that a reviewer left as it was; a mark has 1
-_SHARE = 0.5  # that counts of what is learned: marks are of few sources, and others lie between
-_BELOW = 2.0  # the others on average, is a new class before anything is learned
+_HEAD_PULL = 10.0  # regularisation to zero, for standardised inputs
+_NEW_HEAD_PULL = 1.0  # of a new class, which has no base weights
+_CONFIRMED_WEIGHT = 1 / 3  # weight of a window with a confirmed label; a mark has 1
+_SHARE = 0.5  # applied part of the correction: marks have few sources, and other sounds lie between
+_BELOW = 2.0  # initial offset of a new class below the mean of the others
 
 
 class Heads(NamedTuple):
-    """The mix of a model, the arrays of its heads, and how many of the last classes are new."""
+    """Mix, head arrays and number of trailing new classes of a model."""
 
     mix: EmbeddingMix
     weights: Int32
@@ -78,7 +78,7 @@ class Heads(NamedTuple):
 
 
 def base_heads(model: Model, classes: Sequence[str]) -> Heads:
-    """Return the heads of a model as before it was ever adapted, with room for new classes."""
+    """Return the heads of a model before any adaptation, with room for new classes."""
     mix = model.description.embedding
     assert mix is not None
     count = len(mix.head_weights)
@@ -108,7 +108,7 @@ def base_heads(model: Model, classes: Sequence[str]) -> Heads:
 
 
 def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
-    """Return a head with the classes of a home, of which the names say what of unknown ones."""
+    """Return a head extended by the classes of a home; names score the unknown ones."""
     kept = {name: values for name, values in head.classes.items() if name in classes}
     bias = {name: value for name, value in head.bias.items() if name in classes}
     if UNKNOWN in head.classes:
@@ -122,20 +122,20 @@ def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
 def learn_home(
     heads: Heads, windows: EmbeddingWindows, marked: Bool, classes: Sequence[str]
 ) -> Heads:
-    """Add what a home teaches: one half of what is learned, for a class of the base.
+    """Learn the correction of a home; half of it is added for classes of the base.
 
-    The heads stay as they are; what a home teaches is a linear head of its own that is added to
-    them, so that nothing of the base's recordings is needed. It is learned by logistic regression,
-    and pulled to zero: where nothing is marked the base decides.
+    The base heads stay fixed. The home adds its own linear head, so adaptation needs none of the
+    base's recordings. The head is fitted by logistic regression with a pull to zero: the base
+    decides where nothing is marked.
 
-    Where nobody has marked a sound of no class, and there is no new class, how likely that is
-    against the others is not learned: by marks of what was wrongly called unknown alone nearly
-    nothing would be unknown any more.
+    Without new classes and without marks of class `unknown`, the score of `unknown` against the
+    other classes is not learned: marks of sounds wrongly labelled `unknown` would remove nearly all
+    of it.
 
     Parameters
     ----------
     marked : np.ndarray [shape=(m,)], bool
-        Whether somebody has said what it is; the others are as they were labelled.
+        Whether a person labelled the window; the model labelled the others.
     """
     sounds = sounds_of(classes)
     if UNKNOWN in classes and not heads.new:
@@ -152,7 +152,7 @@ def learn_home(
     used = np.flatnonzero(heads.weights.any(axis=(0, 2)))
     mean, scale = heads.scaler[:, used]
     inputs = (values[:, used] - mean) / scale
-    # The windows of a mark are of one sound: many of them say no more than one.
+    # The windows of a mark are of one sound: many of them carry no more information than one.
     windows_of = np.bincount(windows.recording[own])[windows.recording[own]]
     weight = np.where(marked[own], 1.0 / windows_of, _CONFIRMED_WEIGHT)
     target = np.searchsorted(sounds, windows.target[own])
@@ -174,29 +174,27 @@ def learn_home(
     )
 
 
-_LANDMARK_PULL = 1.0  # to zero, of what is added to the weights
-_NEW_LANDMARK_PULL = 0.1  # of those of a class that the base has not: all of it is to be learned
-_LANDMARK_WEIGHT = 3.0  # of what the base says of a landmark; a window of a mark has 1
-_HOME_LANDMARKS = 200  # at most, of its windows
+_LANDMARK_PULL = 1.0  # regularisation to zero of the correction of weights
+_NEW_LANDMARK_PULL = 0.1  # of a new class, which has no base weights
+_LANDMARK_WEIGHT = 3.0  # weight of the base's output for a landmark; a window of a mark has 1
+_HOME_LANDMARKS = 200  # maximum number from the windows of the home
 _LANDMARK_SHARE = (
-    0.5  # that counts of what is learned: marks are of few sources, and others lie between
+    0.5  # applied part of the correction: marks have few sources, and other sounds lie between
 )
-_LANDMARK_BELOW = (
-    2.0  # the others on average, is a new class before anything is learned, a logarithm
-)
-_IMITATION_COST = 30.0  # probabilities are learned closer than labels, which are wrong at times
-_SMOOTHED = 1 / 3  # of the weight of a frame of a machine, which is less sure between its vectors
+_LANDMARK_BELOW = 2.0  # initial offset of a new class below the mean of the others, a logarithm
+_IMITATION_COST = 30.0  # fits probabilities more closely than labels, which have errors
+_SMOOTHED = 1 / 3  # of an SVM's frame weight: an SVM is less sure between its vectors
 _ROWS_AT_ONCE = 256
 _MOST_BIAS = 100.0
 
 
 @dataclass(frozen=True)
 class HomeLandmarks(Method):
-    """Adds to the weights of a classifier on landmarks.
+    """Adapts the weights of a landmark classifier.
 
-    The landmarks, each by what the base says of it, keep the base as it is where the home has no
-    windows: a home has few sources, of few classes. A classifier of another kind is first learned
-    over, by what it says itself.
+    The landmarks, each with the output of the base as target, preserve the base where the home has
+    no windows: a home has few sources of few classes. A classifier of another kind is first
+    imitated by a landmark classifier.
     """
 
     base: Mapping[str, Array] = field(default_factory=dict, compare=False)
@@ -205,7 +203,7 @@ class HomeLandmarks(Method):
 
     @classmethod
     def of_learned(cls, method: LandmarkMethod, learned: LearnedMachine) -> Self:
-        """Return the method that moves what another has learned, as it is."""
+        """Return the method that adapts a learned classifier, given its arrays and parameters."""
         return cls(
             method.name,
             method.feature_set,
@@ -218,7 +216,7 @@ class HomeLandmarks(Method):
 
     @classmethod
     def of(cls, model: Model) -> Self:
-        """Return the method that moves a model of kind `rbf-landmarks`."""
+        """Return the method that adapts a model of kind `rbf-landmarks`."""
         description = model.description
         return cls(
             description.method,
@@ -232,7 +230,7 @@ class HomeLandmarks(Method):
         )
 
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> LearnedMachine:
-        """Move the base by some segments of a home, as of `Method.fit`."""
+        """Adapt the base to segments of a home; see `Method.fit`."""
         with single_thread():
             return self._moved(*examples.windows(seen))
 
@@ -275,14 +273,14 @@ class HomeLandmarks(Method):
 
 
 def is_moved(model: Model) -> bool:
-    """Return whether a home moves the classifier of a model as it is."""
+    """Return whether the classifier of a model can be adapted without imitation."""
     return model.description.kind == RBF_LANDMARKS.name
 
 
 def learned_over(base: Model) -> Model:
-    """Return a model whose landmarks say what the classifier of another kind says.
+    """Return a landmark model that imitates a classifier of another kind.
 
-    Raise `DataError` if the classifier has kept no inputs of its kind, or none of one of its
+    Raise `DataError` if the classifier has stored no inputs of its kind, or none for one of its
     classes.
     """
     kept = kept_inputs(base)
@@ -298,7 +296,7 @@ def learned_over(base: Model) -> Model:
     width, inverse = inputs.shape[1], description.inverse_temperature
     method, smoothed = replace(ROOM, cost=_IMITATION_COST), 1.0
     if description.kind == SVM_RBF.name:
-        if description.embedding is None:  # else smoothed is what the heads say, too
+        if description.embedding is None:  # otherwise smoothing also applies to the heads
             smoothed = _SMOOTHED
         method = replace(method, gamma=description.parameters["gamma"] * width)
     machine = classifier_kind(description.kind).machine(base)
@@ -328,11 +326,11 @@ def learned_over(base: Model) -> Model:
 
 
 _FEWEST_SEGMENTS = 10
-_FOLDS = 3  # by which the temperature is found
+_FOLDS = 3  # for fitting the temperature
 
 
 def base_classes(model: Model) -> tuple[str, ...]:
-    """Return the classes of a model without those that it has from a home alone."""
+    """Return the classes of a model without those learned only from a home."""
     insist_taught(model)
     kept = kept_inputs(model)
     if kept is None or not len(kept[1]):
@@ -341,29 +339,29 @@ def base_classes(model: Model) -> tuple[str, ...]:
 
 
 def adapt_model(base: Model, home: Dataset) -> Model:
-    """Add what a home teaches to the weights of a model.
+    """Adapt the weights of a model to a home.
 
     Parameters
     ----------
     base : Model
-        One whose classifier is not on landmarks is learned over by what it says, if it has kept
-        windows that it learned from.
+        A classifier of another kind than landmarks is imitated first; it must have stored training
+        windows.
     home : Dataset
-        Of the `base_classes` of the model, some of which may have no segments, and of new ones
-        behind them, which have some.
+        Segments of the model's `base_classes`, which may be empty, followed by new classes, which
+        must have segments.
 
     Returns
     -------
     Model
-        With the parameters, transitions and metrics of `base`, which are those of other homes.
-        Parts of the home that were left out in turn move the temperature that the model had before
-        it was ever adapted. It can be adapted again to more of the home.
+        Parameters, transitions and metrics are those of `base`, measured in other homes. The
+        temperature before the first adaptation is adjusted by cross-validation over parts of the
+        home. The model can be adapted again to more of the home.
 
     Raises
     ------
     DataError
         If the home has no segments, or no loud ones of a new class, or if the base cannot be
-        learned over.
+        imitated.
     ModelError
         If the feature set or the kind of classifier of the base is not installed.
     """
@@ -413,7 +411,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
 
 
 def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) -> Model:
-    """Let the heads of a model learn from a home, too; the classifier's decisions are left out."""
+    """Adapt the heads of a model too, given held-out decisions of the classifier."""
     heads = base_heads(base, home.classes)
     marked = home.embedding_windows.collection != _confirmed_number(home)
     learned = learn_home(heads, home.embedding_windows, marked, home.classes)
@@ -438,7 +436,7 @@ def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) 
 
 
 def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
-    """Return how sure the mix may be of sounds of a home, by parts of it left out."""
+    """Return the inverse temperature of the mix, cross-validated over parts of a home."""
     base, sounds = heads.mix.inverse_temperature, sounds_of(home.classes)
     marked = ~_is_confirmed(home)
     tried = np.isfinite(decisions).all(axis=1) & home.is_embedded & np.isin(home.target, sounds)
@@ -457,7 +455,7 @@ def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
 
 
 def _learned_without(heads: Heads, home: Dataset, seen: Indices) -> Heads:
-    """Let heads learn from some segments of a home instead of all windows."""
+    """Fit heads on some segments of a home instead of all windows."""
     own = seen[home.is_embedded[seen]]
     windows = EmbeddingWindows(
         home.embedded[own],
@@ -476,7 +474,7 @@ def _confirmed_number(home: Dataset) -> int:
 
 
 def _check_new_classes(base: Model, examples: Examples, classes: Sequence[str]) -> None:
-    """Refuse what would leave a class that the base lacks without a window to learn from."""
+    """Raise an error if a new class would have no training window."""
     usable = examples.target[examples.usable.any(axis=(0, 2))]
     for number in range(len(base_classes(base)), len(classes)):
         if number not in usable:
@@ -486,7 +484,7 @@ def _check_new_classes(base: Model, examples: Examples, classes: Sequence[str]) 
 
 
 def _of_classes(description: Description, classes: Sequence[str]) -> Description:
-    """Return a description with other classes at its end, of which no figures are known."""
+    """Return a description with other trailing classes and no metrics for them."""
     if tuple(description.classes) == tuple(classes):
         return description
     metrics, training = description.metrics, description.training_data
@@ -516,9 +514,9 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
 def _left_out(
     method: Method, examples: Examples, home: Indices, marked: Bool, description: Description
 ) -> Float64:
-    """Return what a classifier says of parts of a home that it was not adapted to.
+    """Return the decisions of adapted classifiers for held-out parts of a home.
 
-    NaN for all but the home, and for all if too little of it is marked.
+    NaN for segments outside the home, and for all segments if too few are marked.
     """
     everything, count = np.arange(len(examples.target)), len(description.classes)
     if marked.sum() < _FEWEST_SEGMENTS:
@@ -531,7 +529,7 @@ def _left_out(
 
 
 def _parts(marked: Bool) -> list[Indices]:
-    """Divide the segments of a home into parts, each with its share of the marked ones."""
+    """Divide the segments of a home into parts with equal shares of the marked ones."""
     of_marks, others = (np.array_split(np.flatnonzero(same), _FOLDS) for same in (marked, ~marked))
     return [np.concatenate(pair) for pair in zip(of_marks, others, strict=True)]
 
@@ -539,9 +537,9 @@ def _parts(marked: Bool) -> list[Indices]:
 def _temperature_here(
     left_out: Float64, examples: Examples, home: Indices, description: Description
 ) -> float:
-    """Return the inverse temperature of a model adapted to a home, by parts of it left out.
+    """Return the inverse temperature of an adapted model, cross-validated over parts of a home.
 
-    Marks alone, of what was hard, would make it unsure of all the rest.
+    Marks alone are hard cases and would make the model underconfident elsewhere.
     """
     before = description.base_inverse_temperature or description.inverse_temperature
     tried = home[np.isfinite(left_out[home]).all(axis=1)]
@@ -555,6 +553,6 @@ def _is_confirmed(home: Dataset) -> Bool:
 
 
 def _confirmed(home: Dataset) -> dict[str, int]:
-    """Count the segments of each class that are as they were labelled."""
+    """Count the segments of each class that keep the label of the model."""
     counts = np.bincount(home.target[_is_confirmed(home)], minlength=len(home.classes))
     return {name: int(count) for name, count in zip(home.classes, counts, strict=True) if count}

@@ -16,7 +16,7 @@ from hearthlog.models.classifiers.model import Elsewhere
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.errors import Progress
 
-Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
+Fold = tuple[Indices, Indices]  # training and test segments
 
 
 def cross_validate(
@@ -26,17 +26,17 @@ def cross_validate(
     folds: Iterable[Fold],
     progress: Progress,
 ) -> Float64:
-    """Classify segments by classifiers that have not seen them.
+    """Classify segments with classifiers trained on other folds.
 
     Parameters
     ----------
     progress : callable
-        Is told the share of the fits that is done, 0 to 1.
+        Receives the completed share of the fits, 0 to 1.
 
     Returns
     -------
     np.ndarray [shape=(len(methods), n, C)], float64
-        Decision values; -inf for a class that was not learned, NaN for segments that no fold tests.
+        Decision values; -inf for a class without training data, NaN for segments in no test fold.
     """
     from joblib import delayed  # noqa: PLC0415  part of the extra `headless`
 
@@ -54,7 +54,7 @@ def cross_validate(
 
 
 def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Float64:
-    """Classify the test segments of a fold; joblib sends each array, an argument, once."""
+    """Classify the test segments of a fold; joblib sends each array argument once."""
     examples, (seen, unseen) = Examples(*arrays), fold
     learned = method.fit(examples, seen)
     return examples.decide(learned, unseen, classes)
@@ -66,12 +66,12 @@ def softmax(values: Float64) -> Float64:
     Parameters
     ----------
     values : np.ndarray [shape=(n, C)], float64
-        Decision values; -inf is allowed, but not for a whole row.
+        Decision values; -inf is allowed, but not for a complete row.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
-        Every row sums up to 1; 0 where the decision value is -inf.
+        Each row sums to 1; 0 where the decision value is -inf.
     """
     grown = np.exp(values - values.max(axis=1, keepdims=True))
     return grown / grown.sum(axis=1, keepdims=True)
@@ -79,20 +79,20 @@ def softmax(values: Float64) -> Float64:
 
 KNOWN_LOST = 0.05  # share of known segments that may be labelled `unknown`
 _FEWEST_COLLECTIONS = 3
-_FEWEST_SOURCES = 5  # in other collections, of a class that they teach
+_FEWEST_SOURCES = 5  # of a class in other collections
 _BASE_SEGMENTS = 30
-_FEWEST_LABELLED = 10  # segments of a class, for a calibration error of it
+_FEWEST_LABELLED = 10  # segments of a class, for its calibration error
 _FEWEST_SEGMENTS = 20  # of a collection with a fold of its own
 
 
 def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
-    """Leave out one collection after the other; small ones together.
+    """Return folds that hold out one collection each; small collections share a fold.
 
     Returns
     -------
     list of Fold
-        Empty if there are fewer than three folds, if one leaves a single class to learn from, or if
-        fewer than half of all other classes are told by other collections.
+        Empty if there are fewer than three folds, if one leaves a single class for training, or if
+        fewer than half of all other classes occur in other collections.
     """
     counts = np.bincount(data.collection)
     fold = np.where(counts < _FEWEST_SEGMENTS, len(counts), np.arange(len(counts)))[data.collection]
@@ -108,7 +108,7 @@ def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> l
 
 
 def taught_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
-    """Tell which segments are of a known class of which the other folds have five sources.
+    """Return which segments have a known class with five sources in the other folds.
 
     Returns
     -------
@@ -127,15 +127,15 @@ def taught_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
 def calibrate_elsewhere(
     decisions: Float64, data: Dataset, folds: Sequence[Fold]
 ) -> tuple[float, Elsewhere]:
-    """Find the temperature that holds in collections of which nothing was learned.
+    """Find the temperature for collections outside the training set.
 
-    It is found from segments of classes of which the others have five sources. The scores are of
-    these, and macro F1 of segments of no class of the scenario, too.
+    The temperature is fitted on segments of classes with five sources in the other folds. Scores
+    cover these segments; macro F1 also covers segments of no class of the scenario.
 
     Parameters
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
-        Of classifiers that were not learned from the fold of the segment.
+        Of classifiers trained without the fold of the segment.
     """
     taught = taught_elsewhere(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
@@ -144,14 +144,14 @@ def calibrate_elsewhere(
 
 
 def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Elsewhere:
-    """Score what is said of collections of which nothing was learned.
+    """Score predictions for collections outside the training set.
 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float64
-        Of classifiers that were not learned from the collection of the segment.
+        Of classifiers trained without the collection of the segment.
     taught : np.ndarray [shape=(n,)], bool
-        As `taught_elsewhere` tells.
+        Result of `taught_elsewhere`.
     """
     predicted, scored = probabilities.argmax(axis=1), taught.copy()
     if UNKNOWN in data.classes:
@@ -172,7 +172,7 @@ def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Els
 def _of_classes(
     probabilities: Float64, target: Indices, classes: Sequence[str]
 ) -> dict[str, float]:
-    """Return how far the probability of each known class is from the share that is right of it."""
+    """Return the calibration error of each known class: probability against frequency."""
     predicted, sure = probabilities.argmax(axis=1), probabilities.max(axis=1)
     errors = {}
     for number, name in enumerate(classes):
@@ -183,7 +183,7 @@ def _of_classes(
 
 
 def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
-    """Move the temperature of a model by segments of a home, as far as their number allows.
+    """Adjust the temperature of a model to a home, as far as its segment count allows.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
     target : np.ndarray [shape=(n,)], intp
         Classes of the segments.
     base : float
-        Inverse temperature of the model; it counts as much as 30 segments.
+        Inverse temperature of the model; weighs as much as 30 segments.
     """
     if not len(target):
         return base
@@ -204,18 +204,18 @@ def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
 def nested_probabilities(
     decisions: Float64, target: Indices, folds: Sequence[Fold], used: Bool | None = None
 ) -> Float64:
-    """Turn decision values into probabilities, those of each fold by the other folds' temperature.
+    """Convert decisions to probabilities; each fold uses the temperature of the other folds.
 
     Parameters
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
-        Of classifiers that were not learned from the fold of the segment.
+        Of classifiers trained without the fold of the segment.
     target : np.ndarray [shape=(n,)], intp
         Indices of the true classes.
     folds : sequence of Fold
-        At least two; each segment is tried in one of them.
+        At least two; each segment is tested in one of them.
     used : np.ndarray [shape=(n,)], bool, optional
-        Segments from which temperatures are found; all by default.
+        Segments for fitting temperatures; all by default.
 
     Returns
     -------
@@ -226,7 +226,7 @@ def nested_probabilities(
     for _, unseen in folds:
         others = used.copy()
         others[unseen] = False
-        if not others.any():  # nothing else can tell
+        if not others.any():  # no other fold has used segments
             others[unseen] = True
         inverse = inverse_temperature(decisions[others], target[others])
         probabilities[unseen] = softmax(inverse * decisions[unseen])
@@ -234,19 +234,19 @@ def nested_probabilities(
 
 
 def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) -> Float64:
-    """Find what to add to decision values so that few known segments are labelled `unknown`.
+    """Find the bias of class `unknown` that keeps false rejections of known segments rare.
 
     Parameters
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
-        Of segments that were not learned from.
+        Decision values of segments outside the training set.
     target : np.ndarray [shape=(n,)], intp
         Their classes.
 
     Returns
     -------
     np.ndarray [shape=(C,)], float64
-        Zero but for the class `unknown`, if there is one.
+        Zero except for class `unknown`, if it exists.
     """
     bias = np.zeros(len(classes))
     if UNKNOWN in classes:
@@ -266,7 +266,7 @@ def inverse_temperature(decisions: Float64, target: Indices) -> float:
     Parameters
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
-        Decision values; -inf for a class that was not learned.
+        Decision values; -inf for a class without training data.
     target : np.ndarray [shape=(n,)], intp
         Indices of the true classes.
 

@@ -1,4 +1,4 @@
-"""Sound of labelled clips: decoded, altered by rooms and microphones, and embedded."""
+"""Sound of labelled clips: decoding, room and microphone augmentation, embeddings."""
 
 import hashlib
 import warnings
@@ -30,13 +30,13 @@ MOST_SECONDS = 3600.0  # of a clip, which is held in memory
 
 
 class ClipSound(NamedTuple):
-    """The sound of a clip, without the frames that hold samples that are no numbers.
+    """Sound of a clip without frames with non-finite samples.
 
     Attributes
     ----------
     frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Whole frames at 16 kHz, of which a recorder takes features; none of a part behind the end
-        of the file.
+        Complete frames at 16 kHz, as a recorder would process them; an incomplete frame at the end
+        of the file is dropped.
     """
 
     frames: Float32
@@ -45,7 +45,7 @@ class ClipSound(NamedTuple):
 
 
 def clip_frames(clip: LabelledClip) -> Float32:
-    """Read the frames of a clip, as of `read_clip`."""
+    """Read the frames of a clip; see `read_clip`."""
     return read_clip(clip).frames
 
 
@@ -53,7 +53,7 @@ def read_clip(clip: LabelledClip) -> ClipSound:
     """Read a clip.
 
     Raise `SourceError` if the clip cannot be read completely, is longer than an hour, or has no
-    sample that is finite.
+    finite sample.
     """
     cutter = FrameCutter()
     faults: list[str] = []
@@ -80,8 +80,8 @@ def read_clip(clip: LabelledClip) -> ClipSound:
     return ClipSound(np.concatenate(sounds), breaks.tolist(), int((~is_finite).sum()))
 
 
-_COPIED_SHARE = 0.5  # of the copies are in a reverberant room, and as many by another microphone
-_REVERBERATION_SECONDS = (0.1, 0.6)  # until it has fallen by 60 dB
+_COPIED_SHARE = 0.5  # of the copies have reverberation; as many have another microphone
+_REVERBERATION_SECONDS = (0.1, 0.6)  # RT60
 _DIRECT_DB = (-6.0, 12.0)  # direct sound above the reverberation
 _DIRECT_SAMPLES = 48  # 3 ms without an echo
 _TILT_SHARE, _TILT = 0.6, (-3.0, 3.0)  # dB an octave
@@ -91,7 +91,7 @@ _LIMITS_ORDER = 4  # of a Butterworth filter
 _SETTLING = 4000  # samples
 _GAIN_DB = (-20.0, 20.0)
 _SIGNAL_TO_NOISE_DB = (5.0, 30.0)
-_SILENCE_DBFS = (-85.0, -40.0)  # noise in a room where nothing happens
+_SILENCE_DBFS = (-85.0, -40.0)  # noise in a silent room
 _ROOM_NOISE_DBFS = (-100.0, -30.0)  # limits of all noise
 _STEADY_DBFS = (-85.0, -32.0)
 _SLOPES = (0.0, 0.25, 0.5, 0.75, 1.0)  # amplitude falls with the frequency to this power
@@ -107,7 +107,7 @@ class RoomCopy(NamedTuple):
     ----------
     features : np.ndarray [shape=(n, d)], float32
     floor : np.ndarray [shape=(b,)], float64
-        Floor of the room, as a tracker would have it; powers of the bands of the feature set.
+        Floor of the room as the tracker estimates it: band powers of the feature set.
     """
 
     features: Float32
@@ -117,7 +117,7 @@ class RoomCopy(NamedTuple):
 def in_room(
     frames: Float32, features: FeatureSet, rng: np.random.Generator, *, silence: bool
 ) -> RoomCopy:
-    """Compute the features of a sound in a room with steady noise, by any microphone.
+    """Compute the features of a sound in a random room with steady noise and microphone.
 
     Parameters
     ----------
@@ -131,9 +131,9 @@ def in_room(
 def other_room(
     frames: Float32, rng: np.random.Generator, *, silence: bool
 ) -> tuple[Float64, float]:
-    """Put a sound into another room, before another microphone, without the noise there.
+    """Apply a random room and microphone to a sound; return the noise level separately.
 
-    Reverberation is exponentially decaying noise behind the direct sound, as in Moorer, "About this
+    Reverberation is exponentially decaying noise after the direct sound, as in Moorer, "About this
     reverberation business", 1979; a microphone has tilt, bumps and band limits.
 
     Parameters
@@ -145,7 +145,7 @@ def other_room(
     -------
     sound : np.ndarray [shape=(n * FRAME_SAMPLES,)], float64
     level : float
-        Of the noise, in dBFS.
+        Noise level in dBFS.
     """
     sound = frames.ravel().astype(np.float64) * 10.0 ** (rng.uniform(*_GAIN_DB) / 20.0)
     if rng.random() < _COPIED_SHARE:
@@ -167,9 +167,9 @@ def in_noise(
     Parameters
     ----------
     sound : np.ndarray [shape=(n,)], float64
-        Samples of whole frames at 16 kHz, at least one frame.
+        Samples of complete frames at 16 kHz, at least one frame.
     level : float
-        Of the noise, in dBFS.
+        Level of the noise in dBFS.
     """
     noise = steady_noise(len(sound), level, rng)
     copy = captured(sound + noise, features)
@@ -182,7 +182,7 @@ def in_noise(
 
 
 def level_of(sound: Float64) -> float:
-    """Return the mean level of a sound in dBFS, not below -120.
+    """Return the mean level of a sound in dBFS, at least -120.
 
     Parameters
     ----------
@@ -204,21 +204,21 @@ def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
 def reverberated(
     sound: Float64, seconds: float, direct: float, rng: np.random.Generator
 ) -> Float64:
-    """Put a sound into a reverberant room.
+    """Add reverberation to a sound.
 
     Parameters
     ----------
     sound : np.ndarray [shape=(n,)], float64
         Samples at 16 kHz.
     seconds : float
-        Until the reverberation has fallen by 60 dB (RT60).
+        Reverberation time (RT60).
     direct : float
-        Direct sound above the reverberation, in dB.
+        Level of the direct sound above the reverberation, in dB.
 
     Returns
     -------
     np.ndarray [shape=(n,)], float64
-        Of the same power.
+        With the power of the original.
     """
     from scipy.signal import fftconvolve  # noqa: PLC0415  what reads a home needs no rooms
 
@@ -231,7 +231,7 @@ def reverberated(
 
 
 def filtered(sound: Float64, response: Callable[[Float64], Float64]) -> Float64:
-    """Change the spectrum of a sound.
+    """Apply a frequency response to a sound.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def filtered(sound: Float64, response: Callable[[Float64], Float64]) -> Float64:
     Returns
     -------
     np.ndarray [shape=(n,)], float64
-        Of the same power.
+        With the power of the original.
     """
     count = len(sound) + _SETTLING + len(sound) % 2
     frequencies = np.linspace(0.0, SAMPLE_RATE / 2, count // 2 + 1)
@@ -252,14 +252,14 @@ def filtered(sound: Float64, response: Callable[[Float64], Float64]) -> Float64:
 
 
 def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
-    """Return the response of a microphone that is deaf below and above, in dB.
+    """Return the response of a band-limited microphone in dB.
 
     Parameters
     ----------
     frequencies : np.ndarray [shape=(n,)], float64
         In hertz.
     low, high : float
-        In hertz; there the response is -3 dB.
+        Limits in hertz, where the response is -3 dB.
     """
     frequencies = np.maximum(frequencies, 1.0)
     order = 2 * _LIMITS_ORDER
@@ -269,7 +269,7 @@ def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
 
 
 def octaves_of(frequencies: Float64) -> Float64:
-    """Return how many octaves frequencies are above 1 kHz.
+    """Return the distance of frequencies from 1 kHz in octaves.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def octaves_of(frequencies: Float64) -> Float64:
 
 
 def _microphone_response(rng: np.random.Generator) -> Callable[[Float64], Float64]:
-    """Draw the response of a microphone."""
+    """Draw a random microphone response."""
     tilt = rng.uniform(*_TILT) * (rng.random() < _TILT_SHARE)
     count = _BUMPS if rng.random() < _TILT_SHARE else 0
     bumps = [
@@ -303,13 +303,13 @@ def _microphone_response(rng: np.random.Generator) -> Callable[[Float64], Float6
 
 
 def _of_power(changed: Float64, sound: Float64) -> Float64:
-    """Give a changed sound the power of the original."""
+    """Scale a processed sound to the power of the original."""
     factor: float = np.sqrt(np.square(sound).mean() / (np.square(changed).mean() + 1e-20))
     return changed * factor
 
 
 def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
-    """Make Gaussian noise whose spectrum falls by 0 to 6 dB an octave.
+    """Generate Gaussian noise with a spectrum that falls by 0 to 6 dB per octave.
 
     Parameters
     ----------
@@ -328,12 +328,12 @@ def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
 
 
 def captured(sound: Float64, features: FeatureSet) -> Float32:
-    """Compute the features of a sound as a microphone of 16 bits captures it.
+    """Compute the features of a sound captured by a 16-bit microphone.
 
     Parameters
     ----------
     sound : np.ndarray [shape=(n,)], float64
-        Samples of whole frames at 16 kHz in full scale; those beyond it are clipped.
+        Samples of complete frames at 16 kHz; values beyond full scale are clipped.
 
     Returns
     -------
@@ -352,42 +352,43 @@ AS_IT_IS, IN_A_ROOM, SHORT = 0, 1, 2  # versions of windows
 
 _WINDOW = WINDOW_FRAMES * FRAME_SAMPLES
 _HALF = _WINDOW // 2
-_HOP, _HOP_IN_ROOM = 4000, 8000  # samples: windows in a room cost as much, and teach less
-_FILLED = 0.5  # of a window, by a clip that is long enough
-_FILLED_BY_SHORT = 0.45  # of a clip that is shorter
-_PADDING_DBFS = -75.0  # where a clip is silent, no room is
+_HOP, _HOP_IN_ROOM = 4000, 8000  # samples: windows in a room cost as much, but help training less
+_FILLED = 0.5  # filled share of a window, for a clip that is long enough
+_FILLED_BY_SHORT = 0.45  # filled share of a window, for a shorter clip
+_PADDING_DBFS = -75.0  # digital silence does not occur in rooms
 _MOST_WINDOWS = 32  # windows of a version of a clip, evenly spaced
 _MIDDLE = 2000  # samples on either side of the middle of a window
-_BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB, that the middle of a window may be
+_BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB, limit for the centre of a window
 _SHORT_SECONDS = (0.3, 0.3, 0.6, 0.6)
 SHORT_PARTS = len(_SHORT_SECONDS)  # of a clip
 _SHORT_NOISE_DBFS = (-80.0, -60.0)
-_SHORT_PLACE = (0.1, 0.9)  # of the window, in which a short part lies
+_SHORT_PLACE = (0.1, 0.9)  # of the window: range for a short part
 _FAINTER_DB = (-20.0, 0.0)  # every other short part
 _NEAR, _FAR = 5, 1 << 60  # frames
 _EMBEDDING_SEED = 20_261_126
 
 
 class Embeds(Protocol):
-    """Embeds a window of 20 frames, as `Embedder` does: the integers that are logged."""
+    """Embeds a window of 20 frames into logged integers, as `Embedder` does."""
 
     def __call__(self, window: Float32) -> Int8:
         """Compute the integers of a window."""
 
 
 class ClipEmbeddings(NamedTuple):
-    """Windows of a clip.
+    """Embedded windows of a clip.
 
     Attributes
     ----------
     values : np.ndarray [shape=(m, W)], int8
-        As they are logged.
+        Logged integers.
     version : np.ndarray [shape=(m,)], intp
         `AS_IT_IS`, `IN_A_ROOM` or `SHORT`.
     taught : np.ndarray [shape=(m,)], bool
-        Whether heads learn from the window; the others are where the sound is faint.
+        Whether heads are trained on the window; the sound is faint in the others.
     starts : np.ndarray [shape=(m,)], intp
-        Frames of the clip at which windows as it is begin; below 0 before it. 0 of other versions.
+        Frame of the clip at which an unchanged window starts; negative before the clip. 0 for other
+        versions.
     """
 
     values: Int8
@@ -396,26 +397,26 @@ class ClipEmbeddings(NamedTuple):
     starts: Indices
 
     def at(self, start: int) -> Int8:
-        """Return the window nearest to one that begins at a frame, at most five frames from it.
+        """Return the window whose start is nearest to a frame, at most five frames away.
 
         Returns
         -------
         np.ndarray [shape=(1 or 0, W)], int8
-            None if there is none so near.
+            Empty if no window is near enough.
         """
         away = np.where(self.version == AS_IT_IS, np.abs(self.starts - start), _FAR)
         nearest = int(away.argmin()) if len(away) else 0
         return self.values[nearest : nearest + int(len(away) > 0 and away[nearest] <= _NEAR)]
 
     def part(self, rows: slice) -> "ClipEmbeddings":
-        """Return some of the windows."""
+        """Return a subset of the windows."""
         return ClipEmbeddings(
             self.values[rows], self.version[rows], self.taught[rows], self.starts[rows]
         )
 
 
 class ClipEmbedder:
-    """Embeds the windows of clips, those of each clip once."""
+    """Embeds the windows of clips; each clip is embedded once."""
 
     def __init__(self, embed: Embeds, seed: int = 0) -> None:
         self._embed, self._seed = embed, seed
@@ -423,7 +424,7 @@ class ClipEmbedder:
         self._done: dict[bytes, ClipEmbeddings] = {}
 
     def __call__(self, frames: Float32, segments: Indices, *, silence: bool) -> ClipEmbeddings:
-        """Embed the windows of a clip, as of `clip_embeddings`."""
+        """Embed the windows of a clip; see `clip_embeddings`."""
         digest = hashlib.sha256(np.ascontiguousarray(frames).tobytes())
         digest.update(segments.astype("<i8").tobytes() + bytes([silence]))
         key = digest.digest()
@@ -437,19 +438,18 @@ class ClipEmbedder:
 def clip_embeddings(
     frames: Float32, embed: Embeds, segments: Indices, *, silence: bool, seed: int = 0
 ) -> ClipEmbeddings:
-    """Embed the windows of a clip; the same clip and seed give the same ones.
+    """Embed the windows of a clip; deterministic for a clip and seed.
 
-    A home gives windows that a sound fills in part, short sounds, and other rooms; so do these.
+    Homes contain partly filled windows, short sounds and other rooms; so do these windows.
 
     Parameters
     ----------
     frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         At least one.
     segments : np.ndarray [shape=(k,)], intp
-        Frames at which the segments of the clip begin, multiples of five: these windows are
-        embedded in any case.
+        Start frames of the clip's segments, multiples of five; their windows are always embedded.
     silence : bool
-        Whether nothing happens in the clip: then only its segments are embedded.
+        Whether the clip is silent: only its segments are embedded.
     """
     digest = hashlib.blake2b(np.ascontiguousarray(frames).tobytes(), digest_size=8).digest()
     rng = np.random.default_rng([_EMBEDDING_SEED + seed, int.from_bytes(digest, "little")])
@@ -489,7 +489,7 @@ def clip_embeddings(
 
 
 def _padding_samples(sound: Float64) -> int:
-    """Return the samples of a sound with half a window before and behind it."""
+    """Return the samples of a sound padded by half a window on both sides."""
     return len(sound) + 2 * _HALF
 
 
@@ -499,9 +499,9 @@ def _padded(sound: Float64, noise: Float64) -> Float64:
 
 
 def _taught(padded: Float64, count: int, hop: int) -> Indices:
-    """Return the middles of the windows to learn from, in samples of the clip.
+    """Return the centres of training windows in samples of the clip.
 
-    They are filled well enough, and not faint in their middle.
+    These windows are filled sufficiently and not faint at the centre.
     """
     middles = np.arange(0, count + 1, hop)
     filled = np.minimum(middles + _HALF, count) - np.maximum(middles - _HALF, 0)
@@ -533,12 +533,12 @@ def _window(samples: Float64) -> Float32:
 
 
 def _short_parts(sound: Float64, rng: np.random.Generator) -> Iterator[Float32]:
-    """Yield windows of faint noise with a short part of a sound somewhere, the loudest one."""
+    """Yield windows of faint noise with the loudest short part of a sound at a random place."""
     power = np.concatenate([[0.0], np.cumsum(np.square(sound))])
     for number, seconds in enumerate(_SHORT_SECONDS):
         length = min(int(seconds * SAMPLE_RATE), len(sound))
         loudest = int(np.argmax(power[length:] - power[:-length]))
-        part = sound[loudest : loudest + length] * np.hanning(length) ** 0.1  # no clicks
+        part = sound[loudest : loudest + length] * np.hanning(length) ** 0.1  # avoids clicks
         if number % 2:
             part *= 10.0 ** (rng.uniform(*_FAINTER_DB) / 20.0)
         level = rng.uniform(*_SHORT_NOISE_DBFS)
@@ -551,7 +551,7 @@ def _short_parts(sound: Float64, rng: np.random.Generator) -> Iterator[Float32]:
 
 
 def _noise_of(samples: Float64) -> SteadyNoise:
-    """Return the noise of a room in which there is nothing else, as it is learned there."""
+    """Return the learned noise of an otherwise silent room."""
     noise = SteadyNoise()
     for first in range(0, len(samples) - _WINDOW + 1, _WINDOW):
         noise.learn(_window(samples[first : first + _WINDOW]))
@@ -559,14 +559,10 @@ def _noise_of(samples: Float64) -> SteadyNoise:
 
 
 def model_embedder(model: Model) -> ClipEmbedder | None:
-    """Return what hears clips for the heads of a model; None if it has none.
+    """Return the clip embedder for the heads of a model; None without heads.
 
-    Without its network, or with another projection, a `HearthlogWarning` says that the model is
-    tried without it.
-
-    Parameters
-    ----------
-    model : Model
+    If the network is missing or the projection differs, a `HearthlogWarning` reports that the model
+    is evaluated without it.
     """
     mix = model.description.embedding
     if mix is None:
@@ -587,9 +583,9 @@ def model_embedder(model: Model) -> ClipEmbedder | None:
 
 @lru_cache(maxsize=2)
 def network_embedder(network: str, seed: int = 0) -> ClipEmbedder:
-    """Return what hears clips by a network.
+    """Return the clip embedder of a network.
 
-    Raise `ModelError` if it is not known, not there, another file, or cannot be used.
+    Raise `ModelError` if the network is unknown, missing, a different file, or unusable.
     """
     path = find_network(network)
     if path is None:

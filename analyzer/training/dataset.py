@@ -1,4 +1,4 @@
-"""Datasets: windows of one second for training, cut from labelled sound."""
+"""Datasets: training windows of one second, cut from labelled sound."""
 
 import hashlib
 from collections import Counter
@@ -39,32 +39,32 @@ HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
 _WINDOWS_PER_GROUP = 32  # windows of each version
 UNREADABLE = "cannot be read, or not all of it"
-CONFIRMED = "this home, as it was labelled"  # a collection
+CONFIRMED = "this home, as it was labelled"  # name of a collection
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 _SEED = 20_261_122
 
 
 class Recording(NamedTuple):
-    """Sound of one label.
+    """Sound with one label.
 
     Attributes
     ----------
     label, group, collection, licence : str
-        As in a manifest; a group is never both learned from and tested on.
+        As in a manifest; a group is never in both training and test sets.
     features : np.ndarray [shape=(n, d)], float32
         Features of successive frames.
     floor : np.ndarray [shape=(n, b)], float64, or None
-        Floor of the room at each frame; None for none, as in a clip that was cut out of it.
+        Floor of the room at each frame; None without a room, as in a cut clip.
     most : int or None
-        Segments of it at most, evenly spaced; None for no limit.
+        Maximum number of segments, evenly spaced; None for no limit.
     span : (int, int) or None
-        Its start and end in nanoseconds of UTC, if that is known.
+        Start and end in nanoseconds of UTC, if recorded.
     fault : str
-        Why it could not be read; empty if it could.
+        Read error; empty if there is none.
     hole : str
-        What is missing there; empty if nothing is.
+        Missing part; empty if complete.
     embedded : ClipEmbeddings or None
-        Windows of it as a network hears them; None without a network.
+        Embedded windows; None without a network.
     """
 
     label: str
@@ -85,18 +85,18 @@ class Recording(NamedTuple):
 
 
 class EmbeddingWindows(NamedTuple):
-    """Windows of sound as a network hears them, to learn heads from.
+    """Embedded windows for training heads.
 
     Attributes
     ----------
     values : np.ndarray [shape=(m, W)], int8
-        As they are logged.
+        Logged integers.
     target, group, collection : np.ndarray [shape=(m,)], intp
-        As those of segments.
+        As for segments.
     tried : np.ndarray [shape=(m,)], bool
-        Whether it is a window as it is, by which it is found how sure a head may be.
+        Whether the window is unchanged and used for calibrating heads.
     recording : np.ndarray [shape=(m,)], intp
-        Number of the recording that it is of: in a home, of a mark.
+        Number of the recording; in a home, of the mark.
     """
 
     values: Int8
@@ -107,7 +107,7 @@ class EmbeddingWindows(NamedTuple):
     recording: Indices
 
     def rows(self, chosen: Indices | Bool) -> "EmbeddingWindows":
-        """Return some of the windows."""
+        """Return a subset of the windows."""
         return EmbeddingWindows(
             self.values[chosen],
             self.target[chosen],
@@ -131,7 +131,7 @@ NO_WINDOWS = EmbeddingWindows(
 
 @dataclass(frozen=True)
 class Dataset:
-    """Segments to learn from: windows of one second.
+    """Training segments: windows of one second.
 
     Attributes
     ----------
@@ -146,20 +146,20 @@ class Dataset:
     floor : np.ndarray [shape=(n, b)], float64
         Floor of the room; b is 0 for a feature set without bands.
     copies : np.ndarray [shape=(k, n, window_frames, d)], float32
-        The same segments in other rooms; NaN where there is none.
+        The same segments in other rooms; NaN where a copy is missing.
     copy_floor : np.ndarray [shape=(k, n, b)], float64
     seconds : dict of str to float
-        Seconds of sound of each class, before it was thinned out.
+        Seconds of sound of each class before thinning.
     spans : np.ndarray [shape=(k, 2)], int64
-        Starts and ends of the recordings that were used, in nanoseconds of UTC, if they are known.
-    sightings : sequence of (Sighting or None)
-        Whence the recording of each segment came, if that is known; empty if it is of none.
+        Starts and ends of the used recordings, in nanoseconds of UTC, if recorded.
+    sightings : sequence of (DirectionSample or None)
+        Direction of the recording of each segment, if recorded; empty if none has one.
     left_out : sequence of SkippedClip
-        Recordings that could not be read, which `skipped` counts too, and parts of others.
+        Unreadable recordings, which `skipped` counts too, and unreadable parts of others.
     embedded : np.ndarray [shape=(n, W)], int8
-        The segments as a network hears them; W is 0 without a network.
+        Embeddings of the segments; W is 0 without a network.
     is_embedded : np.ndarray [shape=(n,)], bool
-        Of which segments that is known.
+        Whether a segment has an embedding.
     """
 
     windows: Float32
@@ -221,34 +221,32 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     embedder: ClipEmbedder | None = None,
     seed: int = 0,
 ) -> Dataset:
-    """Cut clips, and recordings of a home, into the segments of a scenario.
+    """Cut clips and recordings of a home into segments of a scenario.
 
     Parameters
     ----------
-    clips : sequence of LabelledClip
-    scenario : Scenario
     progress : callable
-        Is told the share of the clips that is done, 0 to 1.
+        Receives the completed share of the clips, 0 to 1.
     home : iterable of Recording
         Further recordings; their labels may be names of classes.
     features : FeatureSet
-        The features to compute; those of `home` are of the same set.
+        Features to compute; `home` must have the same set.
     rooms : int
         Number of copies of each clip in other rooms.
     embedder : ClipEmbedder, optional
-        Hears the windows of clips, for methods with heads.
+        Embeds the windows of clips, for methods with heads.
     seed : int
-        Of the rooms.
+        Seed of the random rooms.
 
     Returns
     -------
     Dataset
-        As `cut_recordings` makes it.
+        Result of `cut_recordings`.
 
     Raises
     ------
     DataError
-        If a class is left without segments.
+        If a class has no segments.
     """
     of_clips = clip_recordings(clips, scenario, progress, features, rooms, embedder, seed)
     data = cut_recordings(chain(of_clips, home), scenario, features)
@@ -273,22 +271,18 @@ def clip_recordings(  # noqa: PLR0913, PLR0917
 ) -> Iterator[Recording]:
     """Read clips and compute their features.
 
-    Clips of labels outside the scenario have none, nor those that cannot be read.
+    Clips with labels outside the scenario and unreadable clips have no features.
 
     Parameters
     ----------
-    clips : sequence of LabelledClip
-    scenario : Scenario
     progress : callable
-        Is told the share of the clips that is done, 0 to 1.
-    features : FeatureSet, optional
-        The features to compute.
+        Receives the completed share of the clips, 0 to 1.
     rooms : int
-        Number of copies in other rooms; the same clips and seed get the same ones.
+        Number of copies in other rooms; deterministic for clips and seed.
     embedder : ClipEmbedder, optional
-        Hears the windows of clips, for methods with heads.
+        Embeds the windows of clips, for methods with heads.
     seed : int
-        Of the rooms.
+        Seed of the random rooms.
 
     Yields
     ------
@@ -320,15 +314,15 @@ def cut_recordings(
 ) -> Dataset:
     """Cut recordings into segments of one window, half a second apart.
 
-    Segments of silence are all kept, others if they are above -60 dBFS and at most 12 dB below the
-    mean level of their recording. Of each class, source group and collection at most 24 segments,
-    times their weight, are kept, evenly spaced.
+    All segments of silence are kept; others if above -60 dBFS and at most 12 dB below the mean
+    level of their recording. At most 24 evenly spaced segments, times their weight, are kept of
+    each class, source group and collection.
 
     Returns
     -------
     Dataset
-        Its classes are those of the scenario, some of which may have no segments; `skipped` says
-        why recordings gave none.
+        With the classes of the scenario, some possibly without segments; `skipped` counts the
+        reasons for recordings without segments.
     """
     classes = tuple(scenario.classes)
     groups: dict[str, int] = {}
@@ -405,10 +399,9 @@ class _Chosen(NamedTuple):
 
 
 def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Float64]:
-    """Return the features of segments, as they are and in other rooms, and the floors.
+    """Return the features of segments, unchanged and in other rooms, and the floors.
 
-    Their shapes are (1 + k, n, window_frames, d) and (1 + k, n, b); NaN for a copy that a segment
-    has not.
+    Shapes are (1 + k, n, window_frames, d) and (1 + k, n, b); NaN for a missing copy.
     """
     count = 1 + max((len(segment.recording.copies) for segment in segments), default=0)
     shape = (count, len(segments), features.window_frames, features.width)
@@ -425,9 +418,9 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
 
 
 def _joined(embedded: Sequence[tuple[Recording, Indices]]) -> EmbeddingWindows:
-    """Join the windows that teach heads, evenly spaced ones where a source has many.
+    """Join the training windows of heads; windows of large sources are thinned evenly.
 
-    Each recording is of a class, a group and a collection.
+    Each recording has one class, group and collection.
     """
     parts = [
         (one.values[one.taught], one.version[one.taught], key, recording.weight)
@@ -452,7 +445,7 @@ def _joined(embedded: Sequence[tuple[Recording, Indices]]) -> EmbeddingWindows:
 
 
 def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:
-    """Return segments as a network hears them, and of which that is known; zeros elsewhere."""
+    """Return the embeddings of segments, zeros where missing, and which segments have one."""
     rows: list[tuple[int, Int8]] = []
     for number, (recording, start) in enumerate(segments):
         if recording.embedded is not None:
@@ -471,7 +464,7 @@ def _recording(
     rooms: int,
     rng: np.random.Generator,
 ) -> Recording:
-    """Compute the features of a clip, and of its copies in other rooms."""
+    """Compute the features of a clip and of its copies in other rooms."""
     frames, lost = sound.frames, sound.lost * FRAME_SECONDS
     runs = np.split(frames, sound.breaks)
     values = np.concatenate([features.extractor()(run) for run in runs])
@@ -495,7 +488,7 @@ def _recording(
 
 
 def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]:
-    """Return where the segments that are loud enough begin, and why there are none."""
+    """Return the starts of sufficiently loud segments, and the reason if there are none."""
     values, window = recording.features, features.window_frames
     nothing = np.empty(0, np.intp)
     if recording.fault:
@@ -525,7 +518,7 @@ def spread(values: Indices, most: int | None) -> Indices:
     ----------
     values : np.ndarray [shape=(n,)], intp
     most : int or None
-        How many at most; None for all.
+        Maximum count; None for all.
     """
     count = len(values) if most is None else min(len(values), most)
     return values[np.linspace(0, len(values) - 1, count).round().astype(np.intp)]
@@ -544,7 +537,7 @@ _DIGEST_BYTES = 8
 
 
 def segment_digests(windows: Float32) -> Int64:
-    """Return the digests of segments, without those of digital silence, which are all alike.
+    """Return the digests of segments; digital silence is excluded, as its digests are all equal.
 
     Parameters
     ----------
@@ -554,13 +547,13 @@ def segment_digests(windows: Float32) -> Int64:
     Returns
     -------
     np.ndarray [shape=(m,)], int64
-        Sorted, each once.
+        Sorted and unique.
     """
     return np.unique(_digests(windows)[_told_apart(windows)])
 
 
 def learned_digests(model: Model) -> Int64:
-    """Return the digests of what a model has learned from; older models have kept the segments.
+    """Return the digests of a model's training segments; older models store the segments.
 
     Returns
     -------
@@ -572,7 +565,7 @@ def learned_digests(model: Model) -> Int64:
 
 
 def learned_groups(model: Model, data: Dataset) -> Indices:
-    """Return the source groups of which a model has learned from a segment.
+    """Return the source groups with a segment in a model's training set.
 
     Returns
     -------
@@ -593,6 +586,6 @@ def _digests(windows: Float32) -> Int64:
 
 
 def _told_apart(windows: Float32) -> Bool:
-    """Tell in which segments the features change."""
+    """Return which segments have changing features."""
     changing: Bool = (windows != windows[:, :1]).any(axis=(1, 2))
     return changing

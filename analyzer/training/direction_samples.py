@@ -1,4 +1,4 @@
-"""Likelihood of each direction for each class, from the marks of a home."""
+"""Likelihood of each direction for each class, estimated from the marks of a home."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,26 +18,26 @@ from hearthlog.models.classifiers.model import (
 from hearthlog.schemas.arrays import Float64, Indices, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
-_SPREAD = np.deg2rad(10.0)  # of a sound that is always at one place
-_DOUBT = 2.0  # sounds, with which a direction says half as much as with many
-_WITNESSES = 2.0  # as many as the blocks of a second are together
+_SPREAD = np.deg2rad(10.0)  # of a sound at a fixed place
+_DOUBT = 2.0  # number of sounds that gives half the weight of many
+_WITNESSES = 2.0  # equivalent number of independent blocks in a second
 _MOST = 4.0
-_ONE_SOUND = 10 * NANOSECONDS  # in which a class is at one place
+_ONE_SOUND = 10 * NANOSECONDS  # in which a class stays at one place
 _HOUR = 3600 * NANOSECONDS
-_AGAIN = np.linspace(0, 0.95, 20)  # shares of the sounds that come from a place of before
+_AGAIN = np.linspace(0, 0.95, 20)  # shares of sounds from an earlier place
 
 
 class DirectionSample(NamedTuple):
-    """Whence a recording came.
+    """Directions of a recording.
 
     Attributes
     ----------
     microphone : str
         Name of the array.
     start : int
-        When, in nanoseconds of UTC.
+        In nanoseconds of UTC.
     shares : np.ndarray [shape=(S,)], float64
-        Of the sectors of the circle; their sum is 1.
+        Shares of the sectors of the circle, with sum 1.
     """
 
     microphone: str
@@ -46,7 +46,7 @@ class DirectionSample(NamedTuple):
 
 
 def sighting_of(microphone: str, directions: Directions) -> DirectionSample | None:
-    """Sum up the directions of a recording; None if it has none."""
+    """Summarise the directions of a recording; None if it has none."""
     weight = directions.confidences.astype(np.float64)
     if not weight.sum() > 0:
         return None
@@ -57,16 +57,16 @@ def sighting_of(microphone: str, directions: Directions) -> DirectionSample | No
 def with_directions(
     model: Model, target: Indices, sightings: Sequence[DirectionSample | None]
 ) -> Model:
-    """Let a model take the directions of the arrays of a home.
+    """Add the direction likelihoods of a home's arrays to a model.
 
     Parameters
     ----------
     model : Model
-        That takes none.
+        Without direction likelihoods.
     target : np.ndarray [shape=(n,)], intp
-        Classes of segments that it was learned from; those of silence say nothing.
-    sightings : sequence of (Sighting or None)
-        Whence they came, if that is known; empty if it is of none.
+        Classes of its training segments; silence is ignored.
+    sightings : sequence of (DirectionSample or None)
+        Directions of the segments, if recorded; empty if none has one.
     """
     silence = model.classes.index(SILENCE) if SILENCE in model.classes else -1
     located = zip(target.tolist(), sightings, strict=False)
@@ -86,7 +86,7 @@ def with_directions(
 
 
 def _weights(target: Indices, sightings: Sequence[DirectionSample], classes: int) -> Float64:
-    """Return logarithms of the likelihood of sectors with a class over that with any class."""
+    """Return the log likelihood ratio of sectors: given a class against given any class."""
     sounds = _sounds(target, sightings)
     likely = np.full((classes, SECTORS), 1 / SECTORS)
     counts = np.bincount(sounds.target, minlength=classes)
@@ -101,17 +101,17 @@ def _weights(target: Indices, sightings: Sequence[DirectionSample], classes: int
 def evidence_of(
     classifier: Classifier, sightings: Sequence[DirectionSample | None]
 ) -> Float64 | None:
-    """Return what is known of segments by whence they came, as `Classifier.classify` takes it.
+    """Return the direction evidence of segments for `Classifier.classify`.
 
     Parameters
     ----------
-    sightings : sequence of (Sighting or None)
-        Of n segments; empty if it is known of none.
+    sightings : sequence of (DirectionSample or None)
+        Of n segments; empty if none has a direction.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64, or None
-        None if nothing is known.
+        None without any direction.
     """
     evidence = np.zeros((len(sightings), len(classifier.classes)))
     for row, one in enumerate(sightings):
@@ -122,7 +122,7 @@ def evidence_of(
 
 
 class _Sounds(NamedTuple):
-    """Sounds, each of one class: whence they came, and in which hour."""
+    """Sounds of one class each, with their directions and hours."""
 
     target: Indices
     hours: Int64
@@ -130,7 +130,7 @@ class _Sounds(NamedTuple):
 
 
 def _sounds(target: Indices, sightings: Sequence[DirectionSample]) -> _Sounds:
-    """Join what is of a class within ten seconds, so that it counts once however it was marked."""
+    """Merge recordings of a class within ten seconds; marking style must not change the count."""
     times = np.array([one.start for one in sightings], np.int64) // _ONE_SOUND
     joined, row = np.unique(np.stack([target, times]), axis=1, return_inverse=True)
     shares = np.zeros((joined.shape[1], SECTORS))
@@ -140,10 +140,10 @@ def _sounds(target: Indices, sightings: Sequence[DirectionSample]) -> _Sounds:
 
 
 def _likelihood(shares: Float64, hours: Int64) -> Float64:
-    """Return how likely each sector is with a class.
+    """Return the likelihood of each sector for a class.
 
-    How much of what was heard comes again from where it came is told by hours left out in turn:
-    that of a television nearly all, that of someone who walks about nearly nothing.
+    Cross-validation over hours estimates how often sounds return to earlier directions: nearly
+    always for a television, nearly never for a person who walks about.
     """
     near = shares @ _smoothing()
     others = (hours[:, np.newaxis] != hours).astype(np.float64)
@@ -160,7 +160,7 @@ def _likelihood(shares: Float64, hours: Int64) -> Float64:
 
 
 def _smoothing() -> Float64:
-    """Return how much of each sector is taken for each other one: von Mises, rows sum to 1."""
+    """Return the von Mises smoothing matrix of the sectors; rows sum to 1."""
     turn = np.arange(SECTORS) * (2 * np.pi / SECTORS)
     near = np.exp((np.cos(turn - turn[:, np.newaxis]) - 1) / _SPREAD**2)
     smoothing: Float64 = near / near.sum(axis=1, keepdims=True)

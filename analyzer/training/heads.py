@@ -18,17 +18,17 @@ from hearthlog.models.embedding.networks import NETWORKS
 from hearthlog.models.embedding.projection import read_projection
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
-_ALPHA = 30.0  # of inputs of one standard deviation, whatever their number
-_ROOT = 0.5  # a collection weighs as its number of windows to this power
+_ALPHA = 30.0  # for standardised inputs, independent of the window count
+_ROOT = 0.5  # exponent of a collection's window count in its weight
 _FEWEST_COLLECTIONS = 3
-_PARTS = 5  # of the sources, where there are fewer collections
-FEWEST_SOURCES = 3  # of a class; one of fewer is left to the other heads, and to names
+_PARTS = 5  # folds of the sources, with fewer collections
+FEWEST_SOURCES = 3  # of a class; other heads and names handle smaller classes
 _LARGEST = 2**31 - 1
 _STEPS = 200  # of a regression
 
 
 class LinearHeads(NamedTuple):
-    """Heads as a model has them.
+    """Linear heads as stored in a model.
 
     Attributes
     ----------
@@ -47,15 +47,15 @@ def learn_heads(
     inputs: Sequence[slice],
     seen: Bool | None = None,
 ) -> LinearHeads:
-    """Learn heads, each with the temperature that holds in collections left out.
+    """Fit heads, each with its temperature from held-out collections.
 
-    By ridge regression, for classes of few sources: a logistic head separates nine coughs by
-    whatever they have in common, ridge regression weighs by what varies in all windows.
+    Ridge regression suits classes of few sources: a logistic head separates nine coughs by any
+    feature they share, ridge regression weights features by their variation over all windows.
 
     Parameters
     ----------
     seen : np.ndarray [shape=(m,)], bool, optional
-        Which of the windows may be learned from; all by default.
+        Windows allowed for training; all by default.
     """
     sound = np.array([name != SILENCE for name in classes])[windows.target]
     chosen = sound if seen is None else sound & seen
@@ -76,7 +76,7 @@ def learn_heads(
 def regressed(  # noqa: PLR0913
     inputs: Float64, truth: Float64, weight: Float64, before: Float64, pull: Float64, *, free: bool
 ) -> tuple[Float64, Float64]:
-    """Return the weights and biases that, added to decision values, tell windows best.
+    """Fit weights and biases of a correction to decision values.
 
     This is multinomial logistic regression.
 
@@ -84,12 +84,12 @@ def regressed(  # noqa: PLR0913
     ----------
     inputs : np.ndarray [shape=(n, d)], float64
     truth : np.ndarray [shape=(n, C)], float64
-        Probabilities of the classes.
+        Target probabilities of the classes.
     weight : np.ndarray [shape=(n,)], float64
     before : np.ndarray [shape=(n, C)], float64
-        Logarithms of probabilities, up to a constant.
+        Log probabilities before the correction, up to a constant.
     pull : np.ndarray [shape=(C,)], float64
-        Of weights and biases to zero.
+        Regularisation of weights and biases to zero.
 
     Returns
     -------
@@ -120,14 +120,14 @@ def regressed(  # noqa: PLR0913
 
 
 def scaler_of(windows: EmbeddingWindows, classes: Sequence[str]) -> Float64:
-    """Return mean and standard deviation of the values of windows with sound, shape (2, W)."""
+    """Return mean and standard deviation over windows with sound, shape (2, W)."""
     sound = np.array([name != SILENCE for name in classes])[windows.target]
     values = windows.values[sound].astype(np.float64)
     return np.stack([values.mean(axis=0), np.maximum(values.std(axis=0), 1.0)])
 
 
 def in_units(values: Float64) -> Int32:
-    """Round weights or biases to those of a model."""
+    """Round weights or biases to the integer units of a model."""
     steps = np.clip(np.rint(values / UNIT), -_LARGEST, _LARGEST)
     return steps.astype(np.int32)
 
@@ -135,7 +135,7 @@ def in_units(values: Float64) -> Int32:
 def _calibrated(
     values: Float64, rows: EmbeddingWindows, count: int
 ) -> tuple[Float64, Float64, Indices]:
-    """Learn one head; returns weights and biases, times its inverse temperature, and which."""
+    """Fit one head; return its weights and biases, scaled by inverse temperature, and classes."""
     unit = rows.collection
     if len(np.unique(unit)) < _FEWEST_COLLECTIONS:
         unit = rows.group % _PARTS
@@ -154,7 +154,7 @@ def _calibrated(
 
 
 class _Sums:
-    """Sums over the windows of each class, collection and unit, of which any may be left out.
+    """Sums over windows by class, collection and unit, each of which can be held out.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class _Sums:
         self._gram = np.array([part.T @ part for part in parts]).reshape(-1, width, width)
 
     def ridge(self, kept: Bool) -> tuple[Float64, Float64, Indices]:
-        """Regress on the classes, which weigh the same; returns weights, biases and which."""
+        """Fit ridge regression with equal class weights; return weights, biases, classes."""
         target, collection = self.target[kept], self.collection[kept]
         count, total, gram = self._count[kept], self._sum[kept], self._gram[kept]
         windows = count.sum()
@@ -198,7 +198,7 @@ class _Sums:
 
     @staticmethod
     def _weights(number: Indices, collection: Indices, count: Float64) -> Float64:
-        """Weigh sums, 1 in all: classes the same, in each its collections by their root."""
+        """Return weights of the sums with total 1: classes equal, collections by square root."""
         pairs, of_pair = np.unique(np.stack([number, collection]), axis=1, return_inverse=True)
         of_pair = of_pair.ravel()
         together = np.bincount(of_pair, count)
@@ -210,19 +210,19 @@ class _Sums:
 
 HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
-_SUREST = 4.0  # inverse temperature: where nothing was wrong, too little was tried
+_SUREST = 4.0  # maximum inverse temperature: without errors the sample was too small
 CLASS_EXPONENT = 0.2
-_NAMES_BESIDE = 0.5  # weight of names beside both heads
+_NAMES_BESIDE = 0.5  # weight of names next to both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.25, 0.2  # of a step of a quarter of a logit
-_NAMES_BIAS = {FLUSHING_WATER: 2.5, OTHER: 1.5}  # which names alone miss
-_FOR_NAMES = 0.02  # of F1: folds share recordists and rooms with what is learned, not with names
+_NAMES_BIAS = {FLUSHING_WATER: 2.5, OTHER: 1.5}  # classes that names alone miss
+_FOR_NAMES = 0.02  # F1: folds share recordists and rooms with the training set, not with names
 _REJECTING_WEIGHT, _REJECTING_BIAS = 0.75, -0.8
 _OF_GENERAL = frozenset(BUILTIN["general"].classes) - {SILENCE}
 
 
 @dataclass(frozen=True)
 class HeadInputs:
-    """The values of an embedding that the linear heads of a model are learned on."""
+    """Values of an embedding that are the inputs of a model's linear heads."""
 
     network: str
     projection_sha256: str
@@ -231,14 +231,14 @@ class HeadInputs:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Names of the groups, which the last of the heads takes."""
+        """Names of the groups that the last head uses."""
         return self.names[self.inputs[-1]]
 
 
 def head_inputs_of(network: str) -> HeadInputs:
-    """Return the values of the embeddings of a network that linear heads are learned on.
+    """Return the embedding values of a network that are the inputs of linear heads.
 
-    Raise `ModelError` if it is not known, or its projection is damaged.
+    Raise `ModelError` if the network is unknown, or its projection is damaged.
     """
     projection = read_projection(NETWORKS.get(network).projection)
     components = projection.components.shape[1]
@@ -252,13 +252,12 @@ def head_inputs_of(network: str) -> HeadInputs:
 
 
 def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
-    """Return which of the windows for heads must not be learned from, as segments are left out.
+    """Return which head windows must be excluded when segments are held out.
 
     Parameters
     ----------
     unseen : np.ndarray [shape=(k,)], intp
-        Segments that are left out: with them go the sources and collections of which all segments
-        are.
+        Held-out segments; sources and collections are excluded if all their segments are held out.
     """
     seen = np.setdiff1d(np.arange(len(data)), unseen)
     lost = np.zeros(len(data.embedding_windows.target), bool)
@@ -273,12 +272,12 @@ def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
 def cross_validated_heads(
     data: Dataset, mix: EmbeddingMix, inputs: Sequence[slice], folds: Sequence[Fold]
 ) -> Float64:
-    """Return what heads say of segments that they have not learned from.
+    """Return the outputs of heads for held-out segments.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
-        As `EmbeddingHeads.log_probabilities`; NaN of segments without an embedding, or in no fold.
+        As from `EmbeddingHeads.log_probabilities`; NaN for segments without an embedding or fold.
     """
     by_heads = np.full((len(data), len(data.classes)), np.nan)
     for _, unseen in folds:
@@ -291,20 +290,20 @@ def cross_validated_heads(
 
 
 def can_learn_heads(data: Dataset) -> bool:
-    """Return whether heads can be learned: from two classes of sound, of some sources each."""
+    """Return whether heads can be trained: two classes of sound with enough sources each."""
     sources = _sources(data)[sounds_of(data.classes)]
     return int((sources >= FEWEST_SOURCES).sum()) > 1
 
 
 class Tried(NamedTuple):
-    """A way of leaving out, with what a classifier says of what was left out.
+    """A cross-validation scheme and the held-out decisions of a classifier.
 
     Attributes
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
         Of the classifier, times its inverse temperature.
     used : np.ndarray [shape=(n,)], bool
-        By which segments it is found how sure the mix may be.
+        Segments for fitting the temperature of the mix.
     """
 
     folds: Sequence[Fold]
@@ -313,13 +312,12 @@ class Tried(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """What was learned.
+    """Fitted heads and temperature of the mix.
 
     Attributes
     ----------
     of_sources, of_collections : np.ndarray [shape=(n, C)], float64
-        Logarithms of the probabilities of segments left out, with what the others say of how sure
-        the mix may be.
+        Log probabilities of held-out segments; each fold uses the temperature of the other folds.
     """
 
     mix: EmbeddingMix
@@ -329,14 +327,14 @@ class Mixture(NamedTuple):
 
 
 class BestMix(NamedTuple):
-    """The best one of the ways to mix.
+    """The best mix of heads, names and classifier.
 
     Attributes
     ----------
     by_heads : list of np.ndarray [shape=(n, C)], float64
-        What heads say of segments, for each way of leaving out.
+        Outputs of heads for segments, by cross-validation scheme.
     left_out : list of np.ndarray [shape=(n, C)], float64
-        Logarithms of the probabilities of segments, as sure as the others allow.
+        Log probabilities of held-out segments, with the temperature of the other folds.
     """
 
     mix: EmbeddingMix
@@ -346,12 +344,12 @@ class BestMix(NamedTuple):
 
 
 def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix:
-    """Try heads and a classifier together, with and without the names of the network as they are.
+    """Compare mixes of heads and classifier, with and without the class names of the network.
 
-    Names say what is of no class of the scenario. Where the classes are a few sounds among all
-    others, such as those of water, names may say of which class a sound is, instead of the head
-    that is learned from them. The mix that tells segments left out best is taken; such names may be
-    worse by a little.
+    Class names of the network detect sounds of no class of the scenario. Where the classes are a
+    few sounds among all others, such as sounds of water, names can also replace the trained head
+    for a class. The mix with the best score on held-out segments is chosen; a mix with such names
+    may score slightly worse.
 
     Parameters
     ----------
@@ -378,7 +376,7 @@ def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix
 
 
 class _Candidate(NamedTuple):
-    """Linear heads and names that may be mixed; `inputs` are those of the heads."""
+    """Linear heads and names for a mix; `inputs` are those of the heads."""
 
     inputs: tuple[slice, ...]
     names: list[NamesHead]
@@ -386,7 +384,7 @@ class _Candidate(NamedTuple):
 
 
 def _candidates(data: Dataset, taken: HeadInputs) -> list[_Candidate]:
-    """Return the ways to mix; a class of hardly any source cannot be measured without its names."""
+    """Return the mixes to compare; a class of few sources cannot be scored without names."""
     every = taken.inputs
     rejecting = rejecting_head(taken, data.classes)
     names = names_head(taken, data.classes)
@@ -404,7 +402,7 @@ def _candidates(data: Dataset, taken: HeadInputs) -> list[_Candidate]:
 
 
 def _sources(data: Dataset) -> Indices:
-    """Return the number of sources of the windows for heads, by class."""
+    """Return the number of sources of the head windows by class."""
     windows = data.embedding_windows
     pairs = np.unique(np.stack([windows.target, windows.group]), axis=1)
     return np.bincount(pairs[0], minlength=len(data.classes))
@@ -413,12 +411,12 @@ def _sources(data: Dataset) -> Indices:
 def learn_mixture(
     data: Dataset, taken: HeadInputs, sources: Tried, collections: Tried | None
 ) -> Mixture:
-    """Learn heads, and how sure they and a classifier may be together.
+    """Fit heads and the temperature of their mix with a classifier.
 
     Parameters
     ----------
     collections : Tried or None
-        None if there are too few of them.
+        None if there are too few collections.
     """
     ways = [sources] if collections is None else [sources, collections]
     best = best_mix(data, taken, ways)
@@ -447,12 +445,12 @@ def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
 
 
 def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
-    """Return what the names of a network say of whether a sound is of any known class.
+    """Return the head that detects unknown sounds by the class names of a network.
 
     Returns
     -------
     NamesHead or None
-        None where there is no class `unknown`, or no known one has a name.
+        None without a class `unknown`, or if no other class has a name.
     """
     first, groups = taken.inputs[-1].start, taken.groups
     known = [name for name in classes if name not in {SILENCE, UNKNOWN}]
@@ -471,7 +469,7 @@ def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | Non
 
 
 def names_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
-    """Return what the names of a network say of some classes; None if one of them has no name."""
+    """Return the head of class names of a network; None if a class has no name."""
     first, groups = taken.inputs[-1].start, taken.groups
     named = {name: _groups_of(name) for name in classes if name != SILENCE}
     if len(named) < 2 or not all(one in groups for same in named.values() for one in same):
@@ -482,12 +480,12 @@ def names_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
 
 
 def _groups_of(name: str) -> list[str]:
-    """Return the groups of names that mean a class."""
+    """Return the groups of names for a class."""
     return {UNKNOWN: ["outside"], OTHER: sorted(_OF_GENERAL)}.get(name, [name])
 
 
 def _of_names_alone(data: Dataset, mix: EmbeddingMix) -> Float64:
-    """Return what names alone say of all segments; they have not learned from any."""
+    """Return the outputs of names alone for all segments; names need no training."""
     by_heads = np.zeros((len(data), len(data.classes)))
     nothing = np.zeros((0, mix.values, len(data.classes)), np.int32)
     alone = mix.model_copy(update={"head_weights": []})
@@ -498,7 +496,7 @@ def _of_names_alone(data: Dataset, mix: EmbeddingMix) -> Float64:
 
 
 def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64) -> Float64:
-    """Mix what is said of segments left out, those of each fold as sure as the others allow."""
+    """Mix held-out outputs; each fold uses the temperature of the other folds."""
     result = way.decisions - _log_sum(way.decisions)
     for _, unseen in way.folds:
         others = np.ones(len(data), bool)
@@ -513,7 +511,7 @@ def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64) -> 
 def _inverse_temperature(
     data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64, chosen: Bool
 ) -> float:
-    """Find how sure the mix may be of which sound it is, by some of the segments."""
+    """Fit the inverse temperature of the mix on some of the segments."""
     sounds = sounds_of(data.classes)
     used = chosen & way.used & np.isin(data.target, sounds) & ~np.isnan(by_heads).any(axis=1)
     if not used.any():
@@ -525,7 +523,7 @@ def _inverse_temperature(
 
 
 def _right(data: Dataset, results: Sequence[Float64]) -> float:
-    """Return the mean macro F1 of ways of leaving out."""
+    """Return the mean macro F1 over cross-validation schemes."""
     numbers = np.unique(data.target)
     return float(
         np.mean(

@@ -50,12 +50,12 @@ from hearthlog.schemas.messages.topics import (
 
 _FIELDS = ("header.stamp", "frame", "values")
 _WARM_UP = 600 * NANOSECONDS
-_AROUND = 2 * NANOSECONDS  # by which a short mark is extended, and more
+_AROUND = 2 * NANOSECONDS  # covers the extension of a short mark
 
 
 @dataclass(frozen=True)
 class HomeSound:
-    """What one microphone recorded in one log, and what a reviewer said of it.
+    """Sound of one microphone in one log, with its review.
 
     Attributes
     ----------
@@ -66,9 +66,9 @@ class HomeSound:
     floors : np.ndarray [shape=(n, b)], float64, or None
         Floor of the room; None for a feature set without bands.
     directions : Directions
-        Of an array; none where only features were wanted.
+        Directions from an array; empty if only features were requested.
     embeddings : Embeddings
-        Of the network that was asked for; none of another one.
+        Embeddings of the requested network; empty for other networks.
     """
 
     log: Path
@@ -86,23 +86,23 @@ class HomeSound:
 
     @property
     def enrolled(self) -> bool:
-        """Whether it was cut out of its room."""
+        """Whether the sound was cut out of its room."""
         return ENROLLED in self.log.parts
 
     @property
     def drawn(self) -> list[tuple[int, int]]:
-        """Spans that were drawn at random, from which nothing is learned."""
+        """Spans drawn at random, which are excluded from training."""
         return [(span.start, span.end) for span in self.reviewed if span.chosen == RANDOM]
 
     def inside(self, spans: Sequence[tuple[int, int]], aside: int = 0) -> Bool:
-        """Tell which frames touch spans of time.
+        """Return which frames overlap spans of time.
 
         Parameters
         ----------
         spans : sequence of (int, int)
             Starts and ends in nanoseconds of UTC.
         aside : int
-            By how much each span is longer at both ends, in nanoseconds.
+            Extension of each span at both ends, in nanoseconds.
         """
         change = np.zeros(len(self.stamps) + 1, np.int64)
         times = np.array(spans, np.int64).reshape(-1, 2) + np.array([-aside, aside])
@@ -117,7 +117,7 @@ class HomeSound:
 def read_reviewed_sound(
     folder: Path, features: FeatureSet, scenario: str = "", space: EmbeddingSpace | None = None
 ) -> Iterator[HomeSound]:
-    """Read what was marked or looked at in the logs of a folder, log by log.
+    """Read the marked or reviewed sound in the logs of a folder, log by log.
 
     Raise `LogError` if there is no log, or if a log or a layer is damaged. Raise `DataError` if
     there are marks, and all of them are in logs of other sets.
@@ -154,15 +154,14 @@ def read_sound_of(
     limits: tuple[int, int],
     scenario: str = "",
 ) -> Iterator[HomeSound]:
-    """Read what microphones recorded in a part of a log, and some seconds around it.
+    """Read the sound of microphones in a part of a log, and some seconds around it.
 
-    Frames that were logged coarsely, for privacy, are left out: no sound is so.
+    Frames logged coarsely for privacy are dropped: their values are not those of real sound.
 
     Parameters
     ----------
     limits : (int, int)
-        Start and end of the part, in nanoseconds of UTC. The floor is tracked from ten minutes
-        before it on.
+        Start and end of the part, in nanoseconds of UTC. Floor tracking starts ten minutes earlier.
 
     Raises
     ------
@@ -212,14 +211,14 @@ def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directio
 def with_embeddings(
     sound: HomeSound, limits: tuple[int, int], space: EmbeddingSpace | None
 ) -> HomeSound:
-    """Read what a network heard in a part of a log, if a model takes it.
+    """Read the embeddings of a part of a log, if a model uses them.
 
     Parameters
     ----------
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC.
     space : EmbeddingSpace or None
-        Of the embeddings that the model takes; None if it takes none.
+        Embeddings that the model uses; None without embeddings.
 
     Raises
     ------
@@ -242,10 +241,10 @@ def with_embeddings(
 
 
 def _coarse(values: Float32, features: FeatureSet) -> Bool:
-    """Return which frames have the very values of one beside them though there is sound, or border.
+    """Return which frames equal a neighbour though there is sound, or border on such frames.
 
-    One that borders may be the only one there of its second, and share its values with others that
-    lie farther away in it.
+    A bordering frame may be the only one of its second there, and share its values with frames
+    farther away in that second.
     """
     coarse = np.zeros(len(values), bool)
     if values.shape[1]:
@@ -259,7 +258,7 @@ def _coarse(values: Float32, features: FeatureSet) -> Bool:
 
 
 def _columns_before(log: Path, topics: Collection[str], start: int) -> dict[str, Columns]:
-    """Read the log before another one from a time on, if there is one and it can be read."""
+    """Read the log before another one from a time on, if it exists and is readable."""
     with suppress(LogError):
         for chain in find_chains([log]):
             for place in chain.asked:
@@ -272,7 +271,7 @@ def _columns_before(log: Path, topics: Collection[str], start: int) -> dict[str,
 def _floors(recorded: Columns, earlier: Columns | None, features: FeatureSet) -> Float64 | None:
     """Return the floor of the room at each frame of a log, as a recorder tracks it.
 
-    What was recorded earlier is tracked before it, as far as it leads up to the log.
+    Tracking starts with earlier recordings that lead up to the log without a gap.
     """
     if features.band_powers is None or not _is_of(recorded, features) or not len(recorded):
         return None
@@ -301,11 +300,11 @@ def _set_of(log: Path, microphone: str) -> str:
 
 
 _DAY = 86_400 * NANOSECONDS
-HOME_WEIGHT = 3.0  # of a segment of the home; others have 1
-# With embeddings heads learn from it, too, and with more weight in the machine than others a home
-# loses what was right in it.
+HOME_WEIGHT = 3.0  # of a segment of the home; other segments weigh 1
+# With embeddings, heads learn from the home too; a greater classifier weight then loses
+# labels of the home that were correct.
 HOME_WEIGHT_WITH_EMBEDDINGS = 1.0
-MOST_OF_MARK = 6  # segments, so that a mark of minutes is not more than a few of seconds
+MOST_OF_MARK = 6  # segments, so that a mark of minutes counts as a few marks of seconds
 HOME = "this home"
 
 
@@ -330,20 +329,20 @@ def marked_recordings(
 ) -> Iterator[Recording]:
     """Cut marks out of the sound of a home.
 
-    A mark shorter than a second is extended to one; one of silence is left out instead, for other
-    sounds are in the same second. All marks of a UTC day are of one group, and so is an enrolled
-    recording. An enrolled sound is without a room, unless it is silence.
+    A mark shorter than a second is extended to one second; a short mark of silence is dropped
+    instead, because its second contains other sounds. All marks of a UTC day form one group, and so
+    does an enrolled recording. An enrolled sound has no room, unless it is silence.
 
     Parameters
     ----------
     gate : float
-        A mark in which nothing is so many dB above the floor of the room is left out, unless it is
-        silence; a `HearthlogWarning` counts them, and those of what was not recorded. 0 for none.
+        Marks with no sound this many dB above the floor of the room are dropped, except silence; a
+        `HearthlogWarning` counts them and marks of unrecorded time. 0 disables the gate.
 
     Yields
     ------
     Recording
-        A mark, or a part of one that lies between gaps; log by log.
+        A mark, or a part of one between gaps; log by log.
     """
     quiet: list[str] = []
     unheard: list[str] = []
@@ -376,7 +375,7 @@ def marked_recordings(
 
 
 def is_short_silence(mark: Mark, features: FeatureSet) -> bool:
-    """Whether a mark of silence is shorter than a window, so that nothing is learned from it."""
+    """Whether a mark of silence is shorter than a window, and so useless for training."""
     is_short = mark.end - mark.start < features.window_seconds * NANOSECONDS
     return is_short and class_name(mark.label) == SILENCE
 
@@ -387,19 +386,18 @@ def lesson_recordings(
     gate: float = 0.0,
     space: EmbeddingSpace | None = None,
 ) -> Iterator[Recording]:
-    """Read the marks in the logs of a folder that teach something; at most six segments of each.
+    """Read the training marks in the logs of a folder; at most six segments of each.
 
-    Raise `LogError, DataError` as of `home_recordings`.
+    Raise `LogError` or `DataError` as `home_recordings` does.
     """
     sounds = (teaching(sound) for sound in read_reviewed_sound(folder, features, space=space))
     yield from marked_recordings(sounds, folder, features, gate)
 
 
 def teaching(sound: HomeSound) -> HomeSound:
-    """Leave out the marks that teach nothing.
+    """Drop marks that are excluded from training.
 
-    Those are the marks of what a reviewer could not tell, and those that touch a span that was
-    drawn at random.
+    These are marks that a reviewer could not decide, and marks that touch a span drawn at random.
     """
     return replace(sound, marks=_teaching(sound.marks, sound.reviewed))
 
@@ -418,7 +416,7 @@ def _teaching(marks: Iterable[Mark], reviewed: Iterable[ReviewedSpan]) -> list[M
 
 
 def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
-    """Tell whether no window of 0.4 s is above the floor of the room."""
+    """Return whether no window of 0.4 s is above the floor of the room."""
     windows = len(recording.features) - BLOCK_FRAMES + 1
     if recording.floor is None or features.band_powers is None or windows < 1:
         return recording.floor is not None
@@ -429,7 +427,7 @@ def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
 def _recordings(
     sound: HomeSound, mark: Mark, features: FeatureSet, *, floored: bool
 ) -> Iterator[Recording]:
-    """Yield the features of a mark, in pieces where there are gaps in it."""
+    """Yield the features of a mark, split at gaps."""
     window = features.window_frames
     first, last = np.searchsorted(sound.stamps, [mark.start, mark.end]).tolist()
     missing = max(window - (last - first), 0)
@@ -448,7 +446,7 @@ def recording_of(
     Parameters
     ----------
     frames : np.ndarray [shape=(n,)], intp
-        Places of the frames.
+        Indices of the frames.
     """
     stamps = sound.stamps[frames]
     span = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
@@ -469,7 +467,7 @@ def recording_of(
 
 
 def _embedded(sound: HomeSound, frames: Indices) -> ClipEmbeddings | None:
-    """Return the windows of successive frames as a network heard them, filled by half or more."""
+    """Return the embedded windows of successive frames that are at least half filled."""
     first, count = int(sound.frames[frames[0]]), len(frames)
     windows = sound.embeddings
     starts = windows.frames - first
@@ -484,9 +482,9 @@ def _embedded(sound: HomeSound, frames: Indices) -> ClipEmbeddings | None:
 
 
 def _group(sound: HomeSound, start: int) -> str:
-    """Name the source of a recording: its day, or what was enrolled, the same sound only once.
+    """Return the source of a recording: its day, or the enrolment it belongs to.
 
-    A recording that was enrolled at midnight is in two logs, and named by that midnight.
+    An enrolment across midnight is in two logs, and named by that midnight.
     """
     if sound.enrolled and not sound.log.stem.endswith(CUT):
         edges = int(sound.stamps[0]), int(sound.stamps[-1]) + FRAME_NANOSECONDS

@@ -1,4 +1,4 @@
-"""Training set of a home: its marks with pseudo-labels."""
+"""Training set of a home: its marks and pseudo-labels."""
 
 import math
 from collections import Counter
@@ -54,15 +54,15 @@ _NOT_LOOKED_AT = (
 
 
 class HomeTrainingSet(NamedTuple):
-    """What a home teaches.
+    """Training set of a home.
 
     Attributes
     ----------
     segments : Dataset
-        Of the classes of the model that was adapted first, and new ones behind them; none if there
-        is nothing to learn from marks.
+        With the classes of the originally adapted model, followed by new ones; empty if no mark can
+        be used for training.
     nothing : str
-        Why there is nothing to learn from marks; empty if there is.
+        Reason for an empty training set; empty if there is one.
     """
 
     segments: Dataset
@@ -71,13 +71,13 @@ class HomeTrainingSet(NamedTuple):
 
 
 def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> HomeTrainingSet:
-    """Read what marks teach a model, and what it is to keep.
+    """Read the training marks of a home, and pseudo-labels that preserve the model.
 
     Parameters
     ----------
     scenario : str, optional
-        For which it labels: only what was marked of this scenario, by its name, is learned from;
-        else only what was marked of none.
+        Name of the model's scenario: only marks of this scenario are used;
+        by default only marks without a scenario.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
         If there is no log, or if a log or a layer is damaged.
     DataError
         If there are marks, and all of them are in logs of other feature sets, or if there is no
-        silence to keep the model from forgetting it.
+        silence for rehearsal.
     """
     features = feature_set(model.description.feature_set)
     marked: list[Recording] = []
@@ -122,17 +122,17 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
 
 
 class _Counts:
-    """What was seen of a home."""
+    """Statistics of the marks of a home."""
 
     def __init__(self) -> None:
         self.marks = 0
-        self.left_out = 0  # as they teach nothing
-        self.short = 0  # pauses that are marked as silence
+        self.left_out = 0  # excluded from training
+        self.short = 0  # pauses marked as silence
         self.looked_at = False
         self.by_embedding: Counter[EmbeddingSpace | None] = Counter()  # marks
 
     def notes(self) -> list[str]:
-        """Say what of the marks is not learned from."""
+        """Return lines on the marks that are not used for training."""
         notes = []
         if self.left_out:
             notes.append(
@@ -147,7 +147,7 @@ class _Counts:
         return notes
 
     def embedding_note(self, model: Model) -> str:
-        """Say which marks teach by features alone, though there are networks; else nothing."""
+        """Return a line on marks without embeddings although a network exists; else empty."""
         wanted = model.description.embedding_space
         others = sorted({each.network for each in self.by_embedding if each not in {None, wanted}})
         if wanted is None and others:
@@ -168,7 +168,7 @@ class _Counts:
 def _counted(
     sounds: Iterable[HomeSound], counts: _Counts, features: FeatureSet
 ) -> Iterator[HomeSound]:
-    """Leave out the marks that teach nothing, and count them."""
+    """Drop and count the marks that are excluded from training."""
     for sound in sounds:
         taught = teaching(sound)
         counts.marks += len(sound.marks)
@@ -182,10 +182,11 @@ def _counted(
 def _with_new_classes(
     marked: Sequence[Recording], model: Model, features: FeatureSet
 ) -> tuple[Scenario, list[str], set[str]]:
-    """Return a scenario with the classes of which marks tell enough.
+    """Return a scenario extended by classes with enough marks.
 
-    A label that the scenario counts as unknown makes its class like any other, and until then is
-    learned as unknown. Then what lacks of other classes, and the labels that cannot be learned.
+    A label that the scenario maps to `unknown` becomes a class like any other, and is trained as
+    unknown until then. Also return the shortfalls of other classes, and the labels that cannot be
+    trained.
     """
     known = scenario_of(model).with_classes(base_classes(model))
     as_unknown = set(known.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}
@@ -221,7 +222,7 @@ def _with_new_classes(
 
 
 def _lumped(marked: Sequence[Recording], known: Scenario) -> list[str]:
-    """Name the marks that are learned as a class of another name, such as `other`."""
+    """List the marks that are trained under another class name, such as `other`."""
     counts: Counter[tuple[str, str]] = Counter()
     for one in marked:
         name = known.find(one.label, marked=True)
@@ -236,7 +237,7 @@ def _lumped(marked: Sequence[Recording], known: Scenario) -> list[str]:
 
 
 def _as_unknown(kept: Sequence[Recording], model: Model, taught: Scenario) -> Iterator[Recording]:
-    """Give what stays unknown a label that no new class of the home has taken."""
+    """Relabel remaining unknown sounds with a label that no new class has taken."""
     before = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]
     after = taught.classes.get(UNKNOWN, (before,))[0]
     for one in kept:
@@ -244,7 +245,7 @@ def _as_unknown(kept: Sequence[Recording], model: Model, taught: Scenario) -> It
 
 
 def _seldom_kept(kept: Sequence[Recording], model: Model) -> set[str]:
-    """Name the classes that are hardly among what was left alone; without marks they would go."""
+    """List classes that are rare among pseudo-labels; without marks the model forgets them."""
     amounts = Counter(one.label for one in kept)
     return {name for name in model.classes if amounts[name] < FEWEST} - {SILENCE, UNKNOWN}
 

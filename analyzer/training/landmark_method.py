@@ -1,4 +1,4 @@
-"""Methods that learn a linear head on kernels of landmarks: the default, and those like it."""
+"""Methods that fit a linear head on landmark kernels, the default method among them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,9 +31,9 @@ from hearthlog.models.classifiers.rbf_distances import RoundedDistances
 from hearthlog.models.classifiers.scaler import Scaler
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
-_ROOT = 0.5  # a class has landmarks as its number of windows to this power
+_ROOT = 0.5  # exponent of a class's window count in its number of landmarks
 _ROUNDS = 30  # of k-means
-_LEAST = 1e-6  # of the largest eigenvalue: what is below is rounding
+_LEAST = 1e-6  # of the largest eigenvalue: smaller ones are rounding errors
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LandmarkMethod(WindowMethod):
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions whose versions influence the result."""
+        """Distributions with an influence on the result."""
         return (*super().libraries, "scipy")
 
     @property
@@ -56,7 +56,7 @@ class LandmarkMethod(WindowMethod):
         return {"cost": self.cost, "gamma": self.gamma}
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """Return this method with another cost or gamma, as of `Method.with_parameters`."""
+        """Return this method with another cost or gamma; see `Method.with_parameters`."""
         if unknown := values.keys() - {"cost", "gamma"}:
             raise DataError(f"method {self.name} has no {min(unknown)} to choose")
         return replace(self, **values)  # type: ignore[arg-type]
@@ -70,7 +70,7 @@ class LandmarkMethod(WindowMethod):
         ]
 
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> LearnedMachine:
-        """Learn from some segments, as of `Method.fit`.
+        """Fit on some segments; see `Method.fit`.
 
         Raise `DataError` if there are fewer landmarks than classes.
         """
@@ -80,7 +80,7 @@ class LandmarkMethod(WindowMethod):
     def learn(
         self, inputs: Float32, target: Indices, weight: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
-        """Learn from windows, as of `WindowMethod.learn`."""
+        """Fit on windows; see `WindowMethod.learn`."""
         truth = np.eye(int(target.max()) + 1)[target]
         weight = balanced(target, weight)
         return self.imitate(inputs, target, weight, truth)
@@ -88,13 +88,13 @@ class LandmarkMethod(WindowMethod):
     def imitate(
         self, inputs: Float32, target: Indices, weight: Float64, truth: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
-        """Learn probabilities of windows.
+        """Fit to target probabilities of windows.
 
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
         target : np.ndarray [shape=(n,)], intp
-            Class of which a window may become a landmark; none is without a window.
+            Class for which a window may become a landmark; each class has a window.
         weight : np.ndarray [shape=(n,)], float64
         truth : np.ndarray [shape=(n, C)], float64
             Probabilities of the classes.
@@ -122,12 +122,12 @@ class LandmarkMethod(WindowMethod):
 
 
 class LandmarkMap:
-    """Kernels of landmarks, and the root that makes their products those of the kernel.
+    """Landmark kernels, and the root that turns their products into the kernel.
 
     Attributes
     ----------
     root : np.ndarray [shape=(m, m)], float64
-        Inverse root of the kernels of the landmarks with each other.
+        Inverse square root of the kernel matrix of the landmarks.
     """
 
     def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
@@ -153,7 +153,7 @@ def centres(  # noqa: PLR0913, PLR0917
     most: int,
     seed: int = 0,
 ) -> tuple[Float32, Indices]:
-    """Return the centres by k-means of the windows of each class, and their number.
+    """Return k-means centres of the windows of each class, and their number.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def centres(  # noqa: PLR0913, PLR0917
     target : np.ndarray [shape=(n,)], intp
     weight : np.ndarray [shape=(n,)], float64
     most : int
-        Centres of all classes; each has one at least that has a window.
+        Maximum number of centres; each class with a window has at least one.
     """
     scaled = Scaler(scaler)(inputs)
     windows = np.bincount(target)
@@ -171,7 +171,7 @@ def centres(  # noqa: PLR0913, PLR0917
     counts = np.zeros(len(windows), np.intp)
     for number in np.flatnonzero(windows).tolist():
         own = target == number
-        # The same sound twice makes no two centres.
+        # Duplicate sounds give one centre.
         counts[number] = min(wanted[number], len(np.unique(scaled[own], axis=0)))
         means = KMeans(counts[number], n_init=1, max_iter=_ROUNDS, random_state=seed)
         found.append(means.fit(scaled[own], sample_weight=weight[own]).cluster_centers_)

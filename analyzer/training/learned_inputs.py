@@ -1,4 +1,4 @@
-"""Training windows of a classifier: chosen, weighted, rounded and scaled."""
+"""Training windows of a classifier: selection, weighting, rounding and scaling."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ _ROUNDING = 0.01  # of the standard deviation
 
 
 def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) -> Indices:
-    """Choose windows at random, those of most weight first, but fewer of the large classes.
+    """Choose windows at random, highest weights first, but fewer of the large classes.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) 
     Returns
     -------
     np.ndarray [shape=(most,)], intp
-        Their places.
+        Indices of the windows.
     """
     shuffled = np.random.default_rng(_SEED + seed).permutation(len(target))
     shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
@@ -39,7 +39,7 @@ def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) 
 
 
 def class_costs(target: Indices) -> Float64:
-    """Weigh classes against their numbers of windows, as scikit-learn's `balanced`.
+    """Return class weights inverse to window counts, as scikit-learn's `balanced`.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def class_costs(target: Indices) -> Float64:
 
 
 def balanced(target: Indices, weight: Float64) -> Float64:
-    """Weigh windows, of some weight each, against the number of their class.
+    """Return window weights scaled inversely to the size of the class.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def balanced(target: Indices, weight: Float64) -> Float64:
 
 
 def fitted_scaler(inputs: Float32) -> StandardScaler:
-    """Return a scaler to the mean and the standard deviation of inputs, shape (n, width)."""
+    """Return a scaler with the mean and standard deviation of inputs, shape (n, width)."""
     return StandardScaler().fit(inputs.astype(np.float64))
 
 
@@ -83,12 +83,12 @@ def scaler_arrays(scaler: StandardScaler) -> dict[str, NDArray[Any]]:
 
 
 def in_whole_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
-    """Return a scaler that rounds as the machine does of which it is a part.
+    """Return a scaler with the rounding of the trained SVM.
 
     Parameters
     ----------
     steps : int or None
-        Of a standard deviation; None: nothing is rounded.
+        Steps per standard deviation; None disables rounding.
     """
     if steps is None:
         return make_pipeline(scaler)
@@ -101,7 +101,7 @@ def _rounded_to_steps(scaled: Float64, steps: int) -> Float64:
 
 
 def rounded(inputs: Float32) -> Float32:
-    """Round inputs to half precision, so that a model file takes half the room.
+    """Round inputs to half precision, which halves the size of a model file.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def rounded(inputs: Float32) -> Float32:
     Returns
     -------
     np.ndarray [shape=(n, width)], float32
-        As they are, if the error would be more than a hundredth of the spread of an input.
+        Unchanged if the error would exceed a hundredth of the standard deviation of an input.
     """
     with np.errstate(over="ignore"):
         half = inputs.astype(np.float16).astype(np.float32)
@@ -119,15 +119,15 @@ def rounded(inputs: Float32) -> Float32:
 
 
 def kept_inputs(model: Model) -> tuple[Float32, Indices] | None:
-    """Return the inputs of windows that a model has kept of what it learned from.
+    """Return the training inputs that a model has stored.
 
-    Those of a model that was adapted are those of its base.
+    An adapted model has those of its base.
 
     Returns
     -------
     inputs : np.ndarray [shape=(n, width)], float32
     target : np.ndarray [shape=(n,)], intp
-        Numbers of their classes. None in place of both, if its kind keeps none.
+        Indices of the classes. None in place of both if the kind of classifier stores none.
     """
     arrays = model.arrays
     if "landmarks" in arrays:

@@ -1,4 +1,4 @@
-"""Manifests of labelled clips, and scenarios: the labels of a manifest by class of a model."""
+"""Manifests of labelled clips, and scenarios that map labels to the classes of a model."""
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -15,8 +15,8 @@ from hearthlog.schemas.files import read_toml
 
 REQUIRED = ("path", "label", "source_group")
 OPTIONAL = ("source", "licence", "start", "end")
-_NAMED = 3  # of those that are left out
-SIZE_LIMIT = 64 << 20  # half a million clips; what is larger is something else
+_NAMED = 3  # skipped clips in a report
+SIZE_LIMIT = 64 << 20  # half a million clips; a larger file is no manifest
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class LabelledClip:
     Attributes
     ----------
     source, licence : str
-        Its collection and licence; empty where the manifest does not say.
+        Collection and licence; empty if the manifest has none.
     start, end : float
-        The part of the file that the label is about, in seconds; `end` is infinite for the rest.
+        Labelled part of the file in seconds; an infinite `end` is the end of the file.
     """
 
     path: Path
@@ -41,14 +41,14 @@ class LabelledClip:
 
 
 class SkippedClip(NamedTuple):
-    """A clip that nothing is learned from.
+    """A clip that is excluded from training.
 
     Attributes
     ----------
     reason : str
-        Why; the same for clips of one kind.
+        The same text for clips with the same problem.
     clip : str
-        Which one, and more about it.
+        Identifies the clip, with details.
     """
 
     reason: str
@@ -56,12 +56,7 @@ class SkippedClip(NamedTuple):
 
 
 def left_out_lines(left_out: Sequence[SkippedClip]) -> list[str]:
-    """Say how many clips were left out, and which first, in a line for each reason.
-
-    Parameters
-    ----------
-    left_out : sequence of SkippedClip
-    """
+    """Format the number of skipped clips, with the first examples, one line per reason."""
     by_reason: dict[str, list[str]] = {}
     for reason, clip in left_out:
         by_reason.setdefault(reason, []).append(clip)
@@ -74,12 +69,12 @@ def left_out_lines(left_out: Sequence[SkippedClip]) -> list[str]:
 
 
 def example_of(left_out: Sequence[SkippedClip]) -> str:
-    """Name the first clip that was left out, behind the reasons; empty if there is none."""
+    """Format the first skipped clip, to follow the reasons; empty if there is none."""
     return f", such as {left_out[0].clip}" if left_out else ""
 
 
 class _RowError(DataError):
-    """One line of a manifest is of no use."""
+    """An invalid line of a manifest."""
 
     def __init__(self, where: str, reason: str, detail: str, shown: str = "") -> None:
         super().__init__(f"{where}: {detail}")
@@ -94,12 +89,12 @@ def read_manifest(
     Parameters
     ----------
     path : Path
-        CSV, UTF-8; the paths in it are relative to its folder. It may have the columns source,
-        licence, start and end, too; others are ignored.
+        CSV, UTF-8; its paths are relative to its folder. Optional columns are source,
+        licence, start and end; others are ignored.
     labels : collection of str
-        Allowed labels; other names of the same sounds (`hearthlog.models.classes`) are allowed too.
+        Allowed labels; synonyms (`hearthlog.models.classes`) are allowed too.
     left_out : list of SkippedClip, optional
-        Takes lines that are of no use, which raise an error without it.
+        Collects invalid lines, which raise an error by default.
 
     Returns
     -------
@@ -146,7 +141,7 @@ def read_manifest(
 def _check_new(
     where: str, clip: LabelledClip, seen: dict[tuple[Path, float, float], int], number: int
 ) -> None:
-    """Refuse a part of a file that another line lists."""
+    """Raise an error if another line lists the same part of a file."""
     first = seen.setdefault((clip.path, clip.start, clip.end), number)
     if first != number:
         raise _RowError(where, "listed twice", f"{clip.path.name!r} is listed in line {first} too")
@@ -231,21 +226,21 @@ class Scenario:
 
     @property
     def class_of(self) -> dict[str, str]:
-        """Class of each label that has one."""
+        """Class of each label that belongs to one."""
         return {label: name for name, labels in self.classes.items() for label in labels}
 
     def find(self, label: str, *, marked: bool = False) -> str | None:
-        """Find the class that a label belongs to.
+        """Return the class of a label.
 
-        It is the class that lists this very label. If none does, it is the one that lists another
-        name of the same sound (see `hearthlog.models.classes`), unless two classes do.
+        A class that lists the label itself takes precedence. Otherwise a class that lists a synonym
+        (see `hearthlog.models.classes`) is used, unless two classes do.
 
         Returns
         -------
         str or None
             Name of the class; None if the label is ignored, or in no class.
         """
-        if marked and label == sound.UNKNOWN:  # a reviewer cannot tell
+        if marked and label == sound.UNKNOWN:  # a reviewer could not decide
             return None
         classes: dict[str, str | None] = dict.fromkeys(self.ignored)
         classes |= {name: name for name in self.classes} if marked else {}
@@ -254,13 +249,13 @@ class Scenario:
         return meant.pop() if len(meant) == 1 else None
 
     def with_unknown(self, sources: Iterable[tuple[str, str]]) -> "Scenario":
-        """Return this scenario with a class `unknown` of all that is in none of its classes.
+        """Return this scenario with a class `unknown` for all labels outside its classes.
 
         Returns
         -------
         Scenario
-            This one, if it has such a class or as many as a model may have, or if fewer than five
-            sources have such labels.
+            Unchanged if it has class `unknown` or the maximum number of classes, or if fewer than
+            five sources have such labels.
         """
         listed = self.class_of.keys() | self.ignored
         others = {(label, group) for label, group in sources if not sound.meant_by(label, listed)}
@@ -271,7 +266,7 @@ class Scenario:
         return Scenario(self.name, {**self.classes, sound.UNKNOWN: labels}, self.ignored)
 
     def with_classes(self, names: Iterable[str]) -> "Scenario":
-        """Return this scenario with some of its classes; labels of the others are unknown again."""
+        """Return this scenario with some of its classes; labels of the others become unknown."""
         classes = {name: self.classes[name] for name in names}
         if sound.UNKNOWN in classes:
             others = [labels for name, labels in self.classes.items() if name not in classes]
@@ -279,7 +274,7 @@ class Scenario:
         return Scenario(self.name, classes, self.ignored)
 
     def with_taught(self, learned: Mapping[str, tuple[str, ...]]) -> "Scenario":
-        """Return this scenario with the classes that a home teaches, which then are not unknown."""
+        """Return this scenario with the new classes of a home, which are then no longer unknown."""
         classes = {**self.classes, **learned}
         if sound.UNKNOWN in self.classes:
             taken = learned.keys() | {one for labels in learned.values() for one in labels}
@@ -290,7 +285,7 @@ class Scenario:
 
     @property
     def labels(self) -> frozenset[str]:
-        """Labels that a manifest may use: built-in labels, those in a class, and ignored ones."""
+        """Labels allowed in a manifest: built-in labels, labels of a class, and ignored ones."""
         return LABELS | self.class_of.keys() | self.ignored
 
 
@@ -304,7 +299,7 @@ BUILTIN = {
 
 
 def scenario_of(model: Model) -> Scenario:
-    """Return the scenario that a model was trained for."""
+    """Return the scenario of a model."""
     classes = {name: tuple(labels) for name, labels in model.description.scenario.items()}
     return Scenario(model.description.scenario_name, classes)
 

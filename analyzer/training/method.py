@@ -1,4 +1,4 @@
-"""Methods: how a classifier is learned from segments."""
+"""Methods: training of classifiers from segments."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -25,18 +25,18 @@ _PLACES = (10, 50)  # frames at which windows of an empty room begin
 
 
 class Examples(NamedTuple):
-    """The inputs of segments, unchanged and changed, window by window.
+    """Inputs of segments, unchanged and augmented, window by window.
 
     Attributes
     ----------
     inputs : np.ndarray [shape=(versions, n, places, width)], float32
         Of the windows in each segment; the first version is the unchanged one.
     usable : np.ndarray [shape=(versions, n, places)], bool
-        Which windows may be learned from; tried are all of the first version.
+        Windows allowed for training; tests use all windows of the first version.
     target : np.ndarray [shape=(n,)], intp
     weight : np.ndarray [shape=(n,)], float64
     more_inputs : np.ndarray [shape=(m, width)], float32
-        Of further windows that are always learned from.
+        Inputs of further windows that are always in the training set.
     more_target : np.ndarray [shape=(m,)], intp
     """
 
@@ -48,7 +48,7 @@ class Examples(NamedTuple):
     more_target: Indices
 
     def windows(self, seen: Indices | slice) -> tuple[Float32, Indices, Float64]:
-        """Return inputs, classes and weights of the windows to learn from.
+        """Return inputs, classes and weights of the training windows.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Examples(NamedTuple):
         )
 
     def decide(self, learned: "Learned", unseen: Indices, classes: int) -> Float64:
-        """Return decision values of segments: the means over their windows.
+        """Return decision values of segments: means over their windows.
 
         Parameters
         ----------
@@ -84,39 +84,39 @@ class Examples(NamedTuple):
 
 
 class Learned(Protocol):
-    """A classifier that was learned from segments."""
+    """A classifier trained on segments."""
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Return decision values as `Machine.decide` gives them, for a classifier of this kind.
+        """Return decision values as `Machine.decide` does for this kind of classifier.
 
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
         classes : int
-            C, the number of all classes.
+            C, the total number of classes.
 
         Returns
         -------
         np.ndarray [shape=(n, C)], float64
-            -inf for a class that was not learned.
+            -inf for a class without training data.
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a model file; all classes were learned."""
+        """Return the arrays of a model file; requires that all classes were in the training set."""
 
     def parameters(self) -> dict[str, Any]:
-        """Return the values of the field `parameters` in the description of a model."""
+        """Return the field `parameters` of a model description."""
 
 
 @dataclass(frozen=True)
 class Method(ABC):
-    """How a classifier is learned.
+    """A method of training a classifier.
 
     Attributes
     ----------
     name : str
     feature_set, inputs : str
-        Feature set of the classifier, and which of its inputs.
+        Feature set of the classifier, and the kind of inputs computed from it.
     kind : str
         Kind of classifier.
     copies : int
@@ -127,13 +127,13 @@ class Method(ABC):
         As in `Description`.
     observation_weight : float
         Weight of a frame's decision values in the hidden Markov model; with a network, of the
-        logarithms of its probabilities.
+        log probabilities.
     network : str
-        The one whose embeddings heads beside the classifier take, by its name; empty for none.
+        Name of the network for heads next to the classifier; empty without heads.
     class_exponent : float or None
         As in `Smoothing`.
     seed : int
-        Of what is drawn at random: rooms, changed copies, windows of many.
+        Seed for rooms, augmented copies and window selection.
     """
 
     name: str
@@ -155,28 +155,28 @@ class Method(ABC):
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions whose versions influence the result."""
+        """Distributions with an influence on the result."""
         return ()
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Parameters that can be chosen and searched for."""
+        """Parameters that can be set and searched."""
         return {}
 
     @abstractmethod
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> Learned:
-        """Learn from some segments.
+        """Train on some segments.
 
         Parameters
         ----------
         examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
-            Indices of the segments to learn from; all by default.
+            Indices of the training segments; all by default.
 
         Returns
         -------
         Learned
-            The classes that it has not seen have decision values of -inf.
+            Classes without training data have decision values of -inf.
         """
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
@@ -185,7 +185,7 @@ class Method(ABC):
         Parameters
         ----------
         values : mapping of str to float
-            By name of the parameter, as in `parameters`; those not named stay.
+            By parameter name, as in `parameters`; other parameters are unchanged.
 
         Raises
         ------
@@ -197,12 +197,12 @@ class Method(ABC):
         return self
 
     def variations(self) -> list[Self]:
-        """Return the methods that a grid search compares, this one among them."""
+        """Return the methods of a grid search, including this one."""
         return [self]
 
 
 def prepare(method: Method, data: Dataset) -> Examples:
-    """Compute the inputs of segments for a method; the same segments give the same inputs.
+    """Compute the inputs of segments for a method; deterministic.
 
     Raise `DataError` if the method wants augmented copies and its feature set has none. Raise
     `ModelError` if the feature set is not installed.
@@ -242,7 +242,7 @@ def prepare(method: Method, data: Dataset) -> Examples:
 def _usable(
     segments: Float32, floor: Float64, data: Dataset, features: FeatureSet, window_frames: int
 ) -> Bool:
-    """Tell which windows of segments are loud enough to be learned from."""
+    """Return which windows of segments are loud enough for training."""
     power = features.power(segments).astype(np.float64)
     heard: Bool = ~np.isnan(power.sum(axis=1, keepdims=True))
     if len(window_places(segments.shape[1], window_frames)) == 1:
@@ -256,14 +256,14 @@ def _usable(
 
 
 def loud_windows(power: Float64, window_frames: int, least: Float64 | None = None) -> Bool:
-    """Tell which windows are at most 6 dB below their segment.
+    """Return which windows are at most 6 dB below their segment.
 
     Parameters
     ----------
     power : np.ndarray [shape=(n, f)], float64
         Mean squares of the frames of each segment.
     least : np.ndarray [shape=(n, 1)], float64, optional
-        What they must be above besides.
+        Additional minimum power of a window.
 
     Returns
     -------

@@ -34,17 +34,17 @@ from hearthlog.schemas.logs.files import relabel_path
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling, scenario_labelling
 
 MOST_CONFIRMED = 60  # segments of a class
-_WEIGHT = 1.0  # of a segment: with that of marks, windows of half a sound become silence
+_WEIGHT = 1.0  # of a segment: with the weight of marks, half-filled windows become silence
 SURE = 0.5
 FEWEST = 20  # of a class
 _ASIDE = NANOSECONDS // 2  # of marks
 SEGMENT_FRAMES = 20
 _MOST_TRIED = 240  # segments of a class in a log
-_MOST_SILENT = 2000  # of silence, most of which is below the gate
+_MOST_SILENT = 2000  # of silence, mostly below the gate
 
 
 class Candidates(NamedTuple):
-    """Segments that may be as they were labelled.
+    """Segments that may keep the labels of the model.
 
     Attributes
     ----------
@@ -59,12 +59,12 @@ class Candidates(NamedTuple):
 def confirmed_segments(
     sound: HomeSound, classes: Sequence[str], segment_frames: int = SEGMENT_FRAMES
 ) -> Candidates:
-    """Cut out what was looked at, and not marked.
+    """Cut segments from reviewed spans without marks.
 
-    Marks are of what was wrong. A model that learns from them alone forgets what was right, and
-    silence first: the only windows with the floor of this room in them would be of other classes.
+    Marks correct errors. A model trained on marks alone forgets correct labels, silence first: the
+    only windows with the floor of this room would be of other classes.
 
-    Raise `LogError` if the labelling that was looked at cannot be read.
+    Raise `LogError` if the reviewed labelling cannot be read.
     """
     confirmed: list[Candidates] = []
     reviewed = [span for span in sound.reviewed if span.chosen != RANDOM]
@@ -84,7 +84,7 @@ def labelled_segments(
     names: Collection[str],
     segment_frames: int = SEGMENT_FRAMES,
 ) -> Candidates:
-    """Cut out what was labelled as some classes, whether anyone has looked at it or not.
+    """Cut segments with labels of some classes, reviewed or not.
 
     Raise `LogError` if the labels cannot be read.
     """
@@ -93,7 +93,7 @@ def labelled_segments(
     labelling = _labelling(sound, LIVE)
     if labelling is not None:
         target = _classes_of(sound, labelling, classes)
-    else:  # the model will tell
+    else:  # the model decides
         target = np.full(len(sound.stamps), classes.index(SILENCE) if SILENCE in classes else -1)
     own = [number for number, name in enumerate(classes) if name in names]
     return _cut(sound, np.where(np.isin(target, own), target, -1), classes, segment_frames)
@@ -102,21 +102,20 @@ def labelled_segments(
 def chosen(
     candidates: Iterable[Candidates], model: Model, least: float = SURE, fewest: int = FEWEST
 ) -> list[Recording]:
-    """Choose segments of each class of which a model is sure, as evenly spaced as can be.
+    """Choose segments of each class with high model probability, evenly spaced if possible.
 
     Parameters
     ----------
     least : float
-        Probability of which it is sure.
+        Minimum probability.
     fewest : int
-        Of a class: the surest ones, if there are not so many of which it is sure.
+        Minimum number of a class: filled up with the most probable segments.
 
     Returns
     -------
     list of Recording
-        At most 60 of a class, all of which the model labels so. Silence below the gate of the
-        model, of which it need not be told, is taken only where there is not enough of other
-        silence.
+        At most 60 of a class, all with this label by the model. Silence below the gate of the
+        model, which needs no training, is used only if other silence is scarce.
     """
     recordings, target = _joined(candidates)
     if not recordings:
@@ -137,7 +136,7 @@ def chosen(
         if len(enough) < fewest:
             enough = np.sort(same[np.argsort(-sure[same], kind="stable")[:fewest]])
         kept += spread(enough, MOST_CONFIRMED).tolist()
-    unknown = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]  # else it is as if not told
+    unknown = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]  # otherwise `unknown` itself
     labels = [unknown if name == UNKNOWN else name for name in model.classes]
     return [recordings[i]._replace(label=labels[target[i]]) for i in sorted(kept)]
 
@@ -155,7 +154,7 @@ def _labelling(sound: HomeSound, name: str) -> Labelling | None:
 
 
 def _classes_of(sound: HomeSound, labelling: Labelling, classes: Sequence[str]) -> Indices:
-    """Return the class of each frame, -1 for none of the classes and where there is no label."""
+    """Return the class of each frame; -1 for other classes and unlabelled frames."""
     names = translation(set(labelling.labels), classes)
     numbers = {name: number for number, name in enumerate(classes)}
     own = np.array([numbers.get(names[label], -1) for label in labelling.labels], np.intp)
@@ -168,9 +167,9 @@ def _classes_of(sound: HomeSound, labelling: Labelling, classes: Sequence[str]) 
 def _cut(
     sound: HomeSound, target: Indices, classes: Sequence[str], segment_frames: int
 ) -> Candidates:
-    """Cut segments by the class in their middle, silence by all of it; away from marks.
+    """Cut segments by the class at their centre (silence: throughout), away from marks.
 
-    -1 is no class, and in no segment.
+    Segments contain no frame of class -1.
     """
     marks = [(mark.start, mark.end) for mark in sound.marks]
     away = ~sound.inside(marks, _ASIDE) & ~sound.inside(sound.drawn)
@@ -193,7 +192,7 @@ def _cut(
 
 
 def _joined(parts: Iterable[Candidates]) -> Candidates:
-    """Join candidates in the order of time, each of them once."""
+    """Merge candidates in order of time, without duplicates."""
     parts = list(parts)
     recordings = [recording for part in parts for recording in part.recordings]
     target = np.concatenate([np.empty(0, np.intp), *(part.target for part in parts)])
@@ -205,10 +204,10 @@ def _joined(parts: Iterable[Candidates]) -> Candidates:
 def _probabilities(
     recordings: Sequence[Recording], silent: Bool, model: Model
 ) -> tuple[Float64, Bool]:
-    """Return the probabilities that a model gives to segments, and which are below its gate.
+    """Return the model's probabilities of segments, and which are below its gate.
 
-    The probabilities are those of the windows from which would be learned: of silence all, else
-    those that are at most 6 dB below the segment.
+    Probabilities are over the training windows: all of silence, else windows at most 6 dB below the
+    segment.
     """
     classifier = Classifier(model)
     features, inputs = classifier.feature_set, classifier.inputs
@@ -237,7 +236,7 @@ def _probabilities(
 
 
 def _by_heads(recordings: Sequence[Recording], classifier: Classifier) -> Float64:
-    """Return what the heads of a classifier say of segments; NaN where nothing is embedded."""
+    """Return the outputs of a classifier's heads for segments; NaN without an embedding."""
     by_heads = np.full((len(recordings), len(classifier.classes)), np.nan)
     if classifier.embedding_heads is None:
         return by_heads
@@ -249,7 +248,7 @@ def _by_heads(recordings: Sequence[Recording], classifier: Classifier) -> Float6
 
 
 def _quiet_windows(recording: Recording, floor: Float64, classifier: Classifier) -> Bool:
-    """Tell which windows of a segment are below the gate of a classifier."""
+    """Return which windows of a segment are below the gate of a classifier."""
     length, powers_of = classifier.inputs.window_frames, classifier.feature_set.band_powers
     places = np.array(window_places(len(recording.features), length))
     if not classifier.gate or powers_of is None:
@@ -259,11 +258,11 @@ def _quiet_windows(recording: Recording, floor: Float64, classifier: Classifier)
 
 
 _RECENT = 14 * 86_400 * NANOSECONDS
-_SILENT_LOGS = 4  # that are read for silence
+_SILENT_LOGS = 4  # logs to read for silence
 _SILENT_PART = 900 * NANOSECONDS  # of each
-_LOGS = 6  # that are read for other classes
+_LOGS = 6  # logs to read for other classes
 _PART = 3600 * NANOSECONDS
-_VERY_SURE = 0.8  # with less a model that is often wrong here would learn its mistakes
+_VERY_SURE = 0.8  # a lower limit would train a poor model on its own errors
 
 
 def unreviewed_silence(
@@ -274,7 +273,7 @@ def unreviewed_silence(
     Parameters
     ----------
     scenario : str, optional
-        For which it labels; empty for the sounds of the home.
+        Scenario of the labels; empty for the sounds of the home.
 
     Raises
     ------
@@ -290,19 +289,19 @@ def unreviewed_silence(
 def unreviewed_sounds(
     folders: Sequence[Path], model: Model, names: Collection[str], scenario: str = ""
 ) -> list[Recording]:
-    """Choose sounds of some classes of which a model is very sure.
+    """Choose sounds of some classes with a very high model probability.
 
-    They are from the logs of the last two weeks in which most of these classes was labelled.
+    The logs are those of the last two weeks with the longest labelled time of these classes.
 
     Parameters
     ----------
     scenario : str, optional
-        For which it labels; empty for the sounds of the home.
+        Scenario of the labels; empty for the sounds of the home.
 
     Returns
     -------
     list of Recording
-        A second each, at most 60 of a class.
+        Of one second each, at most 60 of a class.
 
     Raises
     ------
@@ -329,8 +328,8 @@ def _recent(folders: Sequence[Path]) -> list[Path]:
 def _labelled(
     log: Path, model: Model, names: Collection[str], length: int, scenario: str
 ) -> Iterator[Candidates]:
-    """Cut classes out of the beginning of a log."""
-    with suppress(LogError):  # why it cannot be read is said when it is labelled
+    """Cut segments of classes out of the start of a log."""
+    with suppress(LogError):  # labelling reports the read error
         features = feature_set(model.description.feature_set)
         for info in read_recorder_infos(log, "features"):
             if info.first_frame is not None:
@@ -342,7 +341,7 @@ def _labelled(
 
 
 def _labelled_time(log: Path, names: Collection[str], scenario: str) -> int:
-    """Return for how long classes were labelled in a log, in nanoseconds."""
+    """Return the labelled time of classes in a log, in nanoseconds."""
     amount = 0
     with suppress(LogError):
         infos = read_recorder_infos(log, "features")

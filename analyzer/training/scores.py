@@ -1,4 +1,4 @@
-"""Scores of classified segments with confidence intervals, calibration, and model comparison."""
+"""Scores of classified segments: confidence intervals, calibration, model comparison."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from hearthlog.schemas.arrays import Float64, Int64
 RESAMPLES = 1000
 _BINS = 15
 _SEED = 0
-_COUNTS_AT_ONCE = 4_000_000  # of the counts of resamples: bounds memory
+_COUNTS_AT_ONCE = 4_000_000  # counts of resamples per batch; bounds memory
 _INTERVAL = (2.5, 97.5)
 
 Interval = tuple[float, float]
@@ -22,7 +22,7 @@ Integers = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class ClassScores:
-    """Scores of one class; None where they are undefined, as the recall of an absent class.
+    """Scores of one class; None if undefined, such as the recall of an absent class.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class Bin:
-    """Segments whose winning class has a probability in one of 15 equal ranges.
+    """Segments with the probability of the winning class in one of 15 equal ranges.
 
     Attributes
     ----------
@@ -76,12 +76,12 @@ class Bin:
 
 @dataclass(frozen=True)
 class F1Difference:
-    """Macro F1 of a second model minus that of a first, on the same segments.
+    """Macro F1 of a second model minus that of a first on the same segments.
 
     Attributes
     ----------
     macro_f1 : float
-        Positive where the second is better.
+        Positive if the second model is better.
     interval : tuple of float, or None
         95 %, paired bootstrap over groups; None with a single group.
     """
@@ -102,11 +102,11 @@ def score(
     Parameters
     ----------
     target, predicted : np.ndarray [shape=(n,)], int
-        Indices of the true classes and of the predicted ones.
+        Indices of the true and predicted classes.
     group : np.ndarray [shape=(n,)], int
-        Numbers of the source groups, which are resampled as a whole for the intervals.
+        Numbers of the source groups, which are the resampling units of the intervals.
     weight : np.ndarray [shape=(n,)], int64, optional
-        How many segments a row stands for; one by default. At least 0.
+        Number of segments that a row represents, at least 0; 1 by default.
 
     Raises
     ------
@@ -147,16 +147,16 @@ def difference(
     group: Integers,
     classes: Sequence[str],
 ) -> F1Difference:
-    """Compare the macro F1 of two models on the same segments: that of b minus that of a.
+    """Compute the macro F1 of model b minus that of model a on the same segments.
 
     Parameters
     ----------
     target : np.ndarray [shape=(n,)], int
         Indices of the true classes.
     probabilities_a, probabilities_b : np.ndarray [shape=(n, C)], float
-        Of the two models; the class of the highest one is the predicted one.
+        Of the two models; the class with the highest probability is the predicted one.
     group : np.ndarray [shape=(n,)], int
-        Numbers of the source groups, which are resampled as a whole for the interval.
+        Numbers of the source groups, which are the resampling units of the interval.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float
-        Of the classes, 0 to 1; at least one row.
+        Class probabilities, 0 to 1; at least one row.
     target : np.ndarray [shape=(n,)], int
         Indices of the true classes.
 
@@ -201,12 +201,12 @@ def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> 
 
 
 def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[Bin]:
-    """Compare the confidence of a model with its accuracy, by bins; empty bins are left out.
+    """Compute confidence and accuracy of a model by bins; empty bins are dropped.
 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float
-        Of the classes, 0 to 1.
+        Class probabilities, 0 to 1.
     target : np.ndarray [shape=(n,)], int
         Indices of the true classes.
 
@@ -250,7 +250,7 @@ def _confusions(
 
 
 def _resamples(confusions: Float64) -> Iterator[Float64]:
-    """Yield the confusion matrices of all resamples of the groups, some at a time."""
+    """Yield the confusion matrices of all resamples of the groups, in batches."""
     groups, classes, _ = confusions.shape
     flat = confusions.reshape(groups, -1)
     share = np.full(groups, 1.0 / groups)
@@ -262,10 +262,10 @@ def _resamples(confusions: Float64) -> Iterator[Float64]:
 
 
 def _rates(confusion: Float64) -> tuple[Float64, Float64, Float64]:
-    """Return precision, recall and F1 of each class of matrices (..., C, C).
+    """Return precision, recall and F1 of each class from matrices (..., C, C).
 
-    Recall and F1 are NaN where the class does not occur, precision where it is not predicted
-    either; where it occurs and is not predicted, precision is 0.
+    Recall and F1 are NaN for an absent class; precision is NaN if the class is neither present nor
+    predicted, and 0 if present but not predicted.
     """
     right = np.diagonal(confusion, axis1=-2, axis2=-1)
     true, predicted = confusion.sum(axis=-1), confusion.sum(axis=-2)
@@ -277,7 +277,7 @@ def _rates(confusion: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 def _macro(f1: Float64) -> Float64:
-    """Return the mean over the classes that occur; every resample has at least one."""
+    """Return the mean over the present classes; every resample has at least one."""
     return np.nanmean(f1, axis=-1)
 
 

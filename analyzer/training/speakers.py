@@ -1,4 +1,4 @@
-"""The scenario of speakers: who of those that are enrolled speaks, or somebody else."""
+"""Scenario of speakers: enrolled voices, and `unknown` for other voices."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -27,17 +27,18 @@ from hearthlog.schemas.logs.files import CUT
 from hearthlog.schemas.messages.topics import LIVE
 
 SPEAKERS = "speakers"
-APART = 1800 * NANOSECONDS  # of one time from the next
+APART = 1800 * NANOSECONDS  # between two enrolments
 _LEAST_SECONDS = 10.0  # of a voice
 _LEAST_TIMES = 2
 
 
 def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterator[Recording]:
-    """Read the marks of a training set of voices, and of the scenario; each log is a source.
+    """Read the marks of the voices and of the scenario; each log is a source.
 
-    Enrolled spans of logs are one source where they are less than half an hour apart.
+    Enrolled spans of logs are one source if they are less than half an hour apart.
 
-    Raise `LogError, DataError` as of `hearthlog.analyzer.training.home_recordings.home_recordings`.
+    Raise `LogError` or `DataError` as
+    `hearthlog.analyzer.training.home_recordings.home_recordings` does.
     """
     cut: list[Recording] = []
     for folder in folders:
@@ -47,7 +48,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
         for sound in of_both:
             taught = sound if sound.enrolled else _saying_who(teaching(sound))
             for one in marked_recordings([taught], folder, features, 0.0):
-                # A reviewer who says unknown cannot tell, who enrols it says that it is nobody.
+                # `unknown` means undecided in a review, but nobody enrolled in an enrolment.
                 label = OTHER if class_name(one.label) == UNKNOWN else one.label
                 own = one._replace(label=label, group=f"{HOME} {sound.log.stem}", most=None)
                 if sound.log.stem.endswith(CUT):
@@ -58,7 +59,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
 
 
 def _saying_who(sound: HomeSound) -> HomeSound:
-    """Leave out that somebody speaks, which is not said of the scenario."""
+    """Drop `speech` labels that name no speaker."""
     marks = sound.marks
     if sound.labelling == LIVE:
         marks = [mark for mark in marks if class_name(mark.label) != SPEECH]
@@ -66,8 +67,8 @@ def _saying_who(sound: HomeSound) -> HomeSound:
 
 
 def _by_time(recordings: Iterable[Recording]) -> Iterator[Recording]:
-    """Give recordings of one label that are less than half an hour apart the group of the first."""
-    latest: dict[str, tuple[int, str]] = {}  # the end and the group of each label
+    """Merge the groups of recordings of a label that are less than half an hour apart."""
+    latest: dict[str, tuple[int, str]] = {}  # end and group of each label
     for one in sorted(recordings, key=lambda each: each.span or (0, 0)):
         start, end = one.span or (0, 0)
         before, group = latest.get(one.label, (start - APART, ""))
@@ -78,14 +79,14 @@ def _by_time(recordings: Iterable[Recording]) -> Iterator[Recording]:
 
 
 def is_voice(label: str) -> bool:
-    """Tell whether a label is somebody's name, for no class of sound is called so."""
+    """Return whether a label is a person's name, that is, no class of sound."""
     return find_class(label) is None
 
 
 def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
-    """Return the scenario of the voices that are enrolled, silence, and all else as `unknown`.
+    """Return the scenario of enrolled voices, silence, and `unknown` for the rest.
 
-    Raise `DataError` if no voice is enrolled, or one only once, or for less than ten seconds.
+    Raise `DataError` if no voice is enrolled, or a voice only once or for less than ten seconds.
     """
     groups: dict[str, set[str]] = {}
     seconds: dict[str, float] = {}
@@ -112,7 +113,7 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
 
 
 def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32, Indices]:
-    """Return what a model of sounds has learned from: in the scenario silence, or unknown.
+    """Return the training windows of a sound model as silence or unknown of the scenario.
 
     Returns
     -------
@@ -122,7 +123,7 @@ def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32
     Raises
     ------
     DataError
-        If it has not kept what it learned from as inputs of the method.
+        If the model has not stored training inputs of the kind that the method uses.
     """
     description = model.description
     from hearthlog.analyzer.training.learned_inputs import (  # noqa: PLC0415  needs scikit-learn

@@ -1,4 +1,4 @@
-"""Methods that learn support vector machines, with scikit-learn."""
+"""Methods that train support vector machines with scikit-learn."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ _GAMMA_TIMES = (0.5, 1.0, 2.0)
 
 @dataclass(frozen=True)
 class SvmMethod(Method):
-    """A support vector machine with RBF kernel, whose classes are weighted against their number.
+    """Support vector machine with RBF kernel and balanced class weights.
 
     Support vector machines are the classifiers of "A ROS framework for audio-based activity
     recognition", section 4.
@@ -39,7 +39,7 @@ class SvmMethod(Method):
     Attributes
     ----------
     steps : int or None
-        Of a standard deviation, to which inputs are rounded; None for a model that does not.
+        Rounding steps of inputs per standard deviation; None disables rounding.
     """
 
     cost: float = 4.0
@@ -49,7 +49,7 @@ class SvmMethod(Method):
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions whose versions influence the result."""
+        """Distributions with an influence on the result."""
         return ("scikit-learn",)
 
     @property
@@ -58,12 +58,12 @@ class SvmMethod(Method):
         return {"cost": self.cost, "gamma": self.gamma}
 
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> "LearnedSvm":
-        """Learn from some segments.
+        """Train on some segments.
 
         Parameters
         ----------
         seen : np.ndarray [shape=(m,)], intp, or slice
-            Indices of the segments to learn from; all by default.
+            Indices of the training segments; all by default.
         """
         inputs, target, weight = examples.windows(seen)
         if len(inputs) > self.most_windows:
@@ -87,7 +87,7 @@ class SvmMethod(Method):
         Parameters
         ----------
         values : mapping of str to float
-            `cost` and `gamma`, as in the attributes; one that is not named stays.
+            `cost` and `gamma`; a missing one is unchanged.
 
         Raises
         ------
@@ -108,12 +108,12 @@ class SvmMethod(Method):
 
 
 class LearnedSvm:
-    """A fitted machine.
+    """A fitted support vector machine.
 
     Parameters
     ----------
     support : np.ndarray [shape=(n, width)], float32
-        Inputs that became support vectors, in the order of the `SVC`.
+        Support vectors, in the order of the `SVC`.
     """
 
     def __init__(self, machine: Pipeline, support: Float32, steps: int | None) -> None:
@@ -122,7 +122,7 @@ class LearnedSvm:
         self._support = support
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Return decision values, as `SvmMachine` gives them.
+        """Return decision values as `SvmMachine` computes them.
 
         Parameters
         ----------
@@ -131,7 +131,7 @@ class LearnedSvm:
         Returns
         -------
         np.ndarray [shape=(n, C)], float64
-            That of the weakest pair of the class; -inf for a class that was not learned.
+            Minimum over the pairs of a class; -inf for a class without training data.
         """
         values = self.machine.decision_function(inputs.astype(np.float64))
         pairs = -values[:, np.newaxis] if values.ndim == 1 else values
@@ -154,7 +154,7 @@ class LearnedSvm:
         }
 
     def parameters(self) -> dict[str, Any]:
-        """Return `cost`, as `gamma` that of the kernel itself, and `steps` if there are."""
+        """Return `cost`, the kernel's own `gamma`, and `steps` if set."""
         svc = self.machine[-1]
         steps = {} if self._steps is None else {"steps": self._steps}
         return {"cost": float(svc.C), "gamma": float(svc.gamma), **steps}
@@ -166,5 +166,5 @@ SVM = SvmMethod("svm", **as_room(SVM_RBF), cost=1.0, gamma=0.5)
 
 
 def network_method(name: str) -> SvmMethod:
-    """Return the method that learns from the embeddings of a network."""
+    """Return the method that trains on the embeddings of a network."""
     return SvmMethod(name, name, INPUTS, SVM_RBF.name, copies=0, rooms=1, cost=4.0, gamma=0.5)

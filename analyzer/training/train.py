@@ -1,4 +1,4 @@
-"""Training: learns a model by an installed method, and scores it on held-out sources."""
+"""Training of a model with an installed method, and its scores on held-out sources."""
 
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
@@ -66,42 +66,38 @@ _METHODS = Extensions("hearthlog.methods", Method, "method", _INSTALLED, DataErr
 
 
 def default_method() -> Method:
-    """Return the method that is best with what is installed: with a network where there is one."""
+    """Return the best available method: with a network if one is installed."""
     runtime = find_spec("ai_edge_litert") is not None
     return EMBEDDING if runtime and find_network(EMBEDDING.network) is not None else DEFAULT
 
 
 def clip_embedder(method: Method) -> ClipEmbedder | None:
-    """Return what hears the clips that a method learns from; None if it takes no embeddings.
-
-    Parameters
-    ----------
-    method : Method
+    """Return the clip embedder of a method; None if the method uses no embeddings.
 
     Raises
     ------
     ModelError
-        If its network is not known, not there, another file, or cannot be used.
+        If the network is unknown, missing, a different file, or unusable.
     """
     return network_embedder(method.network, method.seed) if method.network else None
 
 
 def method_named(name: str) -> Method:
-    """Return the method of a name.
+    """Return a method by name.
 
     Parameters
     ----------
     name : str
         `embedding`, `room`, `room21`, `bands`, `paper`, `svm`, the name of an entry point in the
-        group `hearthlog.methods`, or that of a network that has a card.
+        group `hearthlog.methods`, or the name of a network with a card.
 
     Raises
     ------
     DataError
-        If there is no method of this name, or a network and a method of this name.
+        If no method has this name, or both a network and a method have it.
     ModelError
-        If the entry point cannot be imported, or is no method of this name, or if the card says
-        what cannot be.
+        If the entry point cannot be imported, or is no method of this name, or if the card is
+        invalid.
     """
     if is_network(name):
         if _METHODS.has(name):
@@ -110,30 +106,29 @@ def method_named(name: str) -> Method:
     return _METHODS.get(name)
 
 
-LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real clips; 1 s does not
+LAG_SECONDS = 2.0  # equals the offline path on 90 minutes of real clips; 1 s does not
 REACH_SECONDS = 0.3
 SHORTEST_SECONDS = 0.25
 
-_SOUND_AFTER_SOUND = 0.007  # times as likely as it were if all classes were equally likely
-_DURATION_SECONDS = 10.0  # expected duration of a class that is not in the table of classes
+_SOUND_AFTER_SOUND = 0.007  # relative to equally likely classes
+_DURATION_SECONDS = 10.0  # of a class outside the table of classes
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
-    """Return the transition probabilities of classes by their expected durations.
+    """Return transition probabilities of classes from their expected durations.
 
     A sound is mostly followed by silence, if that is a class, and seldom by another sound: most
-    changes from one sound to another are mistakes in the middle of one of them.
+    changes from one sound to another are errors within one of them.
 
     Parameters
     ----------
     classes : sequence of str
-        Names of the C classes, at least two; one that `hearthlog.models.classes` does not know
-        lasts 10 s.
+        Names of the C classes, at least two; a class outside `hearthlog.models.classes` lasts 10 s.
 
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
-        Probability that a frame of the row's class is followed by one of the column's class.
+        Probability of the column's class in the frame after a frame of the row's class.
     """
     leave = 1.0 / np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
     is_sound = np.array([class_name(name) != SILENCE for name in classes])
@@ -150,7 +145,7 @@ def expected_durations(classes: Sequence[str]) -> Float64:
     Parameters
     ----------
     classes : sequence of str
-        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 10 s.
+        Names of the C classes; a class outside `hearthlog.models.classes` lasts 10 s.
 
     Returns
     -------
@@ -165,17 +160,17 @@ _MERGED_WITHIN = 60 * NANOSECONDS
 
 
 def merged_spans(spans: Int64) -> list[list[int]]:
-    """Join spans of time that are less than a minute apart.
+    """Merge spans of time that are less than a minute apart.
 
     Parameters
     ----------
     spans : np.ndarray [shape=(n, 2)], int64
-        Start and end of each, in nanoseconds of UTC, in any order.
+        Starts and ends in nanoseconds of UTC, in any order.
 
     Returns
     -------
     list of [start, end]
-        In order; not more than a description holds, for which the nearest are joined, too.
+        Sorted; the nearest spans are merged too if a description cannot hold all of them.
     """
     if not len(spans):
         return []
@@ -201,27 +196,25 @@ def train_model(  # noqa: PLR0913, PLR0917
     smoothing: str = "hmm",
     others: tuple[Float32, Indices] | None = None,
 ) -> Model:
-    """Learn a model, and calibrate and measure it on folds that never split a source group.
+    """Train a model; calibrate and score it on folds that never split a source group.
 
     Parameters
     ----------
-    data : Dataset
     scenario : Scenario
-        That of the data.
+        Scenario of the data.
     progress : callable
-        Is told the share of the fits that is done, 0 to 1.
-    method : Method, optional
+        Receives the completed share of the fits, 0 to 1.
     smoothing : str
-        `hmm` or `merge`, as field `method` of `Smoothing` has it.
+        `hmm` or `merge`, as in field `method` of `Smoothing`.
     others : (np.ndarray [shape=(k, width)], np.ndarray [shape=(k,)]), optional
-        Inputs of further windows that are always learned from, and their classes, which may have
+        Inputs of further windows, always in the training set, and their classes, which may have
         segments of one source group, or none.
 
     Raises
     ------
     DataError
-        If a class that the others have not comes from fewer than two source groups, if no division
-        into folds leaves every class something to learn from, if all segments are alike, or if the
+        If a class outside `others` comes from fewer than two source groups, if no division
+        into folds leaves training data for every class, if all segments are equal, or if the
         method wants augmented copies and its feature set has none.
     ModelError
         If the feature set of the method is not installed.
@@ -290,10 +283,7 @@ def train_model(  # noqa: PLR0913, PLR0917
 
 
 def check_varied(data: Dataset) -> None:
-    """Check that not all segments are alike.
-
-    Raise `DataError` if there are segments, and their features never change.
-    """
+    """Raise `DataError` if there are segments and their features never change."""
     if len(data) and (np.ptp(data.windows.reshape(-1, data.windows.shape[2]), axis=0) == 0).all():
         raise DataError("all segments are alike: their features never change; is this sound?")
 
@@ -301,8 +291,8 @@ def check_varied(data: Dataset) -> None:
 def group_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
 
-    Raise `DataError` if another class comes from fewer than two groups, or no division leaves
-    every such class something to learn from.
+    Raise `DataError` if a class outside `others` comes from fewer than two groups, or no division
+    leaves training data for every such class.
     """
     sources = [amount.sources for amount in data.amounts.values()]
     needed = [number for number in range(len(data.classes)) if number not in taught]
@@ -354,7 +344,7 @@ def _mixture(
     sources: tuple[list[Fold], Float64],
     collections: tuple[list[Fold], Float64 | None],
 ) -> Mixture:
-    """Learn heads beside a classifier, whose decision values for segments left out are known."""
+    """Train heads for a classifier, given its decision values for held-out segments."""
     folds, decisions = sources
     known = np.array([name != UNKNOWN for name in data.classes])[data.target]
     of_sources, of_collections = Tried(folds, inverse * decisions, known), None

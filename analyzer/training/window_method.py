@@ -1,4 +1,4 @@
-"""Methods that learn a classifier of scikit-learn from windows."""
+"""Methods that train a scikit-learn classifier on windows."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -19,27 +19,27 @@ _SEED = 20_261_122
 
 @dataclass(frozen=True)
 class WindowMethod(Method):
-    """A classifier of scikit-learn, whose classes are weighted against their number."""
+    """A scikit-learn classifier with balanced class weights."""
 
     most_windows: int = 12_000
 
     @property
     def random_state(self) -> int:
-        """That of the classifier of scikit-learn."""
+        """Random state of the scikit-learn classifier."""
         return _SEED + self.seed
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions whose versions influence the result."""
+        """Distributions with an influence on the result."""
         return ("scikit-learn",)
 
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> "LearnedMachine":
-        """Learn from some segments.
+        """Train on some segments.
 
         Parameters
         ----------
         seen : np.ndarray [shape=(m,)], intp, or slice
-            Indices of the segments to learn from; all by default.
+            Indices of the training segments; all by default.
         """
         inputs, target, weight = examples.windows(seen)
         if len(inputs) > self.most_windows:
@@ -53,13 +53,13 @@ class WindowMethod(Method):
     def learn(
         self, inputs: Float32, target: Indices, weight: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
-        """Learn from windows.
+        """Train on windows.
 
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
         target : np.ndarray [shape=(n,)], intp
-            Numbers of their classes, of which none is without a window.
+            Indices of the classes, each with at least one window.
         weight : np.ndarray [shape=(n,)], float64
         """
 
@@ -78,12 +78,12 @@ def as_room(kind: ClassifierKind) -> dict[str, Any]:
 
 
 class LearnedMachine:
-    """A classifier that decides with the code that will decide in the recorder.
+    """A classifier that decides with the recorder's own code.
 
     Parameters
     ----------
     classes : np.ndarray [shape=(c,)], intp
-        Their numbers, an attribute.
+        Indices of the trained classes; also an attribute.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class LearnedMachine:
         self._parameters = parameters
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Return decision values, as of `Learned.decide`."""
+        """Return decision values; see `Learned.decide`."""
         decision = np.full((len(inputs), classes), -np.inf)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
@@ -107,9 +107,9 @@ class LearnedMachine:
         return decision
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a model file; all classes were learned."""
+        """Return the arrays of a model file; requires that all classes were in the training set."""
         return dict(self._arrays)
 
     def parameters(self) -> dict[str, Any]:
-        """Return the values of the field `parameters` in the description of a model."""
+        """Return the field `parameters` of a model description."""
         return dict(self._parameters)
