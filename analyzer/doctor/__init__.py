@@ -1,1 +1,1 @@
-"""Check logs: against the specification of MCAP, against docs/log.md, and with each other."""
+"""Checks of logs against the MCAP specification, docs/log.md and neighbouring logs."""

@@ -1,4 +1,4 @@
-"""Chunks of a file: their schemas and channels, messages, and message indexes."""
+"""Checks of chunks: schemas, channels, messages and message indexes."""
 
 import re
 import struct
@@ -41,7 +41,7 @@ from hearthlog.schemas.mcap.records import (
 )
 
 ROS_ENCODINGS = (SCHEMA_ENCODING, "ros2idl")
-_SIZE_LIMIT = 16 << 20  # bytes of a record that is neither chunk nor attachment
+_SIZE_LIMIT = 16 << 20  # bytes of a record other than a chunk or an attachment
 _TOTAL_LIMIT = 64 << 20  # bytes of all schemas and channels of a file
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
 
@@ -49,19 +49,19 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
 def parse_strictly(
     findings: Findings, opcode: int, offset: int, content: bytes
 ) -> McapRecord | None:
-    """Parse a record, and report one that is damaged or too large.
+    """Parse a record, and report a damaged or too large one.
 
-    Damaged are records that are too short, have a text that is not UTF-8, or a key of a map twice.
+    A record is damaged if it is too short, has invalid UTF-8, or repeats a key of a map.
 
     Parameters
     ----------
     offset : int
-        Byte of the file at which the record begins, or the chunk that it is in.
+        Byte of the file at which the record, or its chunk, begins.
 
     Returns
     -------
     McapRecord or None
-        None if it cannot be parsed, is larger than hearthlog reads, or is of an unknown kind.
+        None if the record cannot be parsed, is too large for hearthlog, or is of an unknown kind.
     """
     if len(content) > _SIZE_LIMIT and opcode != Opcode.ATTACHMENT:
         what = f"{name_of(opcode)} of {len(content)} bytes is larger than hearthlog reads"
@@ -81,7 +81,7 @@ def parse_strictly(
 
 
 def name_of(opcode: int) -> str:
-    """Name a kind of record, such as `Chunk index`."""
+    """Return the name of a kind of record, such as `Chunk index`."""
     try:
         return Opcode(opcode).name.capitalize().replace("_", " ")
     except ValueError:
@@ -89,29 +89,29 @@ def name_of(opcode: int) -> str:
 
 
 class CheckedDefinitions(Definitions):
-    """The schemas and channels that were defined so far, each checked when it was added.
+    """Schemas and channels defined so far, each checked when added.
 
     Parameters
     ----------
     ours : bool
-        Whether hearthlog made this file: then breaches of its profile are errors, not warnings.
+        Whether hearthlog wrote the file: violations of its profile are then errors, not warnings.
     """
 
     def __init__(self, findings: Findings, *, ours: bool) -> None:
         super().__init__()
-        self.ours = ours  # whether hearthlog made this file
+        self.ours = ours  # whether hearthlog wrote the file
         self.profile = ""  # of the header
-        self.incomplete = False  # whether there may be more, in what was too large to be checked
+        self.incomplete = False  # whether unchecked, too large parts may hold more definitions
         self._size = 0
         self._findings = findings
 
     def read(self, opcode: int, offset: int, content: bytes) -> int | None:
-        """Read and check a schema or a channel.
+        """Read and check a schema or a channel; return the number of a new channel.
 
         Parameters
         ----------
         offset : int
-            Byte of the file at which the record begins, or the chunk that it is in.
+            Byte of the file at which the record, or its chunk, begins.
         """
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):
@@ -121,7 +121,7 @@ class CheckedDefinitions(Definitions):
         return None
 
     def _keeps(self, size: int, offset: int) -> bool:
-        """Tell whether there is room for another definition."""
+        """Whether another definition fits into the limit."""
         self._size += size
         if self._size > _TOTAL_LIMIT:
             what = "more schemas and channels than hearthlog reads"
@@ -129,7 +129,7 @@ class CheckedDefinitions(Definitions):
         return self._size <= _TOTAL_LIMIT
 
     def _add_schema(self, schema: Schema, offset: int, size: int) -> None:
-        """Check a schema, and keep the first of its number."""
+        """Check a schema; keep only the first with its number."""
         error = self._findings.error
         if schema.id == 0:
             error("schema-id", f"schema {schema.name} has the number 0", RECOVER, offset=offset)
@@ -152,7 +152,7 @@ class CheckedDefinitions(Definitions):
             self._profile("profile-schema", what, offset)
 
     def _add_channel(self, channel: Channel, offset: int, size: int) -> bool:
-        """Check a channel, and keep the first of its number; tell whether it is that."""
+        """Check a channel; keep only the first with its number, and return whether it is new."""
         error = self._findings.error
         topic = f"channel {channel.id} ({channel.topic})"
         if channel.id in self.channels:
@@ -180,7 +180,7 @@ class CheckedDefinitions(Definitions):
         return True
 
     def _profile(self, rule: str, what: str, offset: int) -> None:
-        """Say what the profile asks for: it only should be followed, in a file that is not ours."""
+        """Report a violation of the profile: an error in files of hearthlog, else a warning."""
         report = self._findings.error if self.ours else self._findings.warning
         report(rule, what, "its profile, ros2, asks for that", offset=offset)
 
@@ -202,9 +202,9 @@ class ChunkContent(NamedTuple):
     Attributes
     ----------
     starts : np.ndarray [shape=(n,)], int64
-        Bytes in `records` at which its messages begin, ascending.
+        Bytes in `records` at which messages begin, ascending.
     heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-        The heads of these messages.
+        Heads of these messages.
     """
 
     records: bytes
@@ -215,14 +215,14 @@ class ChunkContent(NamedTuple):
 class MessageBatch(NamedTuple):
     """Some messages, still encoded."""
 
-    buffer: Bytes  # [shape=(b,)], uint8: holds their records, and others
-    starts: Int64  # [shape=(n,)], int64: where in the buffer their records begin
+    buffer: Bytes  # [shape=(b,)], uint8: contains their records
+    starts: Int64  # [shape=(n,)], int64: starts of their records in the buffer
     heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
 
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
     ) -> Iterator[RawMessages]:
-        """Group the messages by channel, without those of channels that are not defined."""
+        """Group the messages by channel, without messages of undefined channels."""
         for identity in np.flatnonzero(np.bincount(self.heads["channel"])).tolist():
             if identity in channels:
                 channel = channels[identity]
@@ -233,7 +233,7 @@ class MessageBatch(NamedTuple):
 
 
 def batches(chunks: Sequence[ChunkContent]) -> Iterator[MessageBatch]:
-    """Yield the messages of some chunks, a few megabytes each time, however large a chunk is.
+    """Yield the messages of some chunks in batches of a few megabytes, whatever the chunk size.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def batches(chunks: Sequence[ChunkContent]) -> Iterator[MessageBatch]:
 
 
 class Chunk:
-    """A chunk, checked when the message indexes behind it are known."""
+    """A chunk, to be checked after its message indexes were added."""
 
     def __init__(
         self,
@@ -262,7 +262,7 @@ class Chunk:
         budget: "RecordBudget",
     ) -> None:
         self.content: ChunkContent | None = None  # None if the chunk is too damaged to be read
-        self.whole = False  # whether all of its messages are in `content`
+        self.whole = False  # whether `content` has all of its messages
         self.offset = record.offset
         self._length = record.length
         self._findings = findings
@@ -281,7 +281,7 @@ class Chunk:
                 definitions.incomplete = True
                 return
             self._head = chunk_head(record.content)
-            unchecked = self._head._replace(crc=0)  # a wrong checksum has a rule of its own
+            unchecked = self._head._replace(crc=0)  # a wrong checksum has its own rule
             self._records = decompress(unchecked, record.content)
         except McapError as error:
             self._error("chunk-data", str(error))
@@ -292,7 +292,7 @@ class Chunk:
         self.whole = True
 
     def add_index(self, record: Record) -> None:
-        """Add a message index that stands behind the chunk."""
+        """Add a message index that follows the chunk."""
         self._index_length += record.length
         try:
             channel, size = MESSAGE_INDEX.unpack_from(record.content)
@@ -317,7 +317,7 @@ class Chunk:
         Parameters
         ----------
         cut : bool
-            Whether message indexes may be missing behind it: they are not compared then.
+            Whether message indexes may be missing after the chunk: they are then not compared.
         """
         if not self.whole:
             return
@@ -333,7 +333,7 @@ class Chunk:
             self._check_index(entries, channels)
 
     def index_content(self) -> bytes | None:
-        """Return the chunk index that there should be, without opcode and length.
+        """Return the expected chunk index, without opcode and length.
 
         Returns
         -------
@@ -351,7 +351,7 @@ class Chunk:
         return first + places + text + UINT64.pack(size) + UINT64.pack(head.size)
 
     def _find_records(self, hints: Int64) -> None:
-        """Find messages, take schemas and channels."""
+        """Find the messages, and read schemas and channels."""
         records = self._records
         starts, others, end = _split(records, hints, self._budget)
         if self._budget.left < 0:
@@ -369,7 +369,7 @@ class Chunk:
         check_channels(self._findings, self._definitions, self.content, new, self.offset)
 
     def _other(self, opcode: int, start: int, content: bytes) -> dict[int, int]:
-        """Take a record that is no message; return the channel that it defines, and where."""
+        """Read a record other than a message; return a newly defined channel and its position."""
         if opcode == Opcode.MESSAGE:
             self._error("message-short", f"a message at byte {start} of a chunk is too short")
             self.whole = False
@@ -425,12 +425,12 @@ class Chunk:
 
 
 class RecordBudget:
-    """How many records inside of chunks are gone through one by one in a file.
+    """Limit of the records inside chunks that are walked one by one in a file.
 
     Parameters
     ----------
     size : int
-        Bytes of the file: a small one that claims very many is not believed.
+        Bytes of the file; limits the records that a small file can claim.
     """
 
     def __init__(self, size: int) -> None:
@@ -443,18 +443,18 @@ def _split(records: bytes, hints: Int64, budget: RecordBudget) -> tuple[Int64, I
     Parameters
     ----------
     hints : np.ndarray [shape=(n,)], int64
-        Where messages begin, ascending, if the index can be believed.
+        Starts of messages according to the index, ascending; not trusted.
 
     Returns
     -------
     starts, others : np.ndarray [shape=(m,)], int64
-        Where messages begin, and other records, and messages that are too short.
+        Starts of messages; starts of other records and of messages that are too short.
     end : int
-        Of the last record; not the length of the chunk if that is damaged.
+        End of the last record; less than the length of the chunk if a record is damaged.
     """
     if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
         heads = gather_heads(records, hints)
-        lengths = np.minimum(heads["length"], len(records))  # or their sums may overflow
+        lengths = np.minimum(heads["length"], len(records))  # prevents overflow of their sums
         firsts = np.concatenate([[0], hints + HEAD.size + lengths])
         lasts = np.concatenate([hints, [len(records)]])
         if ((firsts <= lasts) & (lasts <= len(records))).all() and (
@@ -464,7 +464,7 @@ def _split(records: bytes, hints: Int64, budget: RecordBudget) -> tuple[Int64, I
             for place in np.flatnonzero(firsts < lasts).tolist():
                 starts, between, end = _walk(records, int(firsts[place]), int(lasts[place]), budget)
                 if len(starts) or end != lasts[place]:
-                    break  # a message that the index does not know, or no whole records
+                    break  # an unindexed message, or an incomplete record
                 others.append(between)
             else:
                 return hints, np.concatenate(others), len(records)
@@ -472,7 +472,7 @@ def _split(records: bytes, hints: Int64, budget: RecordBudget) -> tuple[Int64, I
 
 
 def _walk(content: bytes, start: int, end: int, budget: RecordBudget) -> tuple[Int64, Int64, int]:
-    """Go from record to record; return what `_split` does."""
+    """Walk from record to record; return values as `_split`."""
     messages, others = array("q"), array("q")
     with suppress(McapError):
         for opcode, first, last in iterate_records(content, start, end):
@@ -494,12 +494,12 @@ def check_channels(
     new: dict[int, int],
     offset: int,
 ) -> None:
-    """Report messages whose channel is not defined, or only behind them.
+    """Report messages with an undefined channel, or a channel defined after them.
 
     Parameters
     ----------
     new : dict of int to int
-        By number of a channel that these records define: where in their bytes they do.
+        Byte of the definition, by channel defined in these records.
     offset : int
         Byte of the file at which the chunk, or the first of the messages, begins.
     """
@@ -516,7 +516,7 @@ def check_channels(
 
 
 def _keys(channels: Int64, times: Int64, offsets: Int64) -> NDArray[np.void]:
-    """Return an array of one comparable thing for each message."""
+    """Return one comparable key for each message."""
     keys = np.empty(len(channels), [("channel", "<u2"), ("time", "<i8"), ("offset", "<i8")])
     keys["channel"], keys["time"], keys["offset"] = channels, times, offsets
     return keys

@@ -1,4 +1,4 @@
-"""The topics of a recorder's log, and the columns of each, checked against docs/log.md."""
+"""Checks of a recorder log's topics and columns against docs/log.md."""
 
 import re
 from itertools import repeat
@@ -25,9 +25,9 @@ from hearthlog.schemas.messages.topics import (
 )
 
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
-DIRECTION = "direction"  # only of an array
-EMBEDDING = "embedding"  # only with a network
-_BESIDE = "beside"  # of a candidate or a scenario
+DIRECTION = "direction"  # only from a microphone array
+EMBEDDING = "embedding"  # only with an embedding network
+_BESIDE = "beside"  # topics of a candidate or a scenario
 BESIDE_LABEL, BESIDE_SEGMENT = f"{_BESIDE}/{LABEL}", f"{_BESIDE}/{SEGMENT}"
 TYPES = {
     "info": message_types.STREAM_INFO,
@@ -41,7 +41,7 @@ TYPES = {
     BESIDE_LABEL: message_types.LABEL,
     BESIDE_SEGMENT: message_types.SEGMENT,
 }
-ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
+ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # channels in every log of a recorder
 LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)(_\d+)?\.mcap(\.active)?")
 SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
 
@@ -52,8 +52,8 @@ def split_topic(topic: str) -> tuple[str, str]:
     Returns
     -------
     microphone, kind : str
-        Such as `mic` and `features`, of a candidate or a scenario `BESIDE_LABEL` or
-        `BESIDE_SEGMENT`; nothing and the whole topic if it is none of a microphone.
+        Such as `mic` and `features`; `BESIDE_LABEL` or `BESIDE_SEGMENT` for a candidate or a
+        scenario; an empty text and the complete topic for other topics.
     """
     name = parse_topic(topic)
     if name is None:
@@ -66,20 +66,14 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def topic_type(topic: str) -> str | None:
-    """Return the message type that docs/log.md gives to a topic.
-
-    Returns
-    -------
-    str or None
-        None if docs/log.md has no such topic.
-    """
+    """Return the message type of a topic in docs/log.md; None for an unknown topic."""
     return TYPES.get(split_topic(topic)[1], SHARED.get(topic))
 
 
 STAMP = "header.stamp"
 _SUM_TOLERANCE = 1e-4
-_LABEL_LATE = MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000  # ns; those by names
-_LATE = {  # ns, with what stamps may be off
+_LABEL_LATE = MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000  # ns; of labels by network names
+_LATE = {  # ns, including the tolerance of stamps
     LABEL: _LABEL_LATE,
     BESIDE_LABEL: _LABEL_LATE,
     SEGMENT: 75_000_000_000,
@@ -97,7 +91,7 @@ def check_stamps(
     Parameters
     ----------
     microphone : str
-        Its name; empty for a topic of no microphone.
+        Name; empty for a topic without a microphone.
 
     Raises
     ------
@@ -111,7 +105,7 @@ def check_stamps(
     late = times - stamps
     if kind == "info" and not named:
         late = np.minimum(late, 0)
-    if kind in _LATE:  # may be known later, but never before it is over
+    if kind in _LATE:  # may be logged later, but never before its end
         late[(late >= 0) & (late <= _LATE[kind])] = 0
     findings.rows(
         "stamp",
@@ -132,12 +126,12 @@ def check_stamps(
 
 
 def check_values(findings: Findings, columns: Columns, field: str, width: int) -> None:
-    """Check that an array has as many values as names, and that they are finite.
+    """Check that an array has one finite value per name.
 
     Parameters
     ----------
     field : str
-        Path of the array; the values of `std` must not be negative, either.
+        Path of the array; values of `std` must not be negative, either.
 
     Raises
     ------
@@ -166,12 +160,12 @@ def check_values(findings: Findings, columns: Columns, field: str, width: int) -
 
 
 def check_labels(findings: Findings, columns: Columns, classes: list[str]) -> None:
-    """Check the labels of frames: their classes, probabilities and confidence.
+    """Check the classes, probabilities and confidence of frame labels.
 
     Parameters
     ----------
     classes : list of str
-        Of the model, in the order of the probabilities.
+        Classes of the model, in the order of the probabilities.
 
     Raises
     ------
@@ -205,7 +199,7 @@ def check_labels(findings: Findings, columns: Columns, classes: list[str]) -> No
 
 
 def _check_names(findings: Findings, columns: Columns, classes: list[str]) -> Int64:
-    """Return the numbers of the classes, -1 where a label is none of them."""
+    """Return the class numbers of labels, -1 for unknown labels, which are reported."""
     numbers_of = {label: number for number, label in enumerate(classes)}
     labels = columns["label"].tolist()
     numbers = np.fromiter(map(numbers_of.get, labels, repeat(-1)), np.int64, len(labels))
@@ -224,7 +218,7 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
     Parameters
     ----------
     classes : list of str or None
-        Of the model; None allows any.
+        Classes of the model; None allows any.
 
     Raises
     ------
@@ -245,7 +239,7 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
 
 
 def check_directions(findings: Findings, columns: Columns) -> None:
-    """Check that directions are angles, and how sure they are a share.
+    """Check that azimuths are within ±π, and confidences within 0 to 1.
 
     Raise `LogError` if a field of the type is missing.
     """
@@ -265,7 +259,7 @@ def check_directions(findings: Findings, columns: Columns) -> None:
 
 
 def check_embeddings(findings: Findings, columns: Columns) -> None:
-    """Check that embeddings are of whole windows, and have a value for each name.
+    """Check that embeddings cover complete windows, and have one value per name.
 
     Raise `LogError` if a field of the type is missing.
     """
@@ -286,9 +280,9 @@ def check_embeddings(findings: Findings, columns: Columns) -> None:
 
 
 def check_gaps(findings: Findings, columns: Columns) -> None:
-    """Report every gap, and check that its lost frames last as long as it does.
+    """Report every gap, and check its duration against its lost frames.
 
-    What a damaged log has lost may have had gaps in which the clock was set.
+    Losses of a damaged log are exempt: they may include gaps in which the clock was set.
 
     Raise `LogError` if a field of the type is missing.
     """

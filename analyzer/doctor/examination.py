@@ -1,4 +1,4 @@
-"""The examination of logs: each file by itself, and the series of files in a folder."""
+"""Examination of logs: single files, and the series of files in a folder."""
 
 import re
 import warnings
@@ -40,28 +40,28 @@ from hearthlog.schemas.mcap.records import FOOTER_SIZE, HEAD, MAGIC, not_mcap, r
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
-_MOST_WRONG = 20_000  # faults of a channel that are unlike, before the rest is passed over
+_MOST_WRONG = 20_000  # distinct faults of a channel, after which its messages are skipped
 _KEPT = {HEARTHLOG_METADATA, ROSBAG2, CONTENTS, *ATTACHMENTS}
 
 
 @dataclass
 class ExaminedFile:
-    """A file that was checked."""
+    """Result of the checks of one file."""
 
     findings: Findings
-    ours: bool = False  # whether it is a log of hearthlog, and no layer beside one
+    ours: bool = False  # whether it is a log of hearthlog, and not a layer
     node: str = ""
     span: tuple[int, int] | None = None  # first and last log time, in nanoseconds
     frames: dict[str, FrameSequence] = field(default_factory=dict)  # by microphone
 
 
 def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFile:
-    """Check one file against the specification of MCAP and, if it is ours, docs/log.md.
+    """Check one file against the MCAP specification and, if it is ours, docs/log.md.
 
     Parameters
     ----------
     progress : callable, optional
-        Is told the share of the bytes that is done, 0 to 1.
+        Called with the share of the bytes that is done, 0 to 1.
     """
     examined = ExaminedFile(Findings(path))
     try:
@@ -73,7 +73,7 @@ def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFi
 
 
 class _Outline(NamedTuple):
-    """What the index of a file tells before the file is read from its beginning."""
+    """Facts from the index of a file, for reading the file from its beginning."""
 
     offsets: list[int]  # bytes at which records begin, ascending
     summary_start: int  # 0 if there is no summary
@@ -123,7 +123,7 @@ def _outline(path: Path, source: ByteSource) -> _Outline:
     start = 0 if footer is None else footer.summary_start
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", HearthlogWarning)  # the checks tell more of it
+            warnings.simplefilter("ignore", HearthlogWarning)  # the checks report more details
             file = LogFile(path)
         with file:
             ours = _is_ours(file)
@@ -137,7 +137,7 @@ def _outline(path: Path, source: ByteSource) -> _Outline:
 
 
 def _is_ours(file: LogFile) -> bool:
-    """Tell whether a recorder wrote this file, and not what merges logs or cuts parts out."""
+    """Whether a recorder wrote this file, rather than a merge or a cut of logs."""
     if _LAYER.fullmatch(file.path.name):
         return False
     records = provenance_records(file)
@@ -156,7 +156,7 @@ def _walk(
     outline: _Outline,
     at: Callable[[int], None],
 ) -> bool:
-    """Go through all records; tell whether the last one is a footer."""
+    """Check all records; return whether the last one is a footer."""
     summary: SummarySection | None = None
     losses = 0
     for record in walk:
@@ -208,14 +208,14 @@ def _check_end(source: ByteSource, findings: Findings) -> None:
 
 
 def _check_contents(findings: Findings) -> None:
-    """Compare what the file says of its messages with what they say."""
+    """Compare the file's contents record with its messages."""
     try:
         with LogFile(findings.path) as file:
             stated, actual = stated_contents(file), LogContents()
             for batch in read_in_batches(file, file.chunks):
                 actual.add(batch)
     except LogError:
-        return  # is reported already
+        return  # already reported
     if stated is None:
         what = f"metadata {CONTENTS} is damaged, or of other messages"
         findings.warning("contents", what, "it is not read: the messages tell what is in the file")
@@ -234,15 +234,15 @@ def _report_unfinished(findings: Findings, *, active: bool) -> None:
 
 
 class ForeignMessages:
-    """Checks that the messages of a file that is not ours are of the types that it names."""
+    """Checks of messages in a file that is not ours: whether they match their types."""
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
         self._data = data
         self._findings = findings
-        self._wrong: Counter[int] = Counter()  # faults that are unlike, by channel
+        self._wrong: Counter[int] = Counter()  # distinct faults, by channel
 
     def add(self, batch: MessageBatch) -> None:
-        """Decode the next messages of the file, and report what cannot be decoded."""
+        """Decode the next messages of the file, and report undecodable ones."""
         definitions = self._data.definitions
         for raw in batch.by_channel(definitions.channels, definitions.schemas):
             if self._wrong[raw.channel.id] > _MOST_WRONG:
@@ -252,14 +252,14 @@ class ForeignMessages:
             if raw.schema is None or raw.schema.encoding not in ROS_ENCODINGS:
                 continue
             if unreadable(raw.channel, raw.schema):
-                continue  # which is said of its definition
+                continue  # reported for the definition
             try:
                 decode([raw])
             except LogError as error:
                 self._report(raw, error)
 
     def _report(self, raw: RawMessages, error: LogError) -> None:
-        """Report the messages that are not of their type, or else texts that are not UTF-8."""
+        """Report messages that do not match their type, or else texts that are not UTF-8."""
         wrong = faults(raw)
         topic = raw.channel.topic
         rows = np.zeros(len(raw), bool)
@@ -278,12 +278,12 @@ class ForeignMessages:
             self._findings.warning("text", str(error), advice, time=int(raw.log_times[0]))
 
     def interrupt(self) -> None:
-        """Note that messages are missing here, which makes no difference."""
+        """Ignore missing messages: each message is checked on its own."""
 
 
 _DAY = re.compile(r"\d{4}/\d{2}/\d{2}")
-_TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
-_BESIDE = 60 * NANOSECONDS  # that a layer may go beyond its log
+_TOLERANCE = 0.01  # share of the time between two files, for the error of a sound card's clock
+_BESIDE = 60 * NANOSECONDS  # maximum extent of a layer beyond its log
 _LEFT = {
     f"{SUFFIX}.damaged": "is what could not be recovered whole; `hearthlog recover` may save more",
     f"{SUFFIX}.recovering": "was left by a recovery that was cut short; the next one makes it anew",
@@ -293,7 +293,7 @@ _LEFT = {
 
 
 def check_leftovers(folder: Path) -> Iterator[Findings]:
-    """Find the files that killed recorders and commands have left behind."""
+    """Find the files left by killed recorders and commands."""
     for path in sorted(folder.rglob("*")):
         for suffix, what in _LEFT.items():
             if path.name.endswith(suffix) and SUFFIX in path.name:
@@ -308,7 +308,7 @@ def check_series(files: Sequence[ExaminedFile]) -> None:
     Parameters
     ----------
     files : sequence of ExaminedFile
-        In any order; those that are not ours, or have no messages, are passed over.
+        In any order; files that are not ours, or have no messages, are skipped.
     """
     homes = {home for file in files if (home := _folder_of_days(file.findings.path)) is not None}
     nodes: dict[tuple[Path | None, str], list[ExaminedFile]] = {}
@@ -325,7 +325,7 @@ def check_series(files: Sequence[ExaminedFile]) -> None:
 
 
 def _check_layers(files: Sequence[ExaminedFile]) -> None:
-    """Find layers that say nothing of the time of the log that they are named after."""
+    """Report layers outside of the time of the log with the same name."""
     spans = {file.findings.path: file.span for file in files if file.span is not None}
     for path in filter(is_layer, spans):
         log, (start, end) = log_of_layer(path), spans[path]
@@ -338,7 +338,7 @@ def _check_layers(files: Sequence[ExaminedFile]) -> None:
 
 
 def _folder_of_days(path: Path) -> Path | None:
-    """Return the folder of a home, which has a log in YYYY/MM/DD; None if it is not in one."""
+    """Return the home folder of a log in YYYY/MM/DD; None for other logs."""
     return path.parents[3] if _DAY.fullmatch("/".join(path.parts[-4:-1])) else None
 
 
@@ -348,7 +348,7 @@ def _start(file: ExaminedFile) -> int:
 
 
 def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
-    """Two logs of one node speak of the same time only where its clock was set back."""
+    """Report logs of one node that overlap, unless the clock was set back."""
     twice = [again for file in files if (again := _lived_twice(file)) is not None]
     latest = files[0]
     for file in files[1:]:
@@ -365,7 +365,7 @@ def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
 
 
 def _lived_twice(file: ExaminedFile) -> tuple[int, int] | None:
-    """Return the time that came again because the clock was set back before a file, or None."""
+    """Return the time span that was repeated because the clock was set back, or None."""
     back = [frames.gap_before for frames in file.frames.values() if _begins_back(frames)]
     gaps = [gap for gap in back if gap is not None]
     if not gaps:
@@ -374,12 +374,12 @@ def _lived_twice(file: ExaminedFile) -> tuple[int, int] | None:
 
 
 def _begins_back(frames: FrameSequence) -> bool:
-    """Tell whether a file begins with the setting back of the clock."""
+    """Whether a file begins with the clock set back."""
     return frames.gap_before is not None and frames.gap_before[1] < frames.gap_before[0]
 
 
 def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
-    """Frame numbers go on from file to file, or begin at 0 again."""
+    """Check that frame numbers continue from file to file, or restart at 0."""
     for earlier, file in pairwise(files):
         frames, last = file.frames[microphone], earlier.frames[microphone].last
         if frames.first is None or frames.first[0] == 0 or last is None:
@@ -391,7 +391,7 @@ def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
 
 
 def _goes_on(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
-    """Tell whether frames go on with where others end: the clock may have been set between."""
+    """Whether frames continue where any other log ends: the clock may have been set in between."""
     assert frames.first is not None
     number = frames.first[0] - frames.lost_before
     time = frames.first[1] if frames.gap_before is None else frames.gap_before[0]
@@ -430,25 +430,26 @@ def examine(
     progress: Progress = ignore_progress,
     missing: list[str] | None = None,
 ) -> list[Findings]:
-    """Check logs, or all logs of folders and how they follow each other.
+    """Check logs, or all logs of folders and their sequence.
 
     Parameters
     ----------
     progress : callable, optional
-        Is told the share of the bytes that is done, 0 to 1.
+        Called with the share of the bytes that is done, 0 to 1.
     missing : list of str, optional
-        Is appended to: which of several paths have no log, and why; the others are checked.
+        Receives the errors of paths without a log, if there are several paths; the others are
+        checked.
 
     Returns
     -------
     list of Findings
-        One for each log, in the order of their paths, sound ones too; then one for each file that
-        a killed recorder or command has left behind.
+        One for each log, in the order of the paths, intact ones too; then one for each file left
+        by a killed recorder or command.
 
     Raises
     ------
     LogError
-        If there is neither a log nor such a file.
+        If there is neither a log nor a leftover file.
     """
     paths = [paths] if isinstance(paths, Path) else paths
     logs: dict[Path, Path] = {}

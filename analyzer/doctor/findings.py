@@ -1,4 +1,4 @@
-"""What is wrong with a log: one finding a line, and not more lines of a kind than help."""
+"""Findings about a log, with a limited number of each kind."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -13,8 +13,8 @@ from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import millisecond_text
 
 Level = Literal["error", "warning"]
-_SHOWN = 5  # findings of one kind in one file
-_LENGTH = 600  # characters of a finding
+_SHOWN = 5  # maximum findings of one kind in one file
+_LENGTH = 600  # maximum characters of a finding
 
 RECOVER = "`hearthlog recover` saves what is whole"
 REINDEX = "the messages are not affected; `hearthlog recover` makes a log with a new index"
@@ -22,13 +22,13 @@ DISTRUST = "do not train from it; if hearthlog wrote it as it is, report that"
 
 
 class Finding(NamedTuple):
-    """One thing that is wrong."""
+    """One problem in a log."""
 
     path: Path
     level: Level
-    rule: str  # which rule of docs/doctor.md is broken
+    rule: str  # violated rule of docs/doctor.md
     what: str
-    advice: str = ""  # what to do; empty where the finding says it all
+    advice: str = ""  # what to do; empty if `what` is sufficient
     offset: int | None = None  # byte of the file at which the record begins
     time: int | None = None  # log time in nanoseconds
 
@@ -45,7 +45,7 @@ class Finding(NamedTuple):
 
 @dataclass
 class Findings:
-    """The findings of one file: of every rule the first few, and the number of all."""
+    """The findings of one file: the first few of each rule, and the count of all."""
 
     path: Path
     shown: list[Finding] = field(default_factory=list)
@@ -60,12 +60,12 @@ class Findings:
         offset: int | None = None,
         time: int | None = None,
     ) -> None:
-        """Add what violates the specification of MCAP or docs/log.md.
+        """Add a violation of the MCAP specification or of docs/log.md.
 
         Parameters
         ----------
         advice : str
-            What to do; empty where `what` says it all.
+            What to do; empty if `what` is sufficient.
         offset : int, optional
             Byte of the file at which the record begins.
         time : int, optional
@@ -82,12 +82,12 @@ class Findings:
         offset: int | None = None,
         time: int | None = None,
     ) -> None:
-        """Add what is incomplete, or was lost.
+        """Add an incomplete part or a loss.
 
         Parameters
         ----------
         advice : str
-            What to do; empty where `what` says it all.
+            What to do; empty if `what` is sufficient.
         offset : int, optional
             Byte of the file at which the record begins.
         time : int, optional
@@ -105,29 +105,28 @@ class Findings:
         *,
         advice: str = DISTRUST,
     ) -> None:
-        """Add the rows of a column that break a rule.
+        """Add the rows of a column that violate a rule.
 
         Parameters
         ----------
         wrong : np.ndarray [shape=(n,)], bool
-            Which rows break it.
+            Which rows violate it.
         times : np.ndarray [shape=(n,)], int64
             Log times in nanoseconds of UTC.
         what : callable
-            Is told the number of a row, from 0, and says what is wrong with it; is called for the
-            first five of them.
+            Returns the text of a finding for a row number, from 0; called for the first five rows.
         """
         places = np.flatnonzero(wrong)
         advice = advice if level == "error" else ""
         for row in places[:_SHOWN].tolist():
             time = int(times[row])
-            with np.errstate(over="ignore"):  # of numbers that are any
+            with np.errstate(over="ignore"):  # damaged numbers may have any value
                 self._add(Finding(self.path, level, rule, what(row), advice, None, time))
         if len(places) > _SHOWN:
             self.counts[level, rule] += len(places) - _SHOWN
 
     def more(self) -> dict[tuple[Level, str], int]:
-        """Count the findings that are not shown, by level and rule."""
+        """Return the number of findings that are not shown, by level and rule."""
         shown = Counter((finding.level, finding.rule) for finding in self.shown)
         return {kind: n - shown[kind] for kind, n in self.counts.items() if n > shown[kind]}
 

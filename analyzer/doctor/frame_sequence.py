@@ -1,4 +1,4 @@
-"""Frame numbers, stamps, gaps, labels and segments of one microphone, checked together."""
+"""Joint checks of one microphone's frame numbers, stamps, gaps, labels and segments."""
 
 from collections.abc import Callable, Collection
 from typing import NamedTuple
@@ -22,27 +22,27 @@ from hearthlog.models.embedding.projection import WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
-# Behind a sound server stamps are steered by when blocks arrive, at first by up to 45 % (ns).
+# ns. Behind a sound server, stamps follow block arrival, with up to 45 % error at first.
 _STEP_TOLERANCE = FRAME_NANOSECONDS // 2
 _GAP_TOLERANCE = 1_000_000  # ns
 
-# Notes rows that break a rule: its name, which rows, their log times, and a text for one of them.
+# Reports rows that break a rule: rule, rows, their log times, and a text for a row.
 Report = Callable[[str, NDArray[np.bool_], Int64, Callable[[int], str]], None]
 
 
 class Steps(NamedTuple):
-    """The way to each frame from the one before it; arrays of one row a frame.
+    """Differences between successive frames; arrays with one row per frame.
 
     Attributes
     ----------
     rows : np.ndarray [shape=(n, 3)]
         Log time, frame and stamp.
     has_previous : np.ndarray [shape=(n,)], bool
-        Whether the frame before it was read.
+        Whether the previous frame was read.
     numbers, elapsed : np.ndarray [shape=(n,)], int64
-        By how much the frame number and the stamp (ns) have grown.
+        Increments of the frame number and of the stamp (ns).
     gaps, lost : np.ndarray [shape=(n,)], int64
-        How many gaps lie between, and the frames that they lost.
+        Number of gaps since the previous frame, and of frames lost in them.
     """
 
     rows: Int64
@@ -54,7 +54,7 @@ class Steps(NamedTuple):
 
 
 def check_steps(report: Report, steps: Steps) -> None:
-    """Check that frame numbers and stamps go on, and that a gap explains every jump."""
+    """Check that frame numbers and stamps are continuous, and that gaps explain every jump."""
     rows, has_previous, numbers, elapsed, gaps, lost = steps
     times, frames, _ = rows.T
     report(
@@ -85,14 +85,14 @@ def check_steps(report: Report, steps: Steps) -> None:
 
 
 def check_gaps(report: Report, steps: Steps, gaps: Int64, following: NDArray[np.intp]) -> None:
-    """Check that gaps begin where the frame before them ends, and end where the next begins.
+    """Check that gaps span exactly from the end of the previous frame to the start of the next.
 
     Parameters
     ----------
     gaps : np.ndarray [shape=(m, 3)], int64
-        End and start (nanoseconds of UTC), and the number of frames that were lost.
+        End and start (nanoseconds of UTC), and the number of lost frames.
     following : np.ndarray [shape=(m,)], int
-        Rows of the frames behind the gaps.
+        Rows of the frames after the gaps.
     """
     alone = steps.gaps[following] == 1
     stamps = steps.rows[following, 2]
@@ -108,20 +108,20 @@ def check_gaps(report: Report, steps: Steps, gaps: Int64, following: NDArray[np.
 
 
 _RATE_TOLERANCE = 2e-3  # of a sound card's clock
-_DELAY = 1_000_000_000  # ns; of a block that comes late
+_DELAY = 1_000_000_000  # ns; delay of a late block
 _NONE = np.empty((0, 3), np.int64)
 
 
 class FrameSequence:
-    """Follows one microphone through a file.
+    """Checks of one microphone's messages throughout a file.
 
-    Messages are added as rows of three numbers: log time, frame and stamp; of segments log time,
-    start and end; of gaps log time (their end), start, and the frames that they lost.
+    Messages are added as rows of three numbers: log time, frame and stamp; for segments log time,
+    start and end; for gaps log time (their end), start, and number of lost frames.
 
     Parameters
     ----------
     timing : LabelTiming or None
-        Of the labels; None if there are none, or it is not known.
+        Timing of the labels; None if there are no labels or it is unknown.
     """
 
     def __init__(
@@ -134,9 +134,9 @@ class FrameSequence:
     ) -> None:
         self.first: tuple[int, int] | None = None  # frame and stamp of the first and the last frame
         self.last: tuple[int, int] | None = None
-        self.lost_before = 0  # frames that gaps before the first frame lost
-        self.lost_behind = 0  # and gaps behind the last one
-        self.gap_before: tuple[int, int] | None = None  # start and end of the first of these gaps
+        self.lost_before = 0  # frames lost in gaps before the first frame
+        self.lost_behind = 0  # frames lost in gaps after the last frame
+        self.gap_before: tuple[int, int] | None = None  # of the first gap before that: start, end
         self._findings = findings
         self._name = microphone
         self._every = statistics_every
@@ -144,13 +144,13 @@ class FrameSequence:
         self._thinned = thinned
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
-        self._run: tuple[int, int] | None = None  # the first frame since the last gap
-        self._heard = _NONE  # features of the last frames, of which there is no label yet
-        self._first_end = 0  # frame at which the first window since then ends
-        self._segment: tuple[int, int] | None = None  # log time and end of the last one
+        self._run: tuple[int, int] | None = None  # first frame since the last gap
+        self._heard = _NONE  # features of the last frames, which have no label yet
+        self._first_end = 0  # last frame of the first window since that gap
+        self._segment: tuple[int, int] | None = None  # log time and end of the last segment
         self._gap_ends: Int64 = np.empty(0, np.int64)
-        self._damages = _NONE  # the gaps of a damaged log
-        self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
+        self._damages = _NONE  # gaps where the log is damaged
+        self._begins = np.empty(0, bool)  # which of the settled frames begin a run
 
     def add(self, kind: str, rows: Int64) -> None:
         """Add messages of one kind.
@@ -158,62 +158,62 @@ class FrameSequence:
         Parameters
         ----------
         rows : np.ndarray [shape=(n, 3)], int64
-            As the class describes them (times in nanoseconds of UTC), in the order of their log
-            times, behind those of this kind that were added before.
+            As described in the class (times in nanoseconds of UTC), in order of log time, after
+            earlier rows of this kind.
         """
         self._pending.setdefault(kind, []).append(rows)
 
     def add_damages(self, gaps: Int64) -> None:
-        """Note which gaps, added before or now, say that a damaged log has lost what was there.
+        """Mark gaps, added before or now, as losses of a damaged log.
 
-        The sound itself had no gap there: labels go on, and segments reach over it.
+        The sound itself has no gap there: labels continue, and segments extend across it.
 
         Parameters
         ----------
         gaps : np.ndarray [shape=(n, 3)], int64
-            As `add` takes them.
+            As for `add`.
         """
         self._damages = np.concatenate([self._damages, gaps])
 
     def interrupt(self) -> None:
-        """Note that messages are missing here, because the file is damaged."""
+        """Record that messages are missing here, because the file is damaged."""
         self.finish()
         self._pending.clear()
         self._previous = self._run = self._segment = None
         self._heard = _NONE
 
     def begin_anew(self, time: int) -> None:
-        """Note that from a log time on this is another recording, or its next log."""
+        """Start another recording, or its next log, at a log time."""
         self.settle(time)
         self._previous = self._run = self._segment = None
         self._heard = _NONE
 
     def finish(self) -> None:
-        """Check the last frame; what a killed recorder did not write of it is not reported."""
+        """Check the last frame; messages that a killed recorder did not write are not reported."""
         self._check_features(self._take(FEATURES, None), self._take(GAP, None))
         self.lost_behind = sum(int(gaps[:, 2].sum()) for gaps in self._pending.get(GAP, []))
         self._check_segments(self._take(SEGMENT, None))
 
     def settle(self, until: int | None) -> None:
-        """Check everything before a log time, of which nothing more will come.
+        """Check all messages before a log time; no more messages of that time may follow.
 
         Parameters
         ----------
         until : int or None
-            Nanoseconds of UTC; None for everything that was added.
+            Nanoseconds of UTC; None for all added messages.
         """
         kinds = FEATURES, STATISTICS, DIRECTION, EMBEDDING, LABEL, SEGMENT, GAP
         features, statistics, directions, embeddings, labels, segments, gaps = (
             self._take(kind, until) for kind in kinds
         )
-        if FEATURES in self._thinned:  # there is nothing to compare labels with
+        if FEATURES in self._thinned:  # labels have no counterpart to compare with
             self._gap_ends = np.concatenate([self._gap_ends, gaps[:, 0]])
             self._check_segments(segments)
             return
         runs = self._check_features(features, gaps)
         if STATISTICS not in self._thinned:
             self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
-        # Their log time is the stamp of the last frame of the block.
+        # Log time is the stamp of the last frame of the block.
         last = directions[:, 1] + BLOCK_FRAMES - 1
         ends = np.stack([directions[:, 0], last, directions[:, 0]], axis=1)
         self._check_same(features, ends, DIRECTION, None)
@@ -237,10 +237,10 @@ class FrameSequence:
         return rows[done]
 
     def _check_features(self, rows: Int64, gaps: Int64) -> NDArray[np.bool_]:
-        """Compare frame numbers, stamps and gaps; return at which frames the sound begins anew."""
+        """Compare frame numbers, stamps and gaps; return at which frames the sound starts anew."""
         following = np.searchsorted(rows[:, 2], gaps[:, 0])
         waiting = following == len(rows)
-        if waiting.any():  # for the next frame
+        if waiting.any():  # gaps before the next frame
             self._pending[GAP] = [gaps[waiting], *self._pending.get(GAP, [])]
         if not len(rows):
             self._begins = np.empty(0, bool)
@@ -255,7 +255,7 @@ class FrameSequence:
             self.lost_before = int(lost[0])
             if count[0]:
                 self.gap_before = int(gaps[0, 1]), int(gaps[0, 0])
-        # Before the first frame whose previous one was not read, one is made up.
+        # The first frame without a read predecessor gets a synthetic one.
         before = self._previous or (int(rows[0, 1]) - 1, int(rows[0, 2]))
         has_previous = np.ones(len(rows), bool)
         has_previous[0] = self._previous is not None
@@ -272,14 +272,14 @@ class FrameSequence:
         return ((count > 0) & ~np.isin(last, self._damages[:, 0])) | (rows[:, 1] == 0)
 
     def _are_damaged(self, times: Int64) -> NDArray[np.bool_]:
-        """Tell for which log times the log is damaged, or right behind them."""
+        """Whether the log is damaged at, or right after, each log time."""
         ends, starts, _ = self._damages.T
         place = np.searchsorted(ends, times, "right")
         begins = np.append(starts, np.iinfo(np.int64).max)[place] - FRAME_NANOSECONDS
         return begins <= times
 
     def _check_rate(self, rows: Int64) -> None:
-        """Compare stamps with frame numbers, from the last gap on."""
+        """Compare stamps with frame numbers since the last gap."""
         times, frames, stamps = rows.T
         starts = np.flatnonzero(self._begins)
         if len(starts):
@@ -308,7 +308,10 @@ class FrameSequence:
         known_start: NDArray[np.bool_],
         timing: LabelTiming,
     ) -> NDArray[np.bool_]:
-        """Tell which frames end a window without a gap; labels have the numbers of such frames."""
+        """Return which frames end a window without a gap.
+
+        Rows of `labels` must have the numbers of window ends, not of the labelled frames.
+        """
         first_end = np.full(len(features), self._first_end)
         for start in np.flatnonzero(self._begins).tolist():
             frame = int(features[start, 1])
@@ -323,12 +326,12 @@ class FrameSequence:
         self, features: Int64, labels: Int64, runs: NDArray[np.bool_], timing: LabelTiming
     ) -> None:
         self._check_label_stamps(features, labels, timing.delay)
-        # Their log time is the stamp of the last frame of the window.
+        # Log time is the stamp of the last frame of the window.
         ends = np.stack([labels[:, 0], labels[:, 1] + timing.delay, labels[:, 0]], axis=1)
         self._check_same(features, ends, LABEL, self._with_label(features, ends, runs, timing))
 
     def _check_label_stamps(self, features: Int64, labels: Int64, delay: int) -> None:
-        """Compare labels with the features of the frames that they speak of."""
+        """Compare the stamps of labels with the features of the same frames."""
         heard = np.concatenate([self._heard, features])
         self._heard = heard[max(len(heard) - delay, 0) :]
         order = np.argsort(heard[:, 1], kind="stable")
@@ -383,9 +386,9 @@ class FrameSequence:
         )
 
     def _check_segments(self, rows: Int64) -> None:
-        """Segments follow each other, with nothing but gaps between them.
+        """Check that segments are contiguous, except for gaps.
 
-        Those that were decided while the log was damaged are lost.
+        Segments that were decided while the log was damaged are lost.
         """
         if not len(rows):
             return

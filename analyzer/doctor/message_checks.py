@@ -1,4 +1,4 @@
-"""The messages and the metadata of a recorder's log, checked against docs/log.md."""
+"""Checks of a recorder's messages and metadata against docs/log.md."""
 
 import hashlib
 import json
@@ -66,31 +66,31 @@ from hearthlog.schemas.messages.topics import (
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.salvage.recover import dropped_kinds
 
-# In ns, by how much the messages of one microphone may come behind those of another.
+# ns; maximum delay of one microphone's messages behind those of another
 ALLOWED_DELAY = 10 * NANOSECONDS
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
-_LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
+_LONGEST_WINDOW = 3600.0  # seconds; no log of ours has a longer window
 
 
 def allowed_delay(data: DataSection) -> int:
-    """Return by how much messages of one microphone may come behind those of another, in ns."""
+    """Return the maximum delay of one microphone's messages behind those of another, in ns."""
     channels = data.definitions.channels.values()
     infos = [channel for channel in channels if split_topic(channel.topic)[1] == "info"]
     return ALLOWED_DELAY if len(infos) > 1 else 0
 
 
 class MessageChecks:
-    """Follows the messages of one file."""
+    """Checks of the messages of one file, in file order."""
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
-        self.infos: dict[str, dict[str, Any]] = {}  # the `AudioStreamInfo` of each microphone
+        self.infos: dict[str, dict[str, Any]] = {}  # `AudioStreamInfo` of each microphone
         self.frames: dict[str, FrameSequence] = {}  # by microphone
         self._data = data
         self._findings = findings
         self._last: int | None = None  # log time of the last message
-        self._last_gathered: int | None = None  # and of the last that was gathered
+        self._last_gathered: int | None = None  # log time of the last gathered message
         self._interrupted = 0  # log time before which messages are missing
-        self._parts: dict[str, list[int]] = {}  # where further ones begin, in a merged log
+        self._parts: dict[str, list[int]] = {}  # starts of further recordings in a merged log
         self._troubles: set[str] = set()
         self._named = LOG_NAME.fullmatch(findings.path.name) is not None
 
@@ -108,7 +108,7 @@ class MessageChecks:
                 except LogError as error:
                     time = int(raw.log_times[0])
                     self._findings.error("cdr", str(error), DISTRUST, time=time)
-        for kind in ("info", *TYPES, *SHARED):  # the rest builds on what the first says
+        for kind in ("info", *TYPES, *SHARED):  # `info` first: the other checks depend on it
             for columns in by_kind.pop(kind, ()):
                 self._check(kind, columns)
         for microphone, frames in self.frames.items():
@@ -117,19 +117,19 @@ class MessageChecks:
             frames.settle(self._settled())
 
     def finish(self) -> None:
-        """Check the last frames: no more messages will come."""
+        """Check the last frames at the end of the file."""
         for frames in self.frames.values():
             frames.finish()
 
     def interrupt(self) -> None:
-        """Note that messages are missing here, because the file is damaged."""
+        """Record that messages are missing here, because the file is damaged."""
         self._interrupted = self._last or self._interrupted
         self._last = self._last_gathered = None
         for frames in self.frames.values():
             frames.interrupt()
 
     def _is_ours(self, channel: Channel, typename: str) -> bool:
-        """Tell whether a channel is of a type as any version has it."""
+        """Whether a channel has any version of a type of ours."""
         schema = self._data.definitions.schemas.get(channel.schema_id)
         if schema is None or schema.name != typename or channel.message_encoding != "cdr":
             return False
@@ -146,7 +146,7 @@ class MessageChecks:
         return self._last - GATHERED_SPAN
 
     def _gathered_channels(self) -> list[int]:
-        """Return the channels whose messages may stand in chunks behind those of the others."""
+        """Return the channels whose messages may be in later chunks than others of their time."""
         channels = self._data.definitions.channels.items()
         return [i for i, one in channels if split_topic(one.topic)[1] == EMBEDDING]
 
@@ -182,9 +182,9 @@ class MessageChecks:
         return int(times[-1])
 
     def _may_be_older(self, channels: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """Tell which messages may be older than their log time: what `cut` puts at the beginning.
+        """Return which messages may be older than their log time: `cut` puts them at the beginning.
 
-        A log that bears the name of a recorder's has none of these.
+        A log with the name of a recorder's log has none of these.
         """
         infos = [
             identity
@@ -215,7 +215,7 @@ class MessageChecks:
             self.frames[microphone] = self._frame_sequence(microphone, info)
         self._check_content(kind, columns, info)
         rows = _sequence_rows(kind, columns)
-        if rows is not None and kind == EMBEDDING:  # gathered behind what is missing
+        if rows is not None and kind == EMBEDDING:  # gathered after the missing messages
             rows = rows[rows[:, 0] > self._interrupted]
         if rows is not None:
             self.frames[microphone].add(kind, rows)
@@ -253,7 +253,7 @@ class MessageChecks:
         return FrameSequence(self._findings, microphone, every, timing, thinned)
 
     def _check_health(self, columns: Columns) -> None:
-        """Say once what the recorder said of itself that was not well."""
+        """Report each problem in the recorder's diagnostics once."""
         for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
             for status in statuses:
                 said = f"{status['name']}: {status['message']}"
@@ -262,7 +262,7 @@ class MessageChecks:
                     self._findings.warning("health", said, time=time)
 
     def _check_infos(self, columns: Columns, microphone: str) -> None:
-        """Keep what a file says of itself; where it says so again another recording begins."""
+        """Store the info of a microphone; a repeated info starts another recording."""
         for row, values in enumerate(_rows(columns)):
             info = dict(zip(columns.fields, values, strict=True)) | {column_checks.STAMP: 0}
             time = int(columns.log_times[row])
@@ -276,12 +276,12 @@ class MessageChecks:
 
 
 def statistics_every(data: DataSection) -> int | None:
-    """Read from the configuration in a file how often statistics are logged.
+    """Read the interval of statistics from the configuration in a file.
 
     Returns
     -------
     int or None
-        Frames from one message of statistics to the next; None if the file does not say.
+        Frames between messages of statistics; None if the file does not state it.
     """
     try:
         configuration = json.loads(data.attachments["configuration.json"][0])
@@ -292,7 +292,7 @@ def statistics_every(data: DataSection) -> int | None:
 
 
 def _class_names(columns: Columns) -> list[str]:
-    """Return the names behind probabilities that the channel of labels has; none if it has none."""
+    """Return the class names of a label channel's probabilities; empty if there are none."""
     try:
         names = json.loads(columns.metadata["probabilities_names"])
     except (KeyError, ValueError, RecursionError):
@@ -302,7 +302,7 @@ def _class_names(columns: Columns) -> list[str]:
 
 
 def _thinned_kinds(data: DataSection) -> set[str]:
-    """Return which kinds of messages a file says were dropped when it grew old."""
+    """Return the kinds of messages that were dropped as the file aged, from its metadata."""
     steps = {record.get(THINNED) for record in data.metadata.get(HEARTHLOG_METADATA, [])}
     return {kind for step in steps for kind in dropped_kinds(step)}
 
@@ -310,9 +310,9 @@ def _thinned_kinds(data: DataSection) -> set[str]:
 def _label_timing(
     data: DataSection, microphone: str, info: Mapping[str, Any]
 ) -> LabelTiming | None:
-    """Return the timing of the model in a file; None if what says it was lost.
+    """Return the timing of the model in a file; None if its description was lost.
 
-    In the first version nothing says it, and labels speak of the end of a window.
+    The first version had no description; its labels refer to the end of a window.
     """
     records = data.metadata.get(HEARTHLOG_METADATA, [])
     if DESCRIPTION not in data.attachments and all(map(describes_model, records)):
@@ -331,7 +331,7 @@ def _label_timing(
         return LabelTiming(frames, frames - 1, needs_floor=False)
     try:
         return label_timing(description)
-    except (KeyError, ModelError):  # its feature set is not installed
+    except (KeyError, ModelError):  # the feature set is not installed
         frames = max(round(description.window_seconds / FRAME_SECONDS), 1)
         return LabelTiming(frames, description.label_frame, needs_floor=description.gate > 0.0)
 
@@ -341,7 +341,7 @@ def _rows(columns: Columns) -> Any:
 
 
 def _sequence_rows(kind: str, columns: Columns) -> Int64 | None:
-    """Return the rows of a kind for `FrameSequence.add`; None for a kind that it does not take."""
+    """Return the rows of a kind for `FrameSequence.add`; None for an unsupported kind."""
     times, stamps = columns.log_times, columns[column_checks.STAMP]
     if kind == GAP:
         parts = times, stamps, columns["frames_lost"]
@@ -361,12 +361,12 @@ _CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS = ("configuration.json", CARD,
 
 
 class MetadataChecks:
-    """Checks what stands once in a file, when all of it was read.
+    """Checks of metadata and counts, after the complete file was read.
 
     Parameters
     ----------
     whole : bool
-        Whether all of it could be read: only then counts are compared.
+        Whether the complete file was readable: counts are compared only then.
     """
 
     def __init__(
@@ -430,7 +430,7 @@ class MetadataChecks:
                 )
 
     def _check_name(self) -> None:
-        """Compare the name, if it is one as the recorder gives it, with the contents."""
+        """Compare a recorder-style file name with the contents."""
         path = self._findings.path
         named = LOG_NAME.fullmatch(path.name)
         if named is None:
@@ -458,11 +458,11 @@ class MetadataChecks:
             "sample_rate": SAMPLE_RATE,
             "frame_seconds": FRAME_SECONDS,
         }
-        with suppress(ModelError):  # the set is not installed here
+        with suppress(ModelError):  # the feature set is not installed
             features = feature_set(str(info["feature_set"]))
             expected["window_seconds"] = features.window_seconds
             expected["feature_names"] = list(features.feature_names)
-        is_first = microphone == next(iter(self._infos))  # the record is about its model
+        is_first = microphone == next(iter(self._infos))  # the record names its model
         for record in self._data.metadata.get(HEARTHLOG_METADATA, [])[:is_first]:
             expected |= {k: record.get(k) for k in ("feature_set", "model", "model_sha256")}
         for name, value in expected.items():
@@ -475,7 +475,7 @@ class MetadataChecks:
             self._error("info", what)
 
     def _check_topics(self) -> None:
-        """Compare the channels with those that a recorder writes."""
+        """Compare the channels with the expected channels of a recorder."""
         expected: dict[str, Topic] = {}
         records = self._data.metadata.get(HEARTHLOG_METADATA, [])
         candidates = [CANDIDATE] if any(record.get("candidate") for record in records) else []
@@ -513,7 +513,7 @@ class MetadataChecks:
     def _check_type(self, channel: Channel, typename: str) -> None:
         schema = self._data.definitions.schemas.get(channel.schema_id)
         if schema is None:
-            return  # is reported already
+            return  # already reported
         if (schema.name, schema.encoding) != (typename, SCHEMA_ENCODING):
             what = f"{channel.topic} is of type {schema.name} ({schema.encoding}), not {typename}"
             self._error("type", what)
@@ -528,7 +528,7 @@ class MetadataChecks:
             self._error("qos", f"{channel.topic}: offered_qos_profiles is no list of profiles")
 
     def _check_definition(self, channel: Channel, schema: Schema) -> None:
-        """Compare a definition with those of released versions, and its hash with the channel's."""
+        """Compare a definition with released versions, and its hash with the channel's hash."""
         records = self._data.metadata.get(HEARTHLOG_METADATA, [{}])
         try:
             kind = message_type(schema.name, schema.encoding, schema.data)

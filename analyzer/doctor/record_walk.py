@@ -1,4 +1,4 @@
-"""The records of a file, read once from its beginning to its end, past what is damaged."""
+"""Sequential reader of a file's records that skips damaged parts."""
 
 import bisect
 import os
@@ -15,20 +15,20 @@ from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_hea
 from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC
 
 _PIECE = 1 << 20  # bytes
-_READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and has no end
+_READ_ANYWAY = 1 << 30  # bytes; a longer skip may be a sparse hole of any length
 
 
 class ByteSource:
-    """The bytes of a file, as many as it had when it was opened.
+    """Bytes of a file, up to its size when opened.
 
-    Raise `OSError` if it cannot be opened, or is no regular file.
+    Raise `OSError` if the file cannot be opened, or is no regular file.
     """
 
     def __init__(self, path: Path) -> None:
         self._stream = os.fdopen(open_regular(path), "rb", buffering=_PIECE)
         self.size = os.fstat(self._stream.fileno()).st_size
         self.offset = 0  # of the next byte
-        self.crc: int | None = 0  # checksum of all bytes before that; None if some were not read
+        self.crc: int | None = 0  # checksum of all bytes before `offset`; None after a long skip
 
     def __enter__(self) -> Self:
         return self
@@ -51,12 +51,12 @@ class ByteSource:
         return data
 
     def skip(self, offset: int) -> None:
-        """Go on to a later byte; what is passed over is read for the checksum, up to 1 GiB.
+        """Move to a later byte; skipped bytes are read for the checksum, up to 1 GiB.
 
         Parameters
         ----------
         offset : int
-            Byte of the file, from 0; an earlier one than the next changes nothing.
+            Byte of the file, from 0; ignored if before the next byte.
         """
         if offset - self.offset > _READ_ANYWAY:
             self.crc = None
@@ -65,17 +65,17 @@ class ByteSource:
             pass
 
     def tail(self, length: int) -> bytes:
-        """Read the last bytes of the file, and leave `offset` as it is.
+        """Read the last bytes of the file, without changing `offset`.
 
         Parameters
         ----------
         length : int
-            Bytes; fewer are returned of a shorter file.
+            Bytes; fewer are returned for a shorter file.
         """
         return self.at(max(self.size - length, 0), length)
 
     def at(self, offset: int, length: int) -> bytes:
-        """Read bytes anywhere in the file, and leave `offset` as it is.
+        """Read bytes anywhere in the file, without changing `offset`.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class ByteSource:
 
 
 _WINDOW = 1 << 20  # bytes
-_CUT = 2 << 20  # bytes; a longer end was not left by a writer that was killed
+_CUT = 2 << 20  # bytes; a killed writer leaves no longer remainder
 
 
 class Record(NamedTuple):
@@ -96,26 +96,26 @@ class Record(NamedTuple):
 
     opcode: int
     offset: int
-    length: int  # in bytes, opcode and length included
+    length: int  # bytes, including opcode and length
     content: bytes
-    crc: int | None  # CRC-32 of the file up to here, if all of it was read
+    crc: int | None  # CRC-32 of the file before the record; None if some bytes were not read
 
 
 class RecordWalk:
-    """All records of a file, those inside chunks excepted.
+    """All records of a file, except those inside chunks.
 
     Parameters
     ----------
     offsets : sequence of int
-        Bytes at which records begin, ascending, as the index of the file has them: here the walk
-        goes on when it has lost its way.
+        Bytes at which records begin, ascending, from the index of the file: the walk resumes
+        there after damage.
     """
 
     def __init__(
         self, source: ByteSource, findings: Findings, offsets: Sequence[int], *, finished: bool
     ) -> None:
-        self.losses = 0  # how often something was passed over
-        self.skipped = False  # whether something was too large to be checked
+        self.losses = 0  # number of skipped places
+        self.skipped = False  # whether a record was too large to be checked
         self._source = source
         self._findings = findings
         self._finished = finished
@@ -123,7 +123,7 @@ class RecordWalk:
 
     @property
     def damaged(self) -> bool:
-        """Whether something was passed over."""
+        """Whether any part was skipped."""
         return self.losses > 0
 
     def __iter__(self) -> Iterator[Record]:
@@ -149,12 +149,12 @@ class RecordWalk:
                     return
 
     def _lost(self, offset: int, rest: int) -> bool:
-        """Say that here is no record; tell whether there is a place to go on from."""
+        """Report a missing record; return whether the walk can resume."""
         following = next(iter(self._offsets[bisect.bisect_right(self._offsets, offset) :]), None)
         if following is None:
             following = self._search(offset + 1)
         if following is None and not self._finished and rest < _CUT:
-            return False  # which is reported as an unfinished file
+            return False  # reported as an unfinished file
         self.losses += 1
         where = "nor behind it" if following is None else f"the next one at byte {following}"
         self._findings.error("framing", f"no record begins here; {where}", RECOVER, offset=offset)
@@ -164,7 +164,7 @@ class RecordWalk:
         return self._source.offset == following
 
     def _search(self, offset: int) -> int | None:
-        """Find the next compressed chunk that is not longer than the file."""
+        """Find the next compressed chunk that ends within the file."""
         source = self._source
         while offset < source.size:
             window = source.at(offset, _WINDOW + CHUNK_HEAD_LIMIT)

@@ -1,4 +1,4 @@
-"""The data section and the summary section of a file, checked against MCAP's specification."""
+"""Checks of a file's data and summary sections against the MCAP specification."""
 
 import zlib
 from collections import Counter
@@ -51,7 +51,7 @@ from hearthlog.schemas.mcap.records import (
 )
 
 _KEPT_SIZE = 1 << 20  # bytes
-_INDEX_SIZE = 4096  # bytes; what has a longer name is not compared with its index
+_INDEX_SIZE = 4096  # bytes; records with a longer index are not compared with it
 _RESERVED = 0x80
 _INDEXES = {
     Opcode.CHUNK_INDEX,
@@ -64,12 +64,12 @@ _INDEXES = {
 
 
 class DataSection:
-    """The data section of a file, checked record by record.
+    """Data section of a file, checked record by record.
 
     Parameters
     ----------
     names : collection of str
-        Of metadata records and attachments, the first two of each are kept if they are not large.
+        Names of metadata records and attachments to keep: the first two of each, up to 1 MiB.
     size : int
         Bytes of the file.
     """
@@ -83,20 +83,20 @@ class DataSection:
         self.attachments: dict[str, list[bytes]] = {}
         self.counts: Counter[int] = Counter()  # messages by channel
         self.span: tuple[int, int] | None = None  # first and last log time
-        # By the opcode of the index and by offset: what the index should say.
+        # Expected index content, by opcode of the index and by offset.
         self.expected_indexes: dict[int, dict[int, bytes]] = {
             Opcode.CHUNK_INDEX: {},
             Opcode.ATTACHMENT_INDEX: {},
             Opcode.METADATA_INDEX: {},
         }
-        self.whole = True  # everything could be read
-        self.loose = False  # there are messages outside of chunks
-        self.ended = False  # there was a Data End
+        self.whole = True  # whether everything could be read
+        self.loose = False  # whether there are messages outside of chunks
+        self.ended = False  # whether there was a Data End
         self.findings = findings
         self._names = names
         self._budget = RecordBudget(size)
         self._chunk: Chunk | None = None
-        self._run = bytearray()  # of messages outside of chunks
+        self._run = bytearray()  # messages outside of chunks
         self._run_offset = 0
         self._parts: list[ChunkContent] = []
         self._size = 0
@@ -108,8 +108,7 @@ class DataSection:
         Yields
         ------
         MessageBatch or None
-            Messages, whenever a few megabytes of them have come together; None where some are
-            missing, because a chunk is damaged.
+            Messages, in batches of a few megabytes; None where a damaged chunk lost some.
         """
         self._check_first(record)
         if record.opcode == Opcode.MESSAGE:
@@ -128,7 +127,7 @@ class DataSection:
             yield from self._batches()
 
     def finish(self, *, cut: bool) -> Iterator[MessageBatch | None]:
-        """Check what is still open, and hand out the last messages."""
+        """Check an open chunk, and yield the remaining messages."""
         self._end_run()
         yield from self._end_chunk(cut=cut)
         yield from self._batches()
@@ -187,7 +186,7 @@ class DataSection:
             self.findings.error("attachment-crc", what, RECOVER, offset=record.offset)
 
     def _expect_index(self, opcode: int, offset: int, index: bytes) -> None:
-        """Keep the index record that there should be, unless it is too long to be compared."""
+        """Store the expected index record, unless it is too long to be compared."""
         content = index[HEAD.size :]
         self.expected_indexes[opcode][offset] = content if len(content) < _INDEX_SIZE else b""
 
@@ -197,7 +196,7 @@ class DataSection:
 
     def _add_index(self, record: Record) -> None:
         if self._chunk is None and self.definitions.incomplete:
-            return  # its chunk was too large
+            return  # the chunk was too large
         if self._chunk is None:
             what = "a message index that does not stand behind a chunk"
             self.findings.error("message-index-place", what, RECOVER, offset=record.offset)
@@ -274,7 +273,7 @@ _ALLOWED = {
     Opcode.METADATA_INDEX,
     Opcode.SUMMARY_OFFSET,
 }
-_OFFSETS = {  # where in an index record the offset of what it speaks of stands
+_OFFSETS = {  # byte of the offset within an index record
     Opcode.CHUNK_INDEX: 16,
     Opcode.ATTACHMENT_INDEX: 0,
     Opcode.METADATA_INDEX: 0,
@@ -292,25 +291,25 @@ class SummarySection:
     Parameters
     ----------
     whole : bool
-        Whether all of that could be read: if not, what the index says is not compared with it.
+        Whether the data section was completely readable: else the index is not compared with it.
     """
 
     def __init__(self, data: DataSection, findings: Findings, *, whole: bool) -> None:
         self._data = data
         self._findings = findings
         self._whole = whole
-        self._starts: dict[int, int] = {}  # of the groups, by opcode
+        self._starts: dict[int, int] = {}  # of the record groups, by opcode
         self._lengths: Counter[int] = Counter()
         self._last = 0
         self._offsets: list[tuple[int, SummaryOffset]] = []
         self._copies: dict[type, dict[int, McapRecord]] = {Schema: {}, Channel: {}}
         self._unseen = {opcode: dict(places) for opcode, places in data.expected_indexes.items()}
-        self._indexed: set[int] = set()  # channels of which the chunk indexes speak
+        self._indexed: set[int] = set()  # channels in the chunk indexes
         self._statistics: list[tuple[int, Statistics]] = []
         self._crc = 0
 
     def add(self, record: Record) -> None:
-        """Check the next record behind the Data End."""
+        """Check the next record after the Data End."""
         opcode = record.opcode
         if opcode not in _ALLOWED:
             if opcode < _RESERVED:
@@ -357,7 +356,7 @@ class SummarySection:
         self._findings.error(rule, what, REINDEX, offset=offset)
 
     def _group(self, record: Record) -> None:
-        """Note the group of a record: those of one opcode must stand together."""
+        """Record the group of a record: records of one opcode must be contiguous."""
         opcode = record.opcode
         if opcode not in self._starts:
             self._starts[opcode] = record.offset
@@ -393,7 +392,7 @@ class SummarySection:
             self._findings.warning("summary-only", what, offset=record.offset)
 
     def _add_index(self, record: Record) -> None:
-        """Compare an index record with what is at the place of which it speaks."""
+        """Compare an index record with the record at its offset."""
         at = _OFFSETS[Opcode(record.opcode)]
         if len(record.content) < at + 8:
             parse_strictly(self._findings, record.opcode, record.offset, record.content)
@@ -421,7 +420,7 @@ class SummarySection:
         index = parse_strictly(self._findings, record.opcode, record.offset, record.content)
         try:
             expected_index = parse(record.opcode, expected)
-        except UnicodeDecodeError:  # the compression of a damaged chunk, is reported there
+        except UnicodeDecodeError:  # invalid compression name of a damaged chunk, reported there
             return
         if index is None or expected_index is None:
             return
@@ -429,7 +428,7 @@ class SummarySection:
             f"{name} {getattr(index, name)} and should say {value}"
             for name, value in vars(expected_index).items()
             if getattr(index, name) != value
-            # A chunk index may leave out message indexes of no messages.
+            # A chunk index may omit empty message indexes.
             and (getattr(index, name) or name != "message_index_offsets")
         ]
         if differing:
@@ -473,10 +472,10 @@ class SummarySection:
             self._error("statistics", f"the statistics say {'; '.join(differing)}", offset)
 
     def _count(self, kind: type, defined: Iterable[int], said: int) -> int:
-        """Count definitions; whether those in the summary alone are counted, writers choose."""
-        none = {0} if kind is Schema else set()  # what the number 0 means of a channel's schema
+        """Count definitions; writers may omit definitions that are only in the summary."""
+        none = {0} if kind is Schema else set()  # schema 0 means that a channel has none
         in_data = set(defined) - none
-        if said == len(in_data):  # libmcap leaves them out, and so does `ros2 bag record`
+        if said == len(in_data):  # libmcap omits them, and so does `ros2 bag record`
             return said
         return len((in_data | self._copies[kind].keys()) - none)
 
@@ -485,7 +484,7 @@ class SummarySection:
             opcode = group.group_opcode
             start, length = self._starts.get(opcode, 0), self._lengths[opcode]
             if not length and not group.group_length:
-                continue  # writers say it of groups that are empty, too
+                continue  # some writers list empty groups, too
             if (group.group_start, group.group_length) != (start, length):
                 what = (
                     f"Summary offset says {name_of(opcode)} is at {group.group_start}, "

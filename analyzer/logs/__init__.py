@@ -1,1 +1,1 @@
-"""Logs of a home and their layers: which there are, what they say, of which time."""
+"""Logs and layers of a home: discovery, contents, time spans and the catalogue."""

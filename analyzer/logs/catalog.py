@@ -1,4 +1,4 @@
-"""The catalogue of a folder: a Parquet file for each home with one row for each log."""
+"""Catalogue of a log folder: one Parquet file per home with one row per log."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,7 +46,7 @@ SCHEMA = pa.schema(
         *(pa.field(name, kind, nullable=False) for name, kind in _ALWAYS.items()),
         *(pa.field(name, kind) for name, kind in _IF_KNOWN.items()),
     ],
-    metadata={"hearthlog_catalog": "2"},  # the number stands for the columns and their meaning
+    metadata={"hearthlog_catalog": "2"},  # version of the columns and their meaning
 )
 _TEXTS = [
     *(field.name for field in SCHEMA if field.type == pa.string()),
@@ -62,13 +62,13 @@ _LEAVES = {
 }
 _DIGEST = hashlib.sha256().digest_size
 _VALUE = 16  # bytes in memory
-_LIMIT = 1 << 30  # bytes of a file: those of three million logs
-_ROOM = 1 << 20  # bytes in memory, and
-_GROWTH = 100  # for each one in the file; ours takes up to 15
+_LIMIT = 1 << 30  # bytes of a file: about three million logs
+_ROOM = 1 << 20  # bytes of memory
+_GROWTH = 100  # bytes of memory per byte of file; our own files take up to 15
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """Make the table of a catalogue from its rows.
+    """Build the catalogue table from its rows.
 
     Parameters
     ----------
@@ -79,13 +79,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
 
 
 def without_times(table: pa.Table) -> pa.Table:
-    """Replace timestamps by numbers, because Python has no times with nanoseconds.
-
-    Returns
-    -------
-    pa.Table
-        The same columns; times are int64, in nanoseconds of UTC.
-    """
+    """Replace timestamps by int64 nanoseconds of UTC; Python times have no nanoseconds."""
     plain = [
         column.cast(pa.int64()) if column.type == _MOMENT else column for column in table.columns
     ]
@@ -93,39 +87,39 @@ def without_times(table: pa.Table) -> pa.Table:
 
 
 def write_table(table: pa.Table, stream: BinaryIO) -> None:
-    """Write the table of a catalogue as Parquet, with a digest."""
+    """Write a catalogue table as Parquet, with a digest."""
     buffer = pa.BufferOutputStream()
     pq.write_table(table, buffer, compression="none")
     stream.writelines(sealed(memoryview(buffer.getvalue())))
 
 
 def sealed(data: memoryview) -> tuple[memoryview, bytes, memoryview]:
-    """Put a digest before the footer of a Parquet file, where readers do not look.
+    """Insert a digest before the footer of a Parquet file, where readers ignore it.
 
     Parquet has no checksum of its footer, and Arrow may abort the process on a damaged one.
 
     Parameters
     ----------
     data : memoryview
-        All bytes of a Parquet file.
+        The complete Parquet file.
     """
     footer = _footer(data)
     return data[:footer], _digest(data[:footer], data[footer:]), data[footer:]
 
 
 def read_table(stream: BinaryIO) -> pa.Table:
-    """Read the table of a part of a catalogue, and check it.
+    """Read and check the table of one catalogue part.
 
     Parameters
     ----------
     stream : binary file
-        Is read from where it is, up to 1 GiB.
+        Read from its current position, up to 1 GiB.
 
     Raises
     ------
     ValueError, pa.ArrowException
-        If the file is no catalogue, of another version, damaged or compressed, if a value is
-        missing, or if the table would take too much memory.
+        If the file is no catalogue, has another version, is damaged or compressed, lacks a value,
+        or if the table would take too much memory.
     """
     data = memoryview(stream.read(_LIMIT))
     footer = _footer(data)
@@ -153,7 +147,7 @@ def read_table(stream: BinaryIO) -> pa.Table:
 
 
 def _footer(data: memoryview) -> int:
-    """Tell where the footer of a Parquet file begins: 8 bytes at the end say how long it is."""
+    """Return the offset of the footer; its length is in the last 8 bytes of a Parquet file."""
     return len(data) - 8 - int.from_bytes(data[-8:-4], "little")
 
 
@@ -164,7 +158,7 @@ def _digest(body: memoryview, footer: memoryview) -> bytes:
 
 
 def _check_size(parquet: pq.FileMetaData, room: int) -> None:
-    """Raise ValueError if the file would not have room in memory."""
+    """Raise ValueError if the table would not fit into memory."""
     for group in map(parquet.row_group, range(parquet.num_row_groups)):
         for column in map(group.column, range(group.num_columns)):
             room -= column.num_values * _VALUE
@@ -175,7 +169,7 @@ def _check_size(parquet: pq.FileMetaData, room: int) -> None:
 
 
 def _size(batch: pa.RecordBatch) -> int:
-    """Return the bytes of rows when their texts are no longer indices of a dictionary."""
+    """Return the bytes of a batch with its dictionary-encoded texts expanded."""
     columns = [*batch.columns, *_parts(batch)]
     texts = [column for column in columns if pa.types.is_dictionary(column.type)]
     lengths = [pc.binary_length(text.dictionary).take(text.indices) for text in texts]
@@ -183,14 +177,14 @@ def _size(batch: pa.RecordBatch) -> int:
 
 
 def _parts(batch: pa.RecordBatch) -> list[pa.Array]:
-    """Return what is in the lists."""
+    """Return the flattened values of the list columns."""
     lists = [batch.column(name).flatten() for name in ("labels", "scenarios")]
     parts = [part for each in lists for part in (each, *each.flatten())]
     return [*parts, batch.column("microphones").flatten()]
 
 
 class KnownFiles:
-    """Files by name, with sizes and times of change."""
+    """Index of catalogued files by name, with size and modification time."""
 
     def __init__(self, table: pa.Table) -> None:
         plain = without_times(table.select(["path", "size", "mtime"]))
@@ -199,7 +193,7 @@ class KnownFiles:
         self._times: Int64 = plain["mtime"].to_numpy()
 
     def rows_of(self, logs: Sequence[ListedLog]) -> list[int | None]:
-        """Return the numbers of the files' rows; None if one has none, or was changed since."""
+        """Return the row number of each file; None if the file has no row or has changed."""
         sizes, times = self._sizes.tolist(), self._times.tolist()
         numbers = [self._numbers.get(catalogued_name(log.name)) for log in logs]
         return [
@@ -208,7 +202,7 @@ class KnownFiles:
         ]
 
     def find(self, path: Path, folder: Path) -> int | None:
-        """Return the number of a file's row, as `rows_of` does, having looked at the file."""
+        """Return the row number of a file on disk, as `rows_of` does."""
         try:
             name = path.relative_to(folder).as_posix()
             return self.rows_of([ListedLog(name, *size_and_time(path))])[0]
@@ -217,19 +211,19 @@ class KnownFiles:
 
 
 _SUFFIX = ".parquet"
-_LONGEST = 150  # bytes of a home's name in that of its part
+_LONGEST = 150  # bytes of the home's name in the name of its part
 
 
 class Parts(NamedTuple):
-    """What there is of a catalogue."""
+    """Tables and errors of a catalogue."""
 
     tables: dict[str, pa.Table]  # by the name of the part
-    unusable: list[str]  # what is wrong with other parts
+    unusable: list[str]  # problems of the other parts
 
 
 def part_of(home: str) -> str:
-    """Name the part of a home."""
-    name = quote(home, safe="")  # which is never hidden from pyarrow by how it begins
+    """Return the file name of a home's part."""
+    name = quote(home, safe="")  # the prefix `home-` keeps pyarrow from hiding it
     if len(name) > _LONGEST:
         name = f"{name[:_LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:16]}"
     return f"home-{name}{_SUFFIX}"
@@ -238,9 +232,9 @@ def part_of(home: str) -> str:
 def read_parts(folder: Path) -> Parts | None:
     """Read the catalogue of a folder; None if there is none.
 
-    An older catalogue, which is one file, is one part.
+    An older catalogue, which is a single file, counts as one part.
 
-    Raise `LogError` if the folder cannot be looked into.
+    Raise `LogError` if the folder cannot be listed.
     """
     catalog = folder / CATALOG
     with store_errors(catalog):
@@ -268,15 +262,15 @@ def _read(path: Path) -> pa.Table | str:
 def write_parts(
     folder: Path, parts: Mapping[str, pa.Table], before: Mapping[str, pa.Table]
 ) -> None:
-    """Write the parts of the catalogue of a folder that are not there yet, each in one step.
+    """Write new and changed catalogue parts, each atomically, and delete obsolete ones.
 
-    Raise `LogError` if the catalogue cannot be written, or is a link.
+    Raise `LogError` if the catalogue cannot be written or is a link.
     """
     catalog = folder / CATALOG
     if is_local(catalog) and catalog.is_symlink():
         raise LogError(f"{catalog}: is a link, and what it leads to is not hearthlog's: delete it")
     with store_errors(catalog):
-        if catalog.is_file():  # an older one
+        if catalog.is_file():  # older, single-file catalogue
             catalog.unlink()
         if is_local(catalog):
             private_folder(catalog, readers=log_readers(folder))
@@ -297,7 +291,7 @@ def _names(catalog: Path) -> list[str]:
 
 
 def divided(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
-    """Divide rows by their homes."""
+    """Yield the rows of each home with the name of its part."""
     ordered = table.sort_by([("home", "ascending"), ("path", "ascending")])
     first = 0
     runs = pc.run_end_encode(ordered["home"].combine_chunks())
@@ -306,16 +300,16 @@ def divided(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
         first = end
 
 
-LOG = "log"  # the kind of a file that is no layer
+LOG = "log"  # kind of a file that is not a layer
 FINISHED, UNFINISHED, DAMAGED = "finished", "unfinished", "damaged"
 _BATCH = 1000  # rows
 
 
 @dataclass(frozen=True)
 class CatalogRow:
-    """What a catalogue says of one file; docs/catalog.md explains the columns.
+    """Catalogue row of one file; docs/catalog.md explains the columns.
 
-    Times are nanoseconds of UTC. What a file does not say is None, or empty.
+    Times are nanoseconds of UTC. Values missing in the file are None or empty.
     """
 
     path: str
@@ -365,42 +359,42 @@ class Catalog:
         return len(self.table)
 
     def current(self, path: Path) -> CatalogRow | None:
-        """Return the row of a file; None if it has none, or the file was changed since."""
+        """Return the row of a file; None if the file has no row or has changed."""
         number = self.files.find(path, self.folder)
         return None if number is None else next(self.rows(number, 1))
 
     def rows(self, first: int = 0, count: int | None = None) -> Iterator[CatalogRow]:
-        """Read rows of the catalogue.
+        """Yield rows of the catalogue.
 
         Parameters
         ----------
         first : int
             Number of the first row, from 0.
         count : int, optional
-            How many rows at most; by default all that follow.
+            Maximum number of rows; by default all from `first` on.
         """
         for batch in self._plain.slice(first, count).to_batches(_BATCH):
             for values in batch.to_pylist():
                 yield CatalogRow(**values)
 
     def of_state(self, state: str) -> list[CatalogRow]:
-        """Return the rows of the files in one state."""
+        """Return the rows of the files in a state."""
         chosen = self._plain.filter(pc.equal(self._plain["state"], state))
         return [CatalogRow(**values) for values in chosen.to_pylist()]
 
 
 def read_catalog(folder: Path) -> Catalog | None:
-    """Read the catalogue of a folder, as far as it can be used.
+    """Read the usable parts of a folder's catalogue, ordered by home and path.
 
     Returns
     -------
     Catalog or None
-        None if there is no catalogue; its rows are by home and path.
+        None if there is no catalogue.
 
     Raises
     ------
     LogError
-        If the folder cannot be looked into.
+        If the folder cannot be listed.
     """
     parts = read_parts(folder)
     if parts is None:
@@ -416,7 +410,7 @@ _FUNCTIONS = {"start": "min", "end": "max"}
 
 @dataclass(frozen=True)
 class HomeTotals:
-    """The files of one home."""
+    """Totals over the files of one home."""
 
     home: str
     logs: int
@@ -424,7 +418,7 @@ class HomeTotals:
     unfinished: int
     damaged: int
     size: int  # bytes
-    frames: int  # of the logs
+    frames: int  # in logs, without layers
     start: int | None  # first and last log time of the logs
     end: int | None
     gaps: int
@@ -432,16 +426,16 @@ class HomeTotals:
 
     @property
     def hours(self) -> float:
-        """Hours that were heard."""
+        """Hours of recorded frames."""
         return self.frames / _HOUR
 
 
 @dataclass(frozen=True)
 class LabelAmount:
-    """How much of a label there is in one home."""
+    """Minutes and segments of one label in one home."""
 
     home: str
-    kind: str  # of the files that say so: `log`, `relabel`, `review`
+    kind: str  # kind of the source files: `log`, `relabel`, `review`
     model: str | None
     label: str
     minutes: float
@@ -450,7 +444,7 @@ class LabelAmount:
 
 
 def homes(catalog: Catalog) -> list[HomeTotals]:
-    """Sum up the files of each home."""
+    """Return the totals of each home."""
     table = catalog.table
     logs = pc.equal(table["kind"], LOG)
     counted = pa.table(
@@ -473,24 +467,23 @@ def homes(catalog: Catalog) -> list[HomeTotals]:
 
 
 def label_amounts(catalog: Catalog) -> list[LabelAmount]:
-    """Sum up the labels of each home, by kind of labelling and by model.
+    """Return the label totals of each home, by kind of labelling and by model.
 
     Returns
     -------
     list of LabelAmount
-        In the order of home, kind and model; within these the label with most minutes first.
+        Sorted by home, kind, model and descending minutes.
     """
     return _amounts(catalog.table, "labels", ["home", "kind", "model"], ["label"])
 
 
 def scenario_amounts(catalog: Catalog) -> list[LabelAmount]:
-    """Sum up the labels of the scenarios of each home, by kind of labelling, scenario and model.
+    """Return the label totals of each home's scenarios, by kind, scenario and model.
 
     Returns
     -------
     list of LabelAmount
-        In the order of home, kind, scenario and model; within these the label with most minutes
-        first.
+        Sorted by home, kind, scenario, model and descending minutes.
     """
     return _amounts(catalog.table, "scenarios", ["home", "kind"], ["scenario", "model", "label"])
 
@@ -498,7 +491,7 @@ def scenario_amounts(catalog: Catalog) -> list[LabelAmount]:
 def _amounts(
     table: pa.Table, column: str, keys: Sequence[str], own: Sequence[str]
 ) -> list[LabelAmount]:
-    """Sum up what is in the lists of a column, by columns of the table and some of its own."""
+    """Sum the entries of a list column, grouped by table columns `keys` and entry fields `own`."""
     lists = table[column].combine_chunks()
     labels = pa.Table.from_struct_array(lists.flatten())
     for name in keys:
@@ -514,7 +507,7 @@ def _amounts(
 def _grouped(
     table: pa.Table, keys: Sequence[str], functions: Sequence[tuple[str, str]]
 ) -> list[dict[str, Any]]:
-    """Aggregate the rows that agree in some columns, in the order of these."""
+    """Aggregate rows with equal key columns; the result is sorted by these columns."""
     grouped = table.group_by(keys, use_threads=False).aggregate(functions)
     names = [*keys, *(name for name, _ in functions)]
     sums = grouped.select([*keys, *map("_".join, functions)]).rename_columns(names)

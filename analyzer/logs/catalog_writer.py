@@ -1,4 +1,4 @@
-"""The writer of a catalogue: inventories of new and changed logs, taken by workers."""
+"""Writer of a catalogue: workers take inventories of new and changed logs."""
 
 import re
 from collections import Counter
@@ -65,32 +65,32 @@ _EVENTS: dict[str, Sequence[str]] = {
 _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
     (message_types.STREAM_INFO, message_types.STATISTICS, message_types.LABEL), ()
 )
-_LONGEST = 1000  # characters of what a log says of itself
+_LONGEST = 1000  # maximum characters of a text from a log
 
 
 @dataclass
 class LogInventory:
-    """What a log holds."""
+    """Contents of a log."""
 
-    complete: bool  # whether it was finished
+    complete: bool  # whether the log is finished
     span: tuple[int, int] | None  # first and last log time
-    # what its `hearthlog` records say, so far as they agree
+    # values of the `hearthlog` records, where all records agree
     record: dict[str, str] = field(default_factory=dict)
     microphones: list[str] = field(default_factory=list)
-    frames: int = 0  # messages of features
-    # number and stamp of the first and of the last frame; None where there are no features, or
-    # those of several microphones
+    frames: int = 0  # number of feature messages
+    # number and stamp of the first and of the last frame; None without features, or with features
+    # of several microphones
     first: tuple[int, int] | None = None
     last: tuple[int, int] | None = None
     gaps: int = 0
     gap_seconds: float = 0.0
-    # By scenario, which is empty for the sounds of the home, and by label: of its segments
+    # by scenario (empty for the sounds of the home) and by label
     seconds: dict[str, Counter[str]] = field(default_factory=dict)
-    segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number
+    segments: dict[str, Counter[str]] = field(default_factory=dict)  # number of segments
 
 
 def read_contents(path: Path, labelling: str) -> LogInventory:
-    """Read what a log holds, without decoding its features.
+    """Read the inventory of a log, without decoding its features.
 
     Parameters
     ----------
@@ -101,13 +101,13 @@ def read_contents(path: Path, labelling: str) -> LogInventory:
     Raises
     ------
     LogError
-        If the log cannot be read, or a part of it that is needed is damaged.
+        If the log cannot be read, or a required part is damaged.
     """
     span = time_span(path)
     with LogFile(path) as file:
         contents = LogInventory(file.complete, span, _common_record(file))
         reading = _Reading(file, contents, labelling)
-        if file.statistics is None:  # nothing says how many messages there are, or where
+        if file.statistics is None:  # message counts and positions are unknown
             reading.read(file.chunks, _EVENTS | _FEATURES)
         else:
             reading.read(reading.chunks_with(_EVENTS), _EVENTS)
@@ -123,7 +123,7 @@ def read_contents(path: Path, labelling: str) -> LogInventory:
 
 
 def _common_record(file: LogFile) -> dict[str, str]:
-    """Read what the file says of itself, so far as its records agree."""
+    """Return the metadata values on which all `hearthlog` records agree."""
     values_by_name: dict[str, set[str]] = {}
     for record in read_provenance(file):
         for name, value in record.items():
@@ -137,7 +137,7 @@ def _ends(chunks: NDArray[np.void]) -> NDArray[np.void]:
 
 
 class _Reading:
-    """Reads messages of one log, and notes in its contents what they say."""
+    """Reader of one log that adds its messages to an inventory."""
 
     def __init__(self, file: LogFile, contents: LogInventory, labelling: str) -> None:
         self._file = file
@@ -145,7 +145,7 @@ class _Reading:
         self._labelling = labelling
 
     def channels_of(self, kinds: Mapping[str, Collection[str]]) -> set[int]:
-        """Return the channels of some types, of which some fields are wanted."""
+        """Return the channels of some types with the required fields."""
         schemas = self._file.schemas
         return {
             number
@@ -156,11 +156,11 @@ class _Reading:
         }
 
     def chunks_with(self, kinds: Mapping[str, Collection[str]]) -> NDArray[np.void]:
-        """Return the chunks that hold messages of some types."""
+        """Return the chunks with messages of some types."""
         return self._file.with_channels(self._file.chunks, self.channels_of(kinds))
 
     def read(self, chunks: NDArray[np.void], types: Mapping[str, Collection[str]]) -> None:
-        """Read some chunks, a few at a time, and note their messages of some types."""
+        """Read chunks in batches, and add their messages of some types to the inventory."""
         topics = None
         if self._file.statistics is not None:
             topics = {self._file.channels[i].topic for i in self.channels_of(types)}
@@ -178,7 +178,7 @@ class _Reading:
             self._note_segments(columns, scenario)
 
     def _scenario(self, name: str) -> str | None:
-        """Return the scenario of which a topic has segments; None if they do not count."""
+        """Return the scenario of a segment topic; None if its segments do not count."""
         topic = parse_topic(name)
         if topic is None or topic.kind != "segment":
             return None
@@ -216,17 +216,17 @@ _HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
 
 
 def read_rows(folder: Path, names: Sequence[str]) -> pa.Table:
-    """Make the rows of some files: the task of a worker."""
+    """Build the catalogue rows of some files: the task of a worker."""
     paths = [folder.joinpath(*name.split("/")) for name in names]
     rows = [row for read in map_logs(partial(_read_row, folder), paths) for row in read]
     return table_of([vars(row) for row in rows])
 
 
 def _read_row(folder: Path, path: Path) -> list[CatalogRow]:
-    """Make the row of a file; none if the file has gone."""
+    """Build the row of a file; empty if the file no longer exists."""
     name = log_name(path)
     kind = name.layer.partition("-")[0]
-    if kind not in {RELABEL, REVIEW}:  # sound is no labelling
+    if kind not in {RELABEL, REVIEW}:  # audio layers are no labelling
         kind = LOG
     home = _HOME.fullmatch(_relative(path, folder))
     try:
@@ -245,13 +245,13 @@ def _read_row(folder: Path, path: Path) -> list[CatalogRow]:
     try:
         return [_filled(row, read_contents(path, LIVE if kind == LOG else kind))]
     except LogError as error:
-        if not path.exists():  # a recorder has completed it, and given it another name
+        if not path.exists():  # a recorder finished and renamed the file
             return []
         return [replace(row, error=str(error).removeprefix(f"{path}: "))]
 
 
 def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
-    """Add what was found in a file to its row."""
+    """Return the row with the inventory added."""
     record = {name: value for name, value in contents.record.items() if value}
     start, end = contents.span or (None, None)
     first, last = contents.first or (None, None), contents.last or (None, None)
@@ -290,9 +290,9 @@ def _labels(contents: LogInventory, scenario: str) -> Iterator[dict[str, Any]]:
 
 
 def _model(record: Mapping[str, str], scenario: str) -> str:
-    """Name the models that labelled for a scenario, of which microphones may have different ones.
+    """Return the models that labelled a scenario, of all microphones, comma-separated.
 
-    Empty where a person did.
+    Empty if a person labelled the scenario.
     """
     models = {one.model for one in recorded_scenarios(record) if one.name == scenario}
     return ", ".join(sorted(models))
@@ -302,7 +302,7 @@ def _relative(path: Path, folder: Path) -> str:
     return catalogued_name(path.relative_to(folder).as_posix())
 
 
-_TASK = 100  # files
+_TASK = 100  # files per task
 
 
 def write_catalog(
@@ -311,24 +311,24 @@ def write_catalog(
     progress: Progress = ignore_progress,
     workers: Workers | None = None,
 ) -> Catalog:
-    """Make the catalogue of a folder, and replace those parts of an older one that changed.
+    """Build the catalogue of a folder, and replace the changed parts of an older one.
 
     Parameters
     ----------
     before : Catalog, optional
-        What there is: files that are as it says are not read again, damaged ones excepted. By
-        default all files are read.
+        Existing catalogue: unchanged files are not read again, except damaged ones. By default
+        all files are read.
     progress : callable, optional
-        Is told the share of the files that is done, 0 to 1.
+        Called with the share of the files that is done, 0 to 1.
 
     Raises
     ------
     LogError
         If there is no log, or the catalogue cannot be written.
     WorkerError
-        If workers are lost; the catalogue then has what was read so far.
+        If workers are lost; the catalogue then has the files read so far.
     KeyboardInterrupt
-        If interrupted; the catalogue then has what was read so far.
+        If interrupted; the catalogue then has the files read so far.
     """
     listing = list_logs(folder)
     listed = listing.logs
@@ -354,7 +354,7 @@ def write_catalog(
 
 
 def _spans(listed: Sequence[ListedLog], catalog: Catalog) -> NDArray[np.void]:
-    """Tell the spans of files as they were listed; what was not read, or was changed, has none."""
+    """Return the spans of listed files; `NEVER` for files that were not read or have changed."""
     numbers = catalog.files.rows_of(listed)
     read = [place for place, number in enumerate(numbers) if number is not None]
     rows = catalog.table.take(pa.array((n for n in numbers if n is not None), pa.int64()))
@@ -369,14 +369,14 @@ def _spans(listed: Sequence[ListedLog], catalog: Catalog) -> NDArray[np.void]:
 def _divided(
     listed: Sequence[ListedLog], before: Catalog | None
 ) -> tuple[list[int], list[ListedLog]]:
-    """Tell which rows are still true, and which files are to be read."""
+    """Return the numbers of rows that are still valid, and the files to read."""
     if before is None:
         return [], list(listed)
     kept: list[int] = []
     new: list[ListedLog] = []
     damaged = np.array(before.table["state"].to_pylist()) == DAMAGED
     for log, number in zip(listed, before.files.rows_of(listed), strict=True):
-        # What could not be read then may be readable now, though the file is the same.
+        # A damaged file may be readable now, even if it is unchanged.
         if number is None or damaged[number]:
             new.append(log)
         else:
@@ -387,12 +387,12 @@ def _divided(
 def _read(
     folder: Path, logs: Sequence[ListedLog], workers: Workers
 ) -> Iterable[tuple[pa.Table, int]]:
-    """Yield the rows of files, some at a time, and how many files are done."""
+    """Yield the rows of files in batches, with the number of files done."""
     tasks = (logs[first : first + _TASK] for first in range(0, len(logs), _TASK))
     running: dict[Future[pa.Table], int] = {}
     done = 0
     while True:
-        most = 2 * workers.parallel if workers.parallel > 1 else 1  # no worker waits for the next
+        most = 2 * workers.parallel if workers.parallel > 1 else 1  # keeps all workers busy
         while len(running) < most and (task := next(tasks, None)):
             names = [log.name for log in task]
             running[workers.submit(read_rows, folder, names)] = len(names)

@@ -1,4 +1,4 @@
-"""Clips of sound in a log."""
+"""Audio clips in a log."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -21,12 +21,12 @@ _FORMAT = "pcm-s16"
 _FULL_SCALE = np.float32(32768.0)
 _RATES = range(1_000, 1_000_001)
 _CHANNELS = range(1, 257)
-_NEAR = 10 * NANOSECONDS  # between the time of a message and that of its sound
-_TOUCHING = 5_000_000  # ns: stamps are as good as 1 ms
+_NEAR = 10 * NANOSECONDS  # maximum difference between the time of a message and of its sound
+_TOUCHING = 5_000_000  # ns: stamps have a resolution of 1 ms
 
 
 class LoggedClip(NamedTuple):
-    """One message of type `RawAudio`: sound from `start` on (ns of UTC), as 16-bit samples."""
+    """One `RawAudio` message: 16-bit samples of the sound from `start` (ns of UTC) on."""
 
     start: int
     rate: int
@@ -35,7 +35,7 @@ class LoggedClip(NamedTuple):
 
     @property
     def end(self) -> int:
-        """When it ends, in nanoseconds of UTC."""
+        """End of the clip, in nanoseconds of UTC."""
         samples = len(self.data) // (SAMPLE_BYTES * self.channels)
         return self.start + samples * NANOSECONDS // self.rate
 
@@ -43,9 +43,8 @@ class LoggedClip(NamedTuple):
 def clips_of(columns: Columns) -> Iterator[LoggedClip]:
     """Yield the clips of messages, in their order.
 
-    Raise `LogError` if a field is missing, or if a clip is not `pcm-s16`, has fewer than 1000
-    or more than 1,000,000 samples a second, has no channel or more than 256, or ends within a
-    sample.
+    Raise `LogError` if a field is missing, or if a clip is not `pcm-s16`, has a sample rate below
+    1000 or above 1,000,000 Hz, has no channel or more than 256, or ends within a sample.
     """
     fields = (columns[path].tolist() for path in ("format", "sample_rate", "number_of_channels"))
     for start, data, form, rate, channels in zip(
@@ -83,12 +82,12 @@ def read_clips(
     rate : int
         Samples per second.
     samples : np.ndarray [shape=(n,)], float32
-        In full scale, -1 to 1; several channels are averaged.
+        In full scale, -1 to 1; the mean of all channels.
 
     Raises
     ------
     LogError
-        If the log is damaged, if the topic holds no clips, or if `clips_of` refuses one.
+        If the log is damaged, if the topic holds no clips, or as `clips_of` does.
     """
     for clip in _clips(path, name, start, end):
         yield clip.start, clip.rate, _mono(clip)
@@ -108,9 +107,9 @@ def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterato
 
 
 def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
-    """Return the time of which sound was kept.
+    """Return the time spans with recorded audio.
 
-    Raise `LogError` as `read_clips`.
+    Raise `LogError` as `read_clips` does.
     """
     times = [
         (clip.start, clip.end)
@@ -122,19 +121,19 @@ def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
 
 
 def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple[int, Float32]:
-    """Return the kept sound of a span of time, with silence where none was kept.
+    """Return the recorded audio of a span of time, with silence where there is none.
 
     Returns
     -------
     rate : int
-        Samples per second, of the first clip; 0 if no sound was kept.
+        Samples per second of the first clip; 0 without any clip.
     samples : np.ndarray [shape=(n,)], float32
-        -1 to 1. Clips of another rate are left out.
+        -1 to 1. Clips with another rate are skipped.
 
     Raises
     ------
     LogError
-        As `read_clips`.
+        As `read_clips` does.
     """
     rate, sound = 0, np.empty(0, np.float32)
     for layer in layers:

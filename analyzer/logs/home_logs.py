@@ -1,4 +1,4 @@
-"""The logs of a home: their layers, spans, days, models, and networks of sounds."""
+"""The logs of a home: layers, spans, days, models and embedding networks."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -26,7 +26,7 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _NEVER = 1 << 62
-_TAIL = 60 * NANOSECONDS  # of a day that may be missing from a whole one
+_TAIL = 60 * NANOSECONDS  # a complete day may lack this much at its end
 
 
 class HomeLog(NamedTuple):
@@ -35,21 +35,21 @@ class HomeLog(NamedTuple):
     path: Path
     node: str
     layer: str  # empty for a log, else `review` or `relabel-<model>`
-    start: int  # what it says is of this span (ns of UTC); what ends later may have begun in it
+    start: int  # time span (ns of UTC) of the contents; messages that end later may begin in it
     end: int
 
 
 @dataclass(frozen=True)
 class HomeLogs:
-    """The logs of a home with their layers, in the order of time."""
+    """The logs of a home with their layers, in order of time."""
 
     entries: Sequence[HomeLog]
-    losses: Sequence[str]  # what cannot be read, and why
+    losses: Sequence[str]  # errors of unreadable files
 
     def between(
         self, start: int | None = None, end: int | None = None, layer: str = ""
     ) -> list[HomeLog]:
-        """List the logs, or the layers of one name, that may speak of a span of time.
+        """List the logs, or the layers of one name, that may cover a span of time.
 
         Parameters
         ----------
@@ -67,12 +67,12 @@ class HomeLogs:
         ]
 
     def latest_models(self) -> list[LabelledBy]:
-        """List the models that labelled the latest log of each recorder, each of them once.
+        """List the models that labelled the latest log of each recorder, without duplicates.
 
         Returns
         -------
         list of LabelledBy
-            Of all microphones of a recorder; empty texts for a microphone without a model.
+            Models of all microphones of a recorder; empty texts for a microphone without a model.
         """
         by_node: dict[str, list[Path]] = {}
         for entry in self.between():
@@ -84,7 +84,7 @@ class HomeLogs:
         return list(found)
 
     def latest_scenario_models(self, scenario: str) -> list[LabelledBy]:
-        """List the models that labelled for a scenario, each of them once."""
+        """List the latest models of each recorder for a scenario, without duplicates."""
         found: dict[str, dict[LabelledBy, None]] = {}
         for record in self.records():
             own = [one for one in recorded_scenarios(record) if one.name == scenario]
@@ -94,28 +94,28 @@ class HomeLogs:
         return list(dict.fromkeys(model for models in found.values() for model in models))
 
     def first_model(self) -> str:
-        """Return the SHA-256 of the model that labelled the first log of one; empty if none did."""
+        """Return the SHA-256 of the model of the first labelled log; empty if there is none."""
         logs = [entry.path for entry in reversed(self.between())]
         records = (one.get("model_sha256", "") for one in latest_records(logs))
         return next(filter(None, records), "")
 
     @property
     def layers(self) -> list[str]:
-        """Names of the models that have relabelled logs."""
+        """Names of the models with relabel layers."""
         layers = {entry.layer for entry in self.entries if entry.layer.startswith(RELABEL_LAYER)}
         return sorted(layer.removeprefix(RELABEL_LAYER) for layer in layers)
 
     def records(self) -> Iterator[Mapping[str, str]]:
-        """Yield the `hearthlog` records of the logs, the last log first."""
+        """Yield the `hearthlog` records of the logs, latest log first."""
         return latest_records(entry.path for entry in self.between())
 
     def days(self, zone: tzinfo) -> list[date]:
-        """List the days on which there are logs.
+        """List the days with logs.
 
         Returns
         -------
         list of date
-            The days on which logs begin, and that of the last message; ascending.
+            The days on which logs begin, and the day of the last message; ascending.
         """
         days = {local_time(entry.start, zone).date() for entry in self.between()}
         end = self.end()
@@ -124,12 +124,11 @@ class HomeLogs:
         return sorted(days)
 
     def last_whole_day(self, zone: tzinfo) -> date:
-        """Return the last day to whose end the logs reach, or the last day if there is none.
+        """Return the last complete day, or the last day if none is complete.
 
-        A day counts as whole if no more than its last minute is missing.
+        A day counts as complete if at most its last minute is missing.
 
-        Raise `LogError` if there are only layers, and logs that cannot be read or have no
-        message.
+        Raise `LogError` if no log has a readable message.
         """
         days = self.days(zone)
         if not days:
@@ -144,7 +143,7 @@ class HomeLogs:
         Returns
         -------
         int or None
-            Nanoseconds of UTC; None if no log has a message that can be read.
+            Nanoseconds of UTC; None if no log has a readable message.
         """
         for entry in reversed(self.between()):
             try:
@@ -157,7 +156,7 @@ class HomeLogs:
 
 
 def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
-    """Find the logs and layers of a home by their names; only files of other names are opened.
+    """Find the logs and layers of a home by name; only files with other names are opened.
 
     Raise `LogError` if there is no such log, or none in a folder.
     """
@@ -177,7 +176,7 @@ def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
 
 
 def days_in_words(days: Sequence[date]) -> str:
-    """Write days as text, with runs of days joined: `2026-03-01 to 2026-03-04, 2026-03-09`.
+    """Format days, with runs of days joined: `2026-03-01 to 2026-03-04, 2026-03-09`.
 
     Parameters
     ----------
@@ -191,12 +190,12 @@ def days_in_words(days: Sequence[date]) -> str:
 
 
 def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
-    """Check that there is a log on one of some days.
+    """Check that there is a log on at least one of some days.
 
     Parameters
     ----------
     first, last : date
-        The days from `first` to `last`, both of them included.
+        Range of days, both included.
 
     Raises
     ------
@@ -213,7 +212,7 @@ def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
 
 
 def _entry(path: Path) -> HomeLog | None:
-    """Tell by its name what a file is; None if there is nothing in it."""
+    """Return the entry of a file, by its name where possible; None for audio or no messages."""
     _, layer, node, time = log_name(path)
     if layer == AUDIO_LAYER:
         return None
@@ -226,7 +225,7 @@ def _entry(path: Path) -> HomeLog | None:
 
 
 def _closed(entries: Iterable[HomeLog]) -> Iterator[HomeLog]:
-    """End each log where the next one of its kind begins."""
+    """End each log where the next log of its kind begins."""
     by_kind: dict[tuple[str, str], list[HomeLog]] = {}
     for entry in entries:
         by_kind.setdefault((entry.node, entry.layer), []).append(entry)
@@ -238,16 +237,16 @@ def _closed(entries: Iterable[HomeLog]) -> Iterator[HomeLog]:
             yield entry if entry.end < _NEVER else entry._replace(end=following[entry.start])
 
 
-_MOST = 4  # changes that are named
+_MOST = 4  # maximum number of changes in a text
 
 
 def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
-    """Say when a home began to be heard with a network, with another one, or without any.
+    """Describe when the embedding network of each microphone changed.
 
     Returns
     -------
     list of str
-        A line for each microphone that is not always heard in one way.
+        One line for each microphone with a change.
     """
     heard: dict[tuple[str, str], list[tuple[int, EmbeddingSpace | None]]] = {}
     for log in logs:

@@ -35,7 +35,7 @@ MOST_CLASSES = 100
 
 @dataclass(frozen=True)
 class Labelling:
-    """Spans of time and their labels.
+    """Labelled spans of time.
 
     Attributes
     ----------
@@ -52,19 +52,19 @@ class Labelling:
         return len(self.starts)
 
     def called_as(self, classes: Sequence[str]) -> "Labelling":
-        """Give each label the name that its class has among some classes.
+        """Rename labels to the equivalent names in a list of classes.
 
         Parameters
         ----------
         classes : sequence of str
-            A label that means exactly one of these, by another name, gets its name; others stay.
+            A label with the same meaning as exactly one of these gets its name; other labels stay.
         """
         names = translation(set(self.labels), classes)
         return replace(self, labels=np.array([names[label] for label in self.labels], object))
 
 
 def overlaid(labels: Labelling, above: Labelling) -> Labelling:
-    """Lay a labelling over another one."""
+    """Overlay a labelling on another one; the upper labels replace the lower ones."""
     left, rows = remains(labels, joined(above.starts, above.ends))
     starts = np.concatenate([left.starts, above.starts])
     order = np.argsort(starts, kind="stable")
@@ -76,14 +76,14 @@ def overlaid(labels: Labelling, above: Labelling) -> Labelling:
 
 
 def unified(labels: Labelling) -> Labelling:
-    """Give each label the name of its class."""
+    """Rename each label to the name of its class."""
     names = {label: class_name(label) for label in set(labels.labels)}
     unique = np.array([names[label] for label in labels.labels], object)
     return replace(labels, labels=unique)
 
 
 def labelling_of(segments: Columns) -> Labelling:
-    """Make a labelling of segments.
+    """Build a labelling from segments.
 
     Raise `LogError` if a field is missing, or if segments overlap.
     """
@@ -93,7 +93,7 @@ def labelling_of(segments: Columns) -> Labelling:
 
 
 def segments_in_order(segments: Columns) -> Columns:
-    """Sort segments by their stamps, and leave out those without a duration.
+    """Sort segments by stamp, and drop segments without a duration.
 
     Raise `LogError` if a field is missing, or if segments overlap.
     """
@@ -111,12 +111,12 @@ def segments_in_order(segments: Columns) -> Columns:
 def all_classes(
     topic: str, named: Iterable[Sequence[str]], labels: Iterable[str]
 ) -> tuple[str, ...]:
-    """List the labels that there may be: those that logs name, and those that occur.
+    """List the possible labels: class names stated by logs, then labels that occur.
 
     Parameters
     ----------
     named : iterable of sequence of str
-        The names that channels of labels have for their probabilities.
+        Names of the probabilities, per label channel.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def all_classes(
 
 
 def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
-    """Check that labels can be names of classes, and that no segment begins before 1970.
+    """Check that labels are valid class names, and that no segment begins before 1970.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
     Raises
     ------
     LogError
-        If a label cannot be the name of a class, or the first start is negative.
+        If a label is no valid class name, or the first start is negative.
     """
     for label in labels:
         if not CLASS_NAME.fullmatch(label):
@@ -154,25 +154,25 @@ _EVER = 1 << 62  # nanoseconds
 
 
 class LabelledFile(NamedTuple):
-    """A log or a layer, and what labels it has."""
+    """Segment and label topics of a log or a layer."""
 
     path: Path
     first: int  # log times in nanoseconds
     last: int
     complete: bool
-    segments: frozenset[str]  # topics of segments
-    classes: Mapping[str, Sequence[str]]  # by topic of labels: the names of their probabilities
+    segments: frozenset[str]  # topics with segments
+    classes: Mapping[str, Sequence[str]]  # names of the probabilities, by label topic
 
 
 class NamedLabelling(NamedTuple):
     """One labelling of one microphone."""
 
     name: str  # `live`, `review`, `scenario/<name>` or `relabel/<model>`
-    classes: tuple[str, ...]  # the labels that there may be
-    labelling: Labelling  # in the order of time, one label at a time
+    classes: tuple[str, ...]  # possible labels
+    labelling: Labelling  # in order of time, without overlaps
 
     def called_as(self, classes: Sequence[str]) -> "NamedLabelling":
-        """Give each label the name that its class has among some classes."""
+        """Rename labels to the equivalent names in a list of classes."""
         names = translation(self.classes, classes)
         own = tuple(dict.fromkeys(names.values()))
         return NamedLabelling(self.name, own, self.labelling.called_as(classes))
@@ -182,8 +182,8 @@ class NamedLabelling(NamedTuple):
 class Labellings:
     """The labellings of a log, or of a folder of logs."""
 
-    logs: Sequence[LabelledFile]  # with their layers, in the order of time
-    losses: list[str] = field(default_factory=list)  # what could not be used, and why
+    logs: Sequence[LabelledFile]  # with their layers, in order of time
+    losses: list[str] = field(default_factory=list)  # errors of unusable logs
 
     def microphone(self, name: str | None) -> str:
         """Return the named microphone, or the only one.
@@ -198,7 +198,7 @@ class Labellings:
         LogError
             If there are no segments.
         DataError
-            If there are several microphones and `name` is None, or none of this name.
+            If there are several microphones and `name` is None, or if no microphone has this name.
         """
         names = {topic.microphone for topic in self._topics()}
         there = ", ".join(sorted(names))
@@ -221,18 +221,18 @@ class Labellings:
         Parameters
         ----------
         microphone : str
-            Its name.
+            Name of the microphone.
 
         Returns
         -------
         list of str
-            `live` first, then the others in the order of the alphabet.
+            `live` first, then the others in alphabetical order.
         """
         names = {t.labelling for t in self._topics() if t.microphone == microphone}
         return sorted(names, key=lambda name: (name != LIVE, name))
 
     def find(self, microphone: str, text: str) -> str:
-        """Find the name of the labelling that a user asks for.
+        """Find a labelling by its full or short name.
 
         Parameters
         ----------
@@ -249,7 +249,7 @@ class Labellings:
         Raises
         ------
         DataError
-            If the microphone has no such labelling, or a scenario and a model are called so.
+            If the microphone has no such labelling, or if a scenario and a model share the name.
         """
         names = self.names(microphone)
         layers = [name for name in names if name.startswith(f"{RELABEL}/")]
@@ -276,23 +276,23 @@ class Labellings:
     ) -> NamedLabelling:
         """Read the segments of a labelling.
 
-        What cannot be read of a damaged log is missing; `losses` then say so.
+        Unreadable parts of a damaged log are skipped and added to `losses`.
 
         Parameters
         ----------
         microphone, name : str
-            As `microphone` and `find` return them.
+            As returned by `microphone` and `find`.
         start, end : int, optional
-            Nanoseconds of UTC: what is before `start` and after `end` is cut off. By default there
+            Nanoseconds of UTC: segments are cut to the span from `start` to `end`. By default there
             is no limit.
         progress : callable, optional
-            Is told the share of the logs that is done, 0 to 1.
+            Called with the share of the logs that is done, 0 to 1.
 
         Raises
         ------
         LogError
             If there is no segment in this span of time, if segments overlap, if the first begins
-            before 1970, or if labels are too many or cannot be names of classes.
+            before 1970, or if labels are too many or no valid class names.
         """
         topic = labelling_topic(microphone, name, "segment")
         labelling = self._labelling(topic, start, end, progress)
@@ -313,7 +313,7 @@ class Labellings:
         Parameters
         ----------
         topic : str
-            Of segments or labels.
+            Topic of segments or labels.
         start, end : int, optional
             Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
             limit.
@@ -321,7 +321,7 @@ class Labellings:
         Returns
         -------
         list of LabelledFile
-            In the order of time.
+            In order of time.
         """
         return [
             log
@@ -332,22 +332,22 @@ class Labellings:
         ]
 
     def unfinished(self, topics: Sequence[str]) -> list[Path]:
-        """List the unfinished logs that have one of some topics.
+        """List the unfinished logs with one of the given topics.
 
         Parameters
         ----------
         topics : sequence of str
-            Of segments.
+            Topics of segments.
         """
         return [log.path for log in self.logs if not log.complete and log.segments & set(topics)]
 
     def lose(self, error: LogError) -> None:
-        """Append the text of an error to `losses`, once.
+        """Append the text of an error to `losses`, without duplicates.
 
         Parameters
         ----------
         error : LogError
-            Why a log could not be read.
+            Reason why a log could not be read.
         """
         if str(error) not in self.losses:
             self.losses.append(str(error))
@@ -380,7 +380,7 @@ class Labellings:
             if columns is not None:
                 yield columns
                 if end is not None and columns.log_times[-1] >= end:
-                    return  # not before: what begins in the span may end, and be logged, later
+                    return  # no earlier: a segment in the span may be logged later
 
     def _topics(self) -> list[TopicName]:
         names = {name for log in self.logs for name in log.segments}
@@ -399,12 +399,12 @@ def find_labellings(*paths: Path) -> Labellings:
     Returns
     -------
     Labellings
-        Its `losses` name the logs that cannot be read.
+        Its `losses` name the unreadable logs.
 
     Raises
     ------
     LogError
-        If there is no log, if none can be read, or if none has a message.
+        If there is no log, if no log can be read, or if no log has a message.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
     logs = [log for log in opened if isinstance(log, LabelledFile)]
@@ -415,7 +415,7 @@ def find_labellings(*paths: Path) -> Labellings:
 
 
 def _opened(path: Path) -> LabelledFile | LogError | None:
-    """Look into a log; None if it is sound, and empty."""
+    """Read the topics of a log; None if the log is intact and empty."""
     try:
         selection = select([path])
         if selection.logs:

@@ -1,4 +1,4 @@
-"""Logs and their layers: which there are, which follow each other, and the time they cover."""
+"""Logs and their layers: discovery, succession and coverage of time."""
 
 import re
 from bisect import bisect_left, bisect_right
@@ -37,24 +37,24 @@ _DAYS = "[0-9]*/[0-9]*/[0-9]*/*"
 
 
 class TimedFile(NamedTuple):
-    """A log or a layer that has messages."""
+    """A log or a layer with messages."""
 
     path: Path
     first: int  # log times in nanoseconds
     last: int
-    size: int  # bytes, as stored
+    size: int  # stored size in bytes
     layer: str  # as `LogName.layer`
 
 
 class Chain(NamedTuple):
     """The logs of a node of a home."""
 
-    logs: Sequence[Path]  # in the order of time; the last may still be being written
-    asked: Mapping[int, Path]  # those that were asked for, by their places
+    logs: Sequence[Path]  # in order of time; the last may still be written
+    asked: Mapping[int, Path]  # requested logs, by position
 
 
 def with_layers(path: Path) -> list[Path]:
-    """List a log and the layers beside it.
+    """List a log and the layers next to it.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def with_layers(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The log, then its layers by name; of a folder, which has the layers in it, the folder alone.
+        The log, then its layers by name; for a folder, which contains the layers, only the folder.
     """
     if not path.is_file():
         return [path]
@@ -74,7 +74,7 @@ def with_layers(path: Path) -> list[Path]:
 
 
 def find_with_layers(paths: Iterable[Path]) -> list[Path]:
-    """List logs with the layers beside them, and all logs and layers in folders.
+    """List logs with the layers next to them, and all logs and layers in folders.
 
     Raise `LogError` if there is no such log, or none in a folder.
     """
@@ -90,8 +90,8 @@ def find_timed_files(
     Parameters
     ----------
     start, end : int, optional
-        Nanoseconds of UTC: what may speak of the time from `start` on, before `end`. None for no
-        limit.
+        Nanoseconds of UTC: files that may cover the time from `start` on, before `end`. None for
+        no limit.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def find_timed_files(
                 losses += _cut_off(path, "and nothing of it is whole")
             if span is None or (start is not None and span[1] < start):
                 continue
-            # What ends in the span may be logged later, so only the start of a log excludes it.
+            # A segment in the span may be logged later, so only the start of a log excludes it.
             if end is not None and span[0] >= end:
                 continue
             size = path.stat().st_size
@@ -121,7 +121,7 @@ def find_timed_files(
 
 
 def _cut_off(path: Path, what: str) -> list[str]:
-    """Say that a file was cut off; nothing of one that is being written, or is read elsewhere."""
+    """Return the loss of a truncated file; none for active logs and review layers."""
     if is_active(path) or log_name(path).layer == REVIEW_LAYER:
         return []
     with LogFile(path) as log:
@@ -129,14 +129,14 @@ def _cut_off(path: Path, what: str) -> list[str]:
 
 
 def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:
-    """Yield the first `hearthlog` record of each log that has one, the last log first.
+    """Yield the first `hearthlog` record of each log that has one, latest log first.
 
-    Layers, and logs that cannot be read, are passed over.
+    Layers and unreadable logs are skipped.
     """
     for path in reversed(list(logs)):
         if is_layer(path):
             continue
-        with suppress(LogError), LogFile(path) as file:  # an error comes when the log is read
+        with suppress(LogError), LogFile(path) as file:  # reading the log will report the error
             yield from read_provenance(file)[:1]
 
 
@@ -146,8 +146,8 @@ def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
     Parameters
     ----------
     name : str or None
-        IANA name of the zone, such as `Europe/Vienna`; None for that of the latest log that names
-        one, or UTC.
+        IANA name of the zone, such as `Europe/Vienna`; None for the zone recorded in the latest
+        log with one, or UTC.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
 
 
 def find_chains(paths: Iterable[Path]) -> list[Chain]:
-    """Find all logs of the nodes that wrote some logs.
+    """Find all logs of the nodes that wrote the given logs.
 
     Raise `LogError` if there is no such log, or it is a layer.
     """
@@ -180,14 +180,14 @@ def find_chains(paths: Iterable[Path]) -> list[Chain]:
 
 
 def home_folder(log: Path) -> Path:
-    """Return the folder of a home: that of the folders of years, else that of the log."""
+    """Return the folder of a log's home: the parent of the year folders, else the log's folder."""
     folder = log.parent
     days = "/".join(part.name for part in (folder.parent.parent, folder.parent, folder))
     return folder.parent.parent.parent if _DAY.fullmatch(days) else folder
 
 
 def _logs_by_node(root: Path) -> list[list[Path]]:
-    """List the logs of each node of a home, in the order of time."""
+    """List the logs of each node of a home, in order of time."""
     nodes: dict[str, list[tuple[str, Path]]] = {}
     for log in (*root.glob("*"), *root.glob(_DAYS)):
         if home_folder(log) == root and is_log(log) and not is_layer(log):
@@ -198,23 +198,23 @@ def _logs_by_node(root: Path) -> list[list[Path]]:
 
 
 def _first_time(log: Path) -> int:
-    with suppress(LogError):  # why it cannot be read will be said when it is labelled
+    with suppress(LogError):  # labelling the log will report the error
         return (time_span(log) or (0, 0))[0]
     return 0
 
 
 _KIND = "features"
 _FIELDS = {"header.stamp"}
-ROUNDING = 1_000_000  # ns; times that passed through a label file are off by up to this
+ROUNDING = 1_000_000  # ns; maximum error of times from a label file
 _TAIL = 60 * NANOSECONDS
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """When a microphone was recording, by its frames."""
+    """Recorded time of a microphone, from its frames."""
 
-    logs: Sequence[Path]  # in the order of time
-    # of the frames of each, in nanoseconds of UTC; they ascend, and do not overlap
+    logs: Sequence[Path]  # in order of time
+    # per log, from its frames, in nanoseconds of UTC; ascending, without overlaps
     starts: Sequence[int]
     ends: Sequence[int]
 
@@ -224,8 +224,8 @@ class Coverage:
         Returns
         -------
         list of (Path, int, int)
-            Log, start and end (nanoseconds of UTC) of each part, in the order of time. Empty if
-            more than a frame of the span is in no log.
+            Log, start and end (nanoseconds of UTC) of each part, in order of time. Empty if more
+            than a frame of the span is in no log.
         """
         parts: list[tuple[Path, int, int]] = []
         covered = start
@@ -240,10 +240,10 @@ class Coverage:
 
 
 def find_coverage(path: Path) -> dict[str, Coverage]:
-    """Find when each microphone of a log, or of a folder of logs, was recording.
+    """Find the recorded time of each microphone of a log, or of a folder of logs.
 
-    Raise `DataError` if there are no features of a microphone. Raise `LogError` if there is no
-    log, or one is damaged.
+    Raise `DataError` if no microphone has features. Raise `LogError` if there is no log, or a log
+    is damaged.
     """
     selection = select([path])
     coverage: dict[str, Coverage] = {}
@@ -258,15 +258,15 @@ def find_coverage(path: Path) -> dict[str, Coverage]:
 
 
 def coverage_of(spans: Sequence[tuple[int, int, Path]]) -> Coverage:
-    """Make a coverage from the spans of logs.
+    """Build a coverage from the spans of logs.
 
-    A log that ends no more than a frame before the next one begins, or after that, gets the end
-    at which the next one begins.
+    The end of a log is moved to the start of the next one if the pause is at most a frame, or if
+    the logs overlap.
 
     Parameters
     ----------
     spans : sequence of (int, int, Path)
-        Start and end (nanoseconds of UTC) of the frames of each log, in the order of time.
+        Start and end (nanoseconds of UTC) of the frames of each log, in order of time.
     """
     starts = [start for start, _, _ in spans]
     ends = [end for _, end, _ in spans]

@@ -1,4 +1,4 @@
-"""The home's own time: its zone, its days, which begin at its midnight."""
+"""Local time of a home: time zone, days and hours."""
 
 from collections.abc import Iterable, Mapping
 from datetime import UTC, date, datetime, timedelta, tzinfo
@@ -8,18 +8,18 @@ from hearthlog.recorder.pause_schedule import DEFAULT, time_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 
-TIMEZONE = "timezone"  # in the `hearthlog` metadata record of a log
-EVENING, MORNING = 22, 7  # of the clock: between them is the night
+TIMEZONE = "timezone"  # key in the `hearthlog` metadata record of a log
+EVENING, MORNING = 22, 7  # local hours between which it is night
 Span = tuple[int, int]
 
 
 def home_zone(name: str | None, records: Iterable[Mapping[str, str]] = ()) -> tzinfo:
-    """Find the time zone of a home.
+    """Return the time zone of a home.
 
     Parameters
     ----------
     records : iterable of mapping of str to str
-        The `hearthlog` records of logs; the first that names a zone counts. Without one it is UTC.
+        `hearthlog` records of logs; the first zone in them is used, else UTC.
 
     Raises
     ------
@@ -40,13 +40,13 @@ def _zone(name: str, advice: str) -> tzinfo:
 
 
 def midnight(day: date, zone: tzinfo) -> int:
-    """Return the time at which a day begins, in nanoseconds of UTC."""
+    """Return the start of a day, in nanoseconds of UTC."""
     local = datetime(day.year, day.month, day.day, tzinfo=zone)
     return int(local.timestamp()) * NANOSECONDS
 
 
 def day_span(day: date, zone: tzinfo) -> Span:
-    """Return the times at which a day and the next one begin, in nanoseconds of UTC.
+    """Return the starts of a day and of the next day, in nanoseconds of UTC.
 
     In most zones they are 23 to 25 hours apart.
     """
@@ -54,7 +54,7 @@ def day_span(day: date, zone: tzinfo) -> Span:
 
 
 def at_hour(day: date, hour: int, zone: tzinfo) -> int:
-    """Return the time at which the clock on the wall shows a full hour.
+    """Return the time of a full local hour, in nanoseconds of UTC.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def at_hour(day: date, hour: int, zone: tzinfo) -> int:
 
 
 def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
-    """Return what the clock and the calendar on the wall show.
+    """Return the local date and time.
 
     Parameters
     ----------
     nanoseconds : int
-        Of UTC.
+        Nanoseconds of UTC.
 
     Returns
     -------

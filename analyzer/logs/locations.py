@@ -1,4 +1,4 @@
-"""The logs of a folder or a store: their locations, sizes and times, and an index of them."""
+"""Locations of logs in folders and stores: listings, sizes, times and a span index."""
 
 import hashlib
 import os
@@ -37,11 +37,11 @@ from hearthlog.schemas.new_files import replaced_file
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
 _FILES = {"file", "local"}
-_OURS = {"fsspec", "s3fs", "upath", ""}  # what the extra `cluster` installs, or nobody knows
-# A listing that is kept hides what others put there since.
+_OURS = {"fsspec", "s3fs", "upath", ""}  # packages of the extra `cluster`; empty if unknown
+# A cached listing hides files that other programs added since.
 _FRESH: dict[str, Any] = {"use_listings_cache": False}
-# botocore waits longer each time where a store says that it is asked too often. s3fs tries five
-# times whatever botocore tried: a silent server is given up after four minutes.
+# botocore backs off where a store throttles requests. s3fs tries five times on top of
+# botocore's retries: a silent server fails after four minutes.
 _S3 = _FRESH | {
     "config_kwargs": {"retries": {"mode": "standard", "total_max_attempts": 5}, "read_timeout": 10}
 }
@@ -53,9 +53,9 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def location(text: str) -> Path:
-    """Read the name of a log or a folder, on this machine or in a store that fsspec knows.
+    """Parse the path of a log or a folder, local or in a store supported by fsspec.
 
-    Raise `LogError` if there is no such kind of store, or its package is not installed.
+    Raise `LogError` if the kind of store is unknown or its package is not installed.
     """
     url = _URL.fullmatch(text)
     if url is None:
@@ -73,28 +73,28 @@ def _stored(scheme: str, rest: str) -> Path:
 
             options = _OPTIONS.get(scheme, {}) | fsspec.config.conf.get(scheme, {})
             path = UPath(text, **options)
-            path.fs.root_marker  # noqa: B018  makes it
+            path.fs.root_marker  # noqa: B018  creates the file system
     except ImportError as error:
         raise LogError(f"{text}: {error}; {_remedy(error)}") from error
-    # It does all that is asked of a Path here, but is none for the type checker.
+    # UPath behaves like a Path here, but is none for the type checker.
     return cast("Path", path)
 
 
 def _remedy(error: ImportError) -> str:
-    """Say how to install what could not be imported: our extra, or a package of fsspec's."""
+    """Return how to install the missing package: our extra, or a package that fsspec needs."""
     missing = error if error.__cause__ is None else error.__cause__
     name = getattr(missing, "name", None) or ""
     return f"try: pip install {name}" if name not in _OURS else remedy("fsspec")
 
 
-_TIMES = ("mtime", "LastModified", "last_modified", "updated", "created")  # of different stores
+_TIMES = ("mtime", "LastModified", "last_modified", "updated", "created")  # keys vary by store
 _NAME = attrgetter("name")
 UNSURE = -1
-_YOUNG = 5 * NANOSECONDS  # since a folder changed: the clock of a disk may stand still for so long
+_YOUNG = 5 * NANOSECONDS  # since a folder changed: a disk's clock may be this coarse
 
 
 class ListedLog(NamedTuple):
-    """A file as its folder lists it."""
+    """A log file as listed by its folder."""
 
     name: str  # path within the folder, with `/`
     size: int  # bytes
@@ -102,29 +102,28 @@ class ListedLog(NamedTuple):
 
 
 class KnownFolder(NamedTuple):
-    """A folder as it was when it was looked into."""
+    """State of a folder when it was last listed."""
 
-    changed: int  # ns of UTC; `UNSURE` if a change since then could not be told by that
-    inner: Sequence[str]  # names of the folders in it
-    logs: int  # how many
+    changed: int  # ns of UTC; `UNSURE` if this time cannot reveal a later change
+    inner: Sequence[str]  # names of its subfolders
+    logs: int  # number of logs
 
 
 class Listing(NamedTuple):
-    """What there is in a folder."""
+    """Logs and folders found in a folder."""
 
-    logs: list[ListedLog]  # by name
-    folders: dict[str, int]  # when those that were looked into had changed, as in `KnownFolder`
-    unchanged: list[str]  # known folders into which nobody needed to look
+    logs: list[ListedLog]  # sorted by name
+    folders: dict[str, int]  # change times of the listed folders, as in `KnownFolder`
+    unchanged: list[str]  # known folders that were not listed again
 
 
 def list_logs(folder: Path, known: Mapping[str, KnownFolder] = MappingProxyType({})) -> Listing:
-    """List the logs in a folder, with what tells that they have changed, and open none of them.
+    """List the logs in a folder with size and modification time, without opening them.
 
     Parameters
     ----------
     known : mapping of str to KnownFolder
-        By name, as in `Listing`; of this machine only. Logs of those that did not change are not
-        listed.
+        By name, as in `Listing`; local folders only. Logs of unchanged folders are not listed.
 
     Raises
     ------
@@ -133,7 +132,7 @@ def list_logs(folder: Path, known: Mapping[str, KnownFolder] = MappingProxyType(
     """
     found = _list_local(folder, known) if is_local(folder) else _list_stored(folder)
     if not found.logs and not any(known[name].logs for name in found.unchanged):
-        find_logs(folder)  # says why
+        find_logs(folder)  # raises the error with its reason
     found.logs.sort(key=_NAME)
     return found
 
@@ -147,7 +146,7 @@ def _list_local(folder: Path, known: Mapping[str, KnownFolder]) -> Listing:
         path, prefix = (f"{folder}/{name}", f"{name}/") if name else (str(folder), "")
         try:
             changed = os.stat(path).st_ctime_ns  # noqa: PTH116  no Path for each folder
-        except OSError:  # it has gone, or must not be looked into
+        except OSError:  # deleted, or no permission
             continue
         before = known.get(name)
         if before and before.changed == changed and os.access(path, os.R_OK):
@@ -164,7 +163,7 @@ def _list_local(folder: Path, known: Mapping[str, KnownFolder]) -> Listing:
 def _listed(name: str, entry: "os.DirEntry[str]") -> ListedLog:
     try:
         about = entry.stat()
-    except OSError:  # it has gone, or reading it will say what is wrong
+    except OSError:  # deleted, or reading it will report the error
         return ListedLog(name, -1, -1)
     return ListedLog(name, about.st_size, about.st_mtime_ns)
 
@@ -178,12 +177,12 @@ def _list_stored(folder: Any) -> Listing:
         for path, about in files.items()
         if path.endswith((SUFFIX, ACTIVE_SUFFIX))
     ]
-    # Folders of a store are parts of names: nothing tells that one has changed.
+    # Folders of a store are only name prefixes, without a change time.
     return Listing([log for log in logs if ENROLLED not in log.name.split("/")[:-1]], {}, [])
 
 
 def size_and_time(path: Path) -> tuple[int, int]:
-    """Return bytes and time of change (ns) of a file, by which a changed one is known.
+    """Return size (bytes) and modification time (ns) of a file, to detect changes.
 
     Raise `LogError` if there is no such file, or its store cannot be used.
     """
@@ -196,7 +195,7 @@ def size_and_time(path: Path) -> tuple[int, int]:
 
 
 def _stored_size_and_time(about: Mapping[str, Any]) -> tuple[int, int]:
-    """Take size and time from what a store says; an object is not changed, but made anew."""
+    """Return size and time from a store's metadata; objects are replaced, never modified."""
     time = next((about[name] for name in _TIMES if about.get(name) is not None), 0)
     if isinstance(time, str):
         time = datetime.fromisoformat(time)
@@ -206,7 +205,7 @@ def _stored_size_and_time(about: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def catalogued_name(name: str) -> str:
-    """Write a name as a catalogue does: names of files are bytes, those in a table are text."""
+    """Return a file name as text for the catalogue; undecodable bytes are replaced."""
     if name.isascii():
         return name
     return name.encode(errors="surrogateescape").decode(errors="replace")
@@ -215,23 +214,23 @@ def catalogued_name(name: str) -> str:
 NEVER = -1
 SPAN = np.dtype(
     [("start", "<i8"), ("end", "<i8"), ("size", "<i8"), ("mtime", "<i8"), ("finished", "?")]
-)  # of a log; times are ns of UTC, `NEVER` if not known
-_FOLDER = np.dtype([("changed", "<i8"), ("logs", "<i8")])  # and the number of its logs
-_HEAD = struct.Struct("<24s4Q")  # folders, logs, bytes of the names of both
-_MAGIC = b"hearthlog index of logs\x01"  # the number stands for all that follows
+)  # of a log; times are ns of UTC, `NEVER` if unknown
+_FOLDER = np.dtype([("changed", "<i8"), ("logs", "<i8")])  # change time and number of logs
+_HEAD = struct.Struct("<24s4Q")  # magic; counts of folders and logs; bytes of the names of both
+_MAGIC = b"hearthlog index of logs\x01"  # the last byte is the version of the format
 _DIGEST = hashlib.sha256().digest_size
-_LIMIT = 1 << 30  # bytes of a file: those of ten million logs
-_CODING = "utf-8", "surrogateescape"  # names of files are bytes
-_END = b"\0"  # of a name
+_LIMIT = 1 << 30  # bytes of a file: about ten million logs
+_CODING = "utf-8", "surrogateescape"  # file names are bytes
+_END = b"\0"  # terminator of a name
 
 
 class SpanIndex:
-    """The logs that a catalogue knows, by number, and the folders that they are in.
+    """Index of a catalogue: logs by number, with their folders and time spans.
 
     Parameters
     ----------
     names : bytes
-        Names of the logs, each with a zero behind it.
+        Names of the logs, each terminated by a zero byte.
     """
 
     def __init__(
@@ -253,7 +252,7 @@ class SpanIndex:
         return root.joinpath(*folder.split("/") if folder else (), self._name(log))
 
     def logs_in(self, folders: Iterable[str]) -> Int64:
-        """Return the numbers of the logs in some folders, without those of folders inside."""
+        """Return the numbers of the logs directly in some folders."""
         logs = [
             range(self._firsts[name], self._firsts[name] + self.folders[name].logs)
             for name in folders
@@ -261,13 +260,13 @@ class SpanIndex:
         return np.fromiter(chain.from_iterable(logs), np.int64)
 
     def find(self, listed: ListedLog) -> int | None:
-        """Return the number of a log; None if there is none, or the log was changed since."""
+        """Return the number of a log; None if the log is unknown or has changed."""
         folder, _, name = listed.name.rpartition("/")
         log = self._logs_of(folder).get(name)
         return log if log is not None and self.is_as(log, *listed[1:]) else None
 
     def is_as(self, log: int, size: int, mtime: int) -> bool:
-        """Tell whether a log has the size and the time of change that it had."""
+        """Whether a log still has the indexed size and modification time."""
         return (self.spans["size"][log], self.spans["mtime"][log]) == (size, mtime)
 
     def _named(self, folder: str) -> dict[str, int]:
@@ -284,9 +283,9 @@ def _ends(names: bytes) -> Int64:
 
 
 def write_index(folder: Path, listing: Listing, spans: NDArray[np.void]) -> None:
-    """Write the index of a catalogue, beside it.
+    """Write the index of a catalogue, next to the catalogue.
 
-    Raise `LogError` if it cannot be written.
+    Raise `LogError` if the index cannot be written.
     """
     logs_of: dict[str, list[int]] = {name: [] for name in listing.folders}
     names = []
@@ -309,13 +308,13 @@ def _joined(names: Iterable[str]) -> bytes:
 
 
 def read_index(folder: Path) -> SpanIndex | None:
-    """Read the index of the catalogue of a folder; None if there is none that can be used."""
+    """Read the index of a folder's catalogue; None if there is no usable index."""
     read = _read(folder)
     return read if isinstance(read, SpanIndex) else None
 
 
 def what_is_wrong(folder: Path) -> str | None:
-    """Say why the index of a catalogue cannot be used; None if it can be, or there is none."""
+    """Return why the index of a catalogue cannot be used; None if usable or missing."""
     read = _read(folder)
     return read if isinstance(read, str) else None
 
@@ -335,12 +334,12 @@ def _read(folder: Path) -> SpanIndex | str | None:
 
 
 def _keeps_times(index: Path) -> bool:
-    """Tell whether a folder changes when a file comes: not all that can be mounted does so."""
+    """Whether adding a file updates the folder's change time; some mounts do not."""
     return index.stat().st_mtime_ns <= index.parent.stat().st_ctime_ns
 
 
 def _parsed(data: bytes, *, is_timed: bool) -> SpanIndex:
-    """Take an index apart; raise ValueError if it is not sound."""
+    """Parse an index; raise ValueError if it is not valid."""
     rest = memoryview(data)[:-_DIGEST]
     if len(rest) < _HEAD.size or hashlib.sha256(rest).digest() != data[-_DIGEST:]:
         raise ValueError("it is damaged, or was not made by hearthlog")
@@ -363,7 +362,7 @@ def _parsed(data: bytes, *, is_timed: bool) -> SpanIndex:
 
 
 def _split(paths: bytes, count: int) -> list[str]:
-    """Take the names of folders apart."""
+    """Split the folder names of an index."""
     names = paths.decode(*_CODING).split("\0")[:-1]
     if len({*names}) != count or any(".." in name.split("/") for name in names):
         raise ValueError("its parts do not fit")
@@ -373,7 +372,7 @@ def _split(paths: bytes, count: int) -> list[str]:
 def _tree(
     paths: Sequence[str], times: Sequence[int], counts: Sequence[int]
 ) -> dict[str, KnownFolder]:
-    """Tell of each folder which ones are in it."""
+    """Build the known folders, each with the names of its subfolders."""
     inner: dict[str, list[str]] = {path: [] for path in paths}
     for path in paths:
         parent, _, name = path.rpartition("/")
@@ -390,7 +389,7 @@ LogSpan = tuple[int, int, Path]  # log times of the first and the last message (
 
 
 class _Known(NamedTuple):
-    """Logs of a folder of which the index of its catalogue knows the spans."""
+    """Logs of a folder with spans in the index of its catalogue."""
 
     folder: Path
     by: SpanIndex
@@ -401,7 +400,7 @@ class _Known(NamedTuple):
 
 
 class LogSpans:
-    """The spans of many logs: a path costs more than all else here, so few are made."""
+    """Spans of many logs; paths are the dominant cost, so they are built only when needed."""
 
     def __init__(self, opened: Sequence[LogSpan], known: Sequence[_Known]) -> None:
         self._opened = opened
@@ -415,11 +414,11 @@ class LogSpans:
         self._begins = np.cumsum([len(opened), *(len(each.logs) for each in known)])
 
     def within(self, start: int | None, end: int | None) -> list[LogSpan]:
-        """Return the logs with messages in a span of time, each once, in the order of time."""
+        """Return the logs with messages in a span of time, without duplicates, in order of time."""
         return self._in_time(np.flatnonzero(overlaps(self._firsts, self._lasts, start, end)))
 
     def before(self, time: int) -> Iterator[Path]:
-        """Return the logs with messages before a time, each once, the last first."""
+        """Yield the logs with messages before a time, without duplicates, latest first."""
         numbers = np.flatnonzero(self._firsts < time)
         order = numbers[np.lexsort((self._lasts[numbers], self._firsts[numbers]))[::-1]]
         for _, same in groupby(order, lambda number: (self._firsts[number], self._lasts[number])):
@@ -428,7 +427,7 @@ class LogSpans:
     def _in_time(self, numbers: Iterable[int]) -> list[LogSpan]:
         spans = ((int(self._firsts[n]), int(self._lasts[n]), self._path(n)) for n in numbers)
         once = {str(span[2].resolve()): span for span in spans}  # a log may have several names
-        # Paths of this machine and of a store do not compare; their parts do.
+        # Local paths and paths of a store do not compare; their parts do.
         return sorted(once.values(), key=lambda span: (*span[:2], span[2].parts))
 
     def _path(self, number: int) -> Path:
@@ -439,7 +438,7 @@ class LogSpans:
 
 
 def overlaps(firsts: Int64, lasts: Int64, start: int | None, end: int | None) -> Bool:
-    """Tell of spans of time whether they have a part in another one."""
+    """Return which spans overlap the span from `start` on, before `end`."""
     chosen = np.ones(len(firsts), bool)
     if start is not None:
         chosen &= lasts >= start
@@ -451,16 +450,16 @@ def overlaps(firsts: Int64, lasts: Int64, start: int | None, end: int | None) ->
 def find_spans(
     paths: Iterable[Path], span_of: SpanOf, start: int | None = None, end: int | None = None
 ) -> LogSpans:
-    """Find the logs of some folders, and when they begin and end.
+    """Find the logs of some folders with their first and last log times.
 
     Parameters
     ----------
     span_of : callable
-        Returns first and last log time of a log of which no catalogue knows them as it is now; None
-        leaves it out.
+        Returns first and last log time of a log without a current catalogue entry; None drops the
+        log.
     start, end : int, optional
-        Log times in nanoseconds of UTC, from `start` on, before `end`: of finished logs outside of
-        them the catalogue is believed.
+        Log times in nanoseconds of UTC, from `start` on, before `end`: outside of this span,
+        catalogue entries of finished logs are trusted without a check.
 
     Raises
     ------
@@ -483,7 +482,7 @@ def find_spans(
 def _looked_up(
     folder: Path, index: SpanIndex, start: int | None, end: int | None
 ) -> tuple[_Known, list[Path]]:
-    """Divide the logs of a folder into those whose spans are known, and those to be asked."""
+    """Divide the logs of a folder into logs with known spans and logs to open."""
     listing = list_logs(folder, index.folders)
     logs = index.logs_in(listing.unchanged)
     spans = index.spans[logs]

@@ -52,8 +52,8 @@ TYPES = {
     "audio": (message_types.RAW_AUDIO, CLIP_FIELDS),
     "info": (message_types.STREAM_INFO, _INFO),
 }
-_UNNAMED = "?"  # a feature set of which a log has no more than the names of its features
-_METHODS = {"auros21": "room21", "home33": "room"}  # which learns best, of the sets of ours
+_UNNAMED = "?"  # feature set of a log that has only the names of its features
+_METHODS = {"auros21": "room21", "home33": "room"}  # best training method of our feature sets
 _DIGEST = re.compile("[0-9a-f]{64}")
 _FIRST: Mapping[str, Collection[str]] = {
     message_types.STREAM_INFO: _INFO,
@@ -62,17 +62,16 @@ _FIRST: Mapping[str, Collection[str]] = {
 
 
 class Configuration(BaseModel):
-    """Settings of a recorder that shape its log.
+    """Recorder settings that shape its log.
 
     Attributes
     ----------
     max_bag_duration : int
         Seconds in a file; 1 to 86,400.
     flush_seconds, sync_seconds : float
-        Seconds that a killed process, and a power cut, lose at most; 1 to 3600.
+        Maximum seconds lost by a killed process and by a power cut; 1 to 3600.
     statistics_every : int
-        Frames from one message of statistics to the next; at least 1, which is that of every log
-        that does not say.
+        Frames between messages of statistics; at least 1, the value for logs without this setting.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
@@ -85,48 +84,46 @@ class Configuration(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class RecorderInfo:
-    """What a log says of the recorder that wrote it."""
+    """Recorder and microphone as described by a log."""
 
     path: Path
     complete: bool  # whether the log is finished
     node: str
     microphone: str
-    device: str  # as in `AudioStreamInfo`; empty where the log does not say
+    device: str  # as in `AudioStreamInfo`; empty if not in the log
     feature_set: str
     model: str
     model_sha256: str
     configuration: Configuration
-    metadata: Mapping[str, str]  # the `hearthlog` record, with the model of this microphone
+    metadata: Mapping[str, str]  # `hearthlog` record, with the model of this microphone
     attachments: Sequence[Attachment]
-    # number and time of the first frame of its features; None if they are not wanted, or it has
-    # none
+    # number and time of the first frame of features; None if not requested or missing
     first_frame: tuple[int, int] | None
-    has_directions: bool  # whether those of an array are beside its features
-    embedding: EmbeddingSource | None  # of the embeddings beside them; None if there are none
+    has_directions: bool  # whether the log has directions from a microphone array
+    embedding: EmbeddingSource | None  # network and projection; None without embeddings
 
 
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
-    """Read what a log says of its recorder, for each of its microphones.
+    """Read the recorder description of each microphone of a log.
 
     Returns
     -------
     list of RecorderInfo
-        In the order of the names of the microphones; empty if the log has no such topic, as layers
-        have not.
+        Sorted by microphone; empty if the log has no such topic, which is normal for layers.
 
     Raises
     ------
     LogError
-        If it is damaged, or says what cannot be.
+        If the log is damaged or has invalid values.
     """
     with LogFile(path) as file:
         if not file.channels:
-            read_chunks(file, file.chunks[:1], topics=())  # a log without an index says it there
+            read_chunks(file, file.chunks[:1], topics=())  # a log without an index has it there
         microphones = sorted(microphones_of(file, kind))
         if not microphones:
             return []
         attachments = attachments_of(file)
-        # What was merged is of the last of its recorders.
+        # A merged log is attributed to the last of its recorders.
         record = next(reversed(read_provenance(file)), {})
         return [_info_of(file, name, kind, record, attachments) for name in microphones]
 
@@ -173,9 +170,9 @@ def _info_of(
 
 
 def _set_of_names(file: LogFile, name: str) -> str:
-    """Name the feature set whose features a channel names; empty if it names none.
+    """Return the feature set with a channel's feature names; empty if it names none.
 
-    Programs that copy topics leave metadata records behind, but not the names.
+    Programs that copy topics drop metadata records, but keep the names.
     """
     channels = (channel for channel in file.channels.values() if channel.topic == name)
     names = next((array_names(channel.metadata, "values") for channel in channels), [])
@@ -184,7 +181,7 @@ def _set_of_names(file: LogFile, name: str) -> str:
 
 
 def embedding_source(file: LogFile, microphone: str) -> EmbeddingSource | None:
-    """Return of which network and projection a log has embeddings; None if it has none."""
+    """Return network and projection of a log's embeddings; None without embeddings."""
     name = topic(microphone, "embedding")
     channels = (channel for channel in file.channels.values() if channel.topic == name)
     return next((EmbeddingSource.from_metadata(channel.metadata) for channel in channels), None)
@@ -195,13 +192,13 @@ def _has_topic(file: LogFile, name: str) -> bool:
 
 
 def first_embedding_source(path: Path) -> EmbeddingSource | None:
-    """Read of which network and projection the embeddings of a log are; None if it has none.
+    """Read network and projection of a log's embeddings; None without embeddings.
 
-    Raise `LogError` if it is damaged.
+    Raise `LogError` if the log is damaged.
     """
     with LogFile(path) as file:
         if not file.channels:
-            read_chunks(file, file.chunks[:1], topics=())  # as above
+            read_chunks(file, file.chunks[:1], topics=())  # as in `read_recorder_infos`
         names = (embedding_source(file, name) for name in sorted(microphones_of(file, "features")))
         return next(filter(None, names), None)
 
@@ -209,7 +206,7 @@ def first_embedding_source(path: Path) -> EmbeddingSource | None:
 def attachments_of(file: LogFile) -> list[Attachment]:
     """Read the attachments of a log, in the order of its index.
 
-    Raise `LogError` if one is too large, or damaged.
+    Raise `LogError` if an attachment is too large or damaged.
     """
     locations = [each for each in file.record_locations if each.opcode == Opcode.ATTACHMENT]
     attached = [r for r in map(file.record, locations) if isinstance(r, records.Attachment)]
@@ -217,17 +214,17 @@ def attachments_of(file: LogFile) -> list[Attachment]:
 
 
 def models_for(features: str) -> str:
-    """Say which models a feature set needs, as advice in a message."""
+    """Return advice for an error message: which models fit a feature set."""
     method = _METHODS.get(features)
     how = f"; `hearthlog train --method {method}` learns one" if method else ""
     return f"take a model for {features[:64]}{how}"
 
 
 def check_model(origin: RecorderInfo, model: Model) -> None:
-    """Check that a model is for the features of a log.
+    """Check that a model fits the features of a log.
 
-    Raise `LogError` if it is for others, or the log's are not installed, or installed in
-    another version.
+    Raise `LogError` if the model is for another feature set, or if the log's feature set is not
+    installed or has another version.
     """
     features, wanted = features_of(origin), model.description.feature_set
     if features.name != wanted:
@@ -238,10 +235,9 @@ def check_model(origin: RecorderInfo, model: Model) -> None:
 
 
 def features_of(origin: RecorderInfo) -> FeatureSet:
-    """Return the feature set of a log; `auros21` where the log names none, as there was no other.
+    """Return the feature set of a log; `auros21`, once the only one, if the log names none.
 
-    Raise `LogError` if the set is not installed, cannot be imported, or is installed in another
-    version.
+    Raise `LogError` if the set is not installed, cannot be imported, or has another version.
     """
     name = origin.feature_set or AUROS21.name
     if name == _UNNAMED:
@@ -268,7 +264,7 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
 
 
 def microphones_of(file: LogFile, kind: str) -> set[str]:
-    """Return the names of the microphones that have a topic in a log."""
+    """Return the names of the microphones with a topic of a kind."""
     names = set()
     for channel in file.channels.values():
         schema = file.schemas.get(channel.schema_id)
@@ -279,7 +275,7 @@ def microphones_of(file: LogFile, kind: str) -> set[str]:
 
 
 def first_message(file: LogFile, name: str, kind: str) -> dict[str, Any]:
-    """Return some fields of the first message of a topic; nothing if it has none.
+    """Return some fields of the first message of a topic; empty if there is no message.
 
     Raise `LogError` if the message is damaged.
     """
@@ -302,11 +298,11 @@ def _configuration(path: Path, attachments: Sequence[Attachment]) -> Configurati
         raise LogError(f"{path}: {CONFIGURATION}{where}: {first['msg']}") from error
 
 
-_ANY = ""  # microphone, where the record alone names a model
+_ANY = ""  # microphone key if only the `hearthlog` record names a model
 
 
 class LabelledBy(NamedTuple):
-    """A model; both texts are empty for none."""
+    """Name and digest of the labelling model; both empty for none."""
 
     model: str
     model_sha256: str
@@ -321,9 +317,9 @@ def models_of(log: Path) -> Mapping[str, LabelledBy]:
     Returns
     -------
     mapping of str to LabelledBy
-        By the names of the microphones, in their order. Of a file in which none of them says it,
-        that of its `hearthlog` record, by an empty name. Empty if it says nothing, is damaged, or
-        has no message of several microphones yet.
+        By microphone, sorted. If no microphone names a model, the model of the `hearthlog` record
+        under an empty name. Empty if there is no model, if the log is damaged, or if it has several
+        microphones and no message of them yet.
     """
     models: dict[str, LabelledBy] = {}
     with suppress(LogError), LogFile(log) as file:
@@ -339,12 +335,12 @@ def models_of(log: Path) -> Mapping[str, LabelledBy]:
 
 
 def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
-    """Read which model labelled a microphone of a log, or of a layer; as `models_of`.
+    """Read which model labelled a microphone of a log or layer, as `models_of`.
 
     Parameters
     ----------
     scenario : str, optional
-        For which it labelled; empty for the sounds of the home.
+        Name of the scenario; empty for the sounds of the home.
     """
     if scenario:
         return scenario_models(log).get((microphone, scenario), NO_MODEL)
@@ -353,7 +349,7 @@ def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
 
 
 def scenario_models(log: Path) -> Mapping[tuple[str, str], LabelledBy]:
-    """Read which models labelled for the scenarios of a log.
+    """Read which models labelled the scenarios of a log.
 
     Returns
     -------
@@ -372,7 +368,7 @@ _LONGEST = 200  # characters
 
 
 class Trouble(NamedTuple):
-    """What was not well, from when to when (ns of UTC): a gap, or what diagnostics say."""
+    """A problem and its span (ns of UTC): a gap, or a diagnostic status that is not OK."""
 
     source: str
     text: str
@@ -381,9 +377,9 @@ class Trouble(NamedTuple):
 
 
 class MicrophoneHealth(NamedTuple):
-    """How a microphone was at a time (ns of UTC): the worst level, and all that was not well.
+    """Health of a microphone at a time (ns of UTC): the worst level and all problems.
 
-    `floor_dbfs` is the level of the floor of the room, NaN where it is not known.
+    `floor_dbfs` is the noise floor of the room, NaN if unknown.
     """
 
     microphone: str
@@ -394,9 +390,9 @@ class MicrophoneHealth(NamedTuple):
 
 
 def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
-    """Yield the gaps of messages, without those of no length.
+    """Yield the gaps of positive duration.
 
-    Raise `LogError` if one of these fields is missing.
+    Raise `LogError` if a field is missing.
     """
     starts, durations = columns["header.stamp"], columns["duration"]
     rows = zip(starts.tolist(), durations.tolist(), columns["reason"].tolist(), strict=True)
@@ -406,9 +402,9 @@ def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
 
 
 def microphone_states(columns: Columns) -> Iterator[MicrophoneHealth]:
-    """Yield the state of a microphone for each diagnostic message that is about one.
+    """Yield the health of a microphone for each of its diagnostic messages.
 
-    Raise `LogError` if one of these fields is missing.
+    Raise `LogError` if a field is missing.
     """
     times, names = columns["header.stamp"].tolist(), columns["header.frame_id"].tolist()
     for time, name, statuses in zip(times, names, columns["status"], strict=True):
@@ -430,12 +426,12 @@ def _floor(statuses: Sequence[Any]) -> float:
 
 
 def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
-    """Yield what was not well, from when it was said until something else was said.
+    """Yield the problems of diagnostic statuses, each until its status changes.
 
     Parameters
     ----------
     end : int
-        Nanoseconds of UTC. The last trouble of a name ends with the last status of that name, or
+        Nanoseconds of UTC. The last problem of a name ends with the last status of that name, or
         here if that is earlier.
     """
     for name, same in groupby(sorted(statuses), lambda status: status.name):
@@ -446,13 +442,12 @@ def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
 
 
 def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple[int, int, str]]:
-    """Let each text last until the next one that differs, and the last one until `end`.
+    """Yield each text with its span: until the next different text, the last until `end`.
 
     Parameters
     ----------
     texts : sequence of (int, str or None)
-        When something was said (nanoseconds of UTC), in the order of time; None where there is
-        nothing to say.
+        Time (nanoseconds of UTC) and text, in order of time; None for no text.
     """
     changes = [(next(same)[0], text) for text, same in groupby(texts, lambda pair: pair[1])]
     ends = [*(time for time, _ in changes[1:]), end]

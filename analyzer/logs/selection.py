@@ -1,4 +1,4 @@
-"""Topics and a span of time of some logs, and their messages as columns."""
+"""Selection of topics and a time span of logs, read as columns."""
 
 import json
 import warnings
@@ -30,7 +30,7 @@ from hearthlog.schemas.messages.type_definitions import message_type
 
 
 class TypedColumns(NamedTuple):
-    """Messages of one topic, and their fields by path."""
+    """Messages of one topic, with their fields by path."""
 
     columns: Columns
     fields: Mapping[str, Field]
@@ -39,18 +39,18 @@ class TypedColumns(NamedTuple):
 def decode_types(
     path: Path, batch: Iterable[RawMessages], types: Mapping[str, Collection[str]]
 ) -> list[Columns]:
-    """Decode the messages of some types, and leave out all others.
+    """Decode the messages of the given types and drop all others.
 
     Parameters
     ----------
     types : mapping of str to collection of str
-        Paths of the fields to decode, by name of the type; `is_compatible` says which fields a
-        type may have.
+        Paths of the fields to decode, by type name; `is_compatible` defines which fields a type
+        may have.
 
     Raises
     ------
     LogError
-        If a message is not of the type that its channel says.
+        If a message does not match the type of its channel.
     """
     decoded: list[Columns] = []
     try:
@@ -63,18 +63,10 @@ def decode_types(
 
 
 def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
-    """Decode messages of any type with all of their fields.
+    """Decode all fields of messages of any type, grouped by topic and definition.
 
-    Parameters
-    ----------
-    batch : iterable of RawMessages
-        Messages, still encoded.
-
-    Returns
-    -------
-    list of TypedColumns
-        Messages of one topic and definition are together. What cannot be decoded is left out, with
-        a `HearthlogWarning`, as `decode_readable` does.
+    Messages that cannot be decoded are dropped with a `HearthlogWarning`, as in
+    `decode_readable`.
     """
     groups: dict[Any, list[RawMessages]] = {}
     for raw in batch:
@@ -93,20 +85,10 @@ def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
 def is_compatible(
     channel: Channel, schema: Schema | None, type_: str, fields: Collection[str]
 ) -> bool:
-    """Tell whether a channel has messages of a type, from which some fields can be read.
+    """Whether a channel has CDR messages of a type with the given fields.
 
-    Any version of a type of ours can be read: fields that were appended later have defaults. If a
-    definition is of no version of the type, a `HearthlogWarning` says so.
-
-    Parameters
-    ----------
-    schema : Schema or None
-        Of the channel; None if it has none.
-
-    Returns
-    -------
-    bool
-        False also if the channel is of another type, or not encoded as CDR.
+    Any version of our types can be read: fields that were appended later have defaults. A
+    definition that matches no version of the type causes a `HearthlogWarning`.
     """
     if schema is None or schema.name != type_ or channel.message_encoding != ENCODING:
         return False
@@ -118,21 +100,21 @@ def is_compatible(
 
 
 _LAST = (1 << 63) - 1  # log time
-_NAMED = 5  # topics of which none can be decoded
+_NAMED = 5  # maximum of undecodable topics in an error
 Result = TypeVar("Result")
-_CHUNKS_NAMED = 3  # damaged ones of a log
+_CHUNKS_NAMED = 3  # maximum of damaged chunks of a log with a warning each
 Described = tuple[Channel, Schema | None]
 
 
 class Damages:
-    """Warns of damaged chunks that are left out: of the first few of each log, then of the rest."""
+    """Collector of warnings about damaged chunks: the first few of each log, then a count."""
 
     def __init__(self) -> None:
         self._told: dict[Path, set[str]] = {}
         self._lock = Lock()
 
     def add(self, path: Path, error: LogError) -> None:
-        """Add a chunk; is called from threads that read."""
+        """Record a damaged chunk; thread-safe."""
         text = str(error)
         with self._lock:
             told = self._told.setdefault(path, set())
@@ -142,7 +124,7 @@ class Damages:
             _warn(path, error)
 
     def warn_of_more(self) -> None:
-        """Count those of which there was no warning."""
+        """Warn of the number of damaged chunks without a warning of their own."""
         for path, told in self._told.items():
             if (more := len(told) - _CHUNKS_NAMED) > 0:
                 _warn(path, LogError(f"{more:,} more chunks are damaged and left out{RECOVER}"))
@@ -152,11 +134,11 @@ class Damages:
 class LogSelection:
     """Topics and a span of time of some logs."""
 
-    logs: Sequence[Path]  # those with messages in the span
-    empty: Sequence[Path]  # those that have no message at all
-    unfinished: Sequence[Path]  # those of both that were not completed
-    channels: Mapping[str, Sequence[Described]]  # by topic, equal ones once
-    # the `hearthlog` records of the logs; equal ones are there once
+    logs: Sequence[Path]  # logs with messages in the span
+    empty: Sequence[Path]  # logs without any message
+    unfinished: Sequence[Path]  # logs in `logs` or `empty` that were not completed
+    channels: Mapping[str, Sequence[Described]]  # by topic, without duplicates
+    # `hearthlog` records of the logs, without duplicates
     metadata: Sequence[Mapping[str, str]]
     topics: frozenset[str] | None  # None: all
     start: int | None  # log times in nanoseconds: from `start` on, before `end`
@@ -166,36 +148,35 @@ class LogSelection:
 
     @property
     def earlier(self) -> Iterator[Path]:
-        """The logs with messages before the span, the last first."""
+        """The logs with messages before the span, latest first."""
         return self.spans.before(0 if self.start is None else self.start)
 
     @property
     def is_part(self) -> bool:
-        """Whether only some topics or a span of time were asked for."""
+        """Whether the selection is limited to some topics or a span of time."""
         return any(limit is not None for limit in (self.topics, self.start, self.end))
 
     def messages(
         self, progress: Progress = ignore_progress, *, once: bool = False
     ) -> Iterator[list[RawMessages]]:
-        """Read the messages of the selection, still encoded, in the order of time.
+        """Read the messages of the selection, still encoded, in order of time.
 
         Parameters
         ----------
         progress : callable, optional
-            Is told the share of the time span that is done, 0 to 1.
+            Called with the share of the time span that is done, 0 to 1.
         once : bool
-            Leave out chunks that are byte for byte an earlier one of their log.
+            Skip chunks that repeat an earlier chunk of their log byte for byte.
 
         Yields
         ------
         list of RawMessages
-            As `iterate_messages` yields them; chunks that are damaged are left out, as `Damages`
-            warns.
+            As `iterate_messages` yields them; damaged chunks are skipped with a warning.
 
         Raises
         ------
         LogError
-            If a log cannot be read any more.
+            If a log can no longer be read.
         """
         first, last = self.span
         damages = Damages()
@@ -207,12 +188,12 @@ class LogSelection:
         damages.warn_of_more()
 
     def verify(self) -> None:
-        """Compare all chunks with their checksums, before a first message is read.
+        """Compare all chunks with their checksums, before reading messages.
 
         Raises
         ------
         LogError
-            If one is damaged.
+            If a chunk is damaged.
         """
         for path in self.logs:
             with LogFile(path) as file:
@@ -222,12 +203,12 @@ class LogSelection:
                 )
 
     def topics_of(self, type_: str, fields: Collection[str]) -> list[str]:
-        """List the topics of a type whose channels all have some fields.
+        """List the topics of a type whose channels all have the given fields.
 
         Parameters
         ----------
         type_ : str
-            Name of a message type, such as those in `message_types`.
+            Name of a message type, such as in `message_types`.
         fields : collection of str
             Paths of the fields.
 
@@ -243,20 +224,20 @@ class LogSelection:
         ]
 
     def only(self, topics: Collection[str]) -> "LogSelection":
-        """Return the selection without its other topics.
+        """Return the selection limited to some topics.
 
         Parameters
         ----------
         topics : collection of str
-            Names of the topics that stay.
+            Names of the topics to keep.
         """
         left = {topic: same for topic, same in self.channels.items() if topic in topics}
         return replace(self, topics=frozenset(topics), channels=left)
 
     def decodable(self) -> "LogSelection":
-        """Return the selection without channels that cannot be decoded, each with a warning.
+        """Return the selection without undecodable channels, with a warning for each.
 
-        These are not of ROS 2, or the log does not define their type as it can be understood.
+        Undecodable channels are not of ROS 2, or the log has no usable definition of their type.
 
         Raises
         ------
@@ -283,13 +264,13 @@ class LogSelection:
         return replace(self, topics=frozenset(left), channels=left)
 
     def no_messages(self) -> list[RawMessages]:
-        """Return zero messages of each channel, of which a decoder makes columns without rows."""
+        """Return an empty batch per channel, which decoders turn into columns without rows."""
         buffer, offsets, heads = np.empty(0, np.uint8), np.empty(0, int), np.empty(0, MESSAGE_HEAD)
         channels = chain.from_iterable(self.channels.values())
         return [RawMessages(*channel, buffer, offsets, heads) for channel in channels]
 
     def nothing(self) -> LogError:
-        """Make the error that says that the selection has no message."""
+        """Return the error for a selection without messages."""
         topics = "" if not self.topics else f" of {abridged(sorted(self.topics))}"
         where = "these logs" if self.start is None and self.end is None else "this span of time"
         return LogError(f"no message{topics} in {where}; `hearthlog info` shows what there is")
@@ -301,16 +282,16 @@ def select(
     start: int | None = None,
     end: int | None = None,
 ) -> LogSelection:
-    """Find the logs that have messages in a span of time, and their topics of some names.
+    """Find the logs with messages in a span of time, and their topics.
 
-    A log that is damaged is left out, with a warning, unless there is no other.
+    A damaged log is left out with a warning, unless there is no other.
 
     Parameters
     ----------
     paths : iterable of Path
         Logs, or folders of logs.
     patterns : sequence of str
-        Names of topics, in which `*` stands for anything; all topics by default.
+        Names of topics, with `*` for any text; all topics by default.
     start, end : int, optional
         Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
         limit.
@@ -318,7 +299,7 @@ def select(
     Raises
     ------
     LogError
-        If there is no such log, if none of them is sound, or if a pattern fits no topic.
+        If there is no such log, if all logs are damaged, or if a pattern matches no topic.
     """
     damages: dict[Path, LogError] = {}
 
@@ -387,7 +368,7 @@ def _is_cut(path: Path) -> bool:
 
 
 class _Content:
-    """What one log says of itself."""
+    """Channels and metadata of one log."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -401,13 +382,7 @@ class _Content:
 
 
 def identity(channel: Channel, schema: Schema | None) -> Hashable:
-    """Return a key that two channels share if they say the same, though their numbers differ.
-
-    Parameters
-    ----------
-    schema : Schema or None
-        Of the channel; None if it has none.
-    """
+    """Return a hashable key, equal for channels that differ only in their numbers."""
     definition = None if schema is None else (schema.name, schema.encoding, schema.data)
     metadata = frozenset(channel.metadata.items())
     return channel.topic, channel.message_encoding, metadata, definition
@@ -425,7 +400,7 @@ def _by_topic(channels: Iterable[Described]) -> dict[str, list[Described]]:
 
 def _matching(patterns: Sequence[str], topics: Iterable[str]) -> frozenset[str]:
     names = sorted(topics)
-    if not names:  # of logs without messages
+    if not names:  # logs without messages
         return frozenset(patterns)
     matching: set[str] = set()
     for pattern in patterns:
@@ -445,15 +420,14 @@ def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
     Parameters
     ----------
     metadata : mapping of str to str
-        Of the channel; its `<field>_names` is a JSON list of texts.
+        Metadata of the channel; its `<field>_names` is a JSON list of texts.
     field : str
         Path of the array in the message, such as `values`.
 
     Returns
     -------
     list of str
-        In the order of the elements; empty if there are no names, if one cannot be printed, or if
-        two are equal.
+        In the order of the elements; empty if names are missing, not printable or not unique.
     """
     names = _names(metadata, field)
     fit = all(name.isprintable() for name in names) and len(set(names)) == len(names)
@@ -461,7 +435,7 @@ def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
 
 
 def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, ...]:
-    """Return the names that a channel gives to the elements of an array: one for each.
+    """Return the names of the elements of an array, exactly one per element.
 
     Parameters
     ----------
@@ -471,8 +445,8 @@ def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, 
     Raises
     ------
     LogError
-        If the messages have no such field, if there are no names or more than 256, if two names
-        are equal, or if there are more or fewer names than elements.
+        If the field is missing, if there are no names or more than 256, if names are not unique,
+        or if the number of names differs from the number of elements.
     """
     where = f"{path}: {columns.topic}"
     names = _names(columns.metadata, field)
@@ -486,10 +460,10 @@ def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, 
 
 
 def _names(metadata: Mapping[str, str], field: str) -> list[str]:
-    """Read a list of texts; none if it is anything else."""
+    """Read a JSON list of texts; empty if the metadata holds anything else."""
     try:
         names: Any = json.loads(metadata.get(f"{field}_names", ""))
-        "".join(names).encode()  # or JSON has other things than texts, or halves of characters
+        "".join(names).encode()  # raises on other items than texts, and on lone surrogates
     except (ValueError, TypeError, RecursionError):
         return []
     return names if isinstance(names, list) else []

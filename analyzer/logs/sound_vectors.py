@@ -16,17 +16,17 @@ from hearthlog.schemas.messages.topics import EmbeddingSource, EmbeddingSpace
 
 
 class Bearings(NamedTuple):
-    """Whence the sound of each of some spans came.
+    """Mean direction of the sound in each of some spans.
 
     Attributes
     ----------
     azimuths : np.ndarray [shape=(n,)], float64
-        In radians, counter-clockwise from x; NaN where nothing was located.
+        In radians, counter-clockwise from x; NaN if no sound was located.
     spreads : np.ndarray [shape=(n,)], float64
-        Circular standard deviation, in radians; NaN where nothing was located. It is large where
-        the sound moved, or there were several.
+        Circular standard deviation, in radians; NaN if no sound was located. Large for a moving
+        source or several sources.
     counts : np.ndarray [shape=(n,)], int64
-        Of the blocks that were located.
+        Number of located blocks.
     """
 
     azimuths: Float64
@@ -35,7 +35,7 @@ class Bearings(NamedTuple):
 
 
 def as_vectors(azimuths: Float32, confidences: Float32) -> Float64:
-    """Turn directions into vectors that can be added.
+    """Convert directions to vectors that can be added.
 
     Parameters
     ----------
@@ -46,14 +46,14 @@ def as_vectors(azimuths: Float32, confidences: Float32) -> Float64:
     Returns
     -------
     np.ndarray [shape=(n, 2)], float64
-        Ahead and left: of a length that is the confidence.
+        Ahead and left; the length is the confidence.
     """
     turned = azimuths.astype(np.float64)
     return np.stack([np.cos(turned), np.sin(turned)], axis=1) * confidences[:, np.newaxis]
 
 
 def degrees_of(vectors: Float64) -> Float64:
-    """Return whence vectors come, in degrees.
+    """Return the azimuths of vectors, in degrees.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def degrees_of(vectors: Float64) -> Float64:
 
 
 def mean_bearings(times: Int64, vectors: Float64, starts: Int64, ends: Int64) -> Bearings:
-    """Compute whence the sound of spans came.
+    """Compute the mean direction of the sound in each span.
 
     The circular mean and standard deviation are those of Mardia and Jupp, "Directional Statistics",
     2000, weighted by the confidence.
@@ -78,11 +78,11 @@ def mean_bearings(times: Int64, vectors: Float64, starts: Int64, ends: Int64) ->
     Parameters
     ----------
     times : np.ndarray [shape=(m,)], int64
-        Starts of the blocks that were located, in their order, in nanoseconds of UTC.
+        Starts of the located blocks, ascending, in nanoseconds of UTC.
     vectors : np.ndarray [shape=(m, 2)], float64
-        As `as_vectors` makes them.
+        As returned by `as_vectors`.
     starts, ends : np.ndarray [shape=(n,)], int64
-        Of the spans, which may overlap. A block belongs to those in which it begins.
+        The spans, which may overlap. A block belongs to each span that contains its start.
     """
     first, last = np.searchsorted(times, starts), np.searchsorted(times, ends)
     weights = np.hypot(*vectors.T)
@@ -101,9 +101,9 @@ DIRECTION_FIELDS = ("header.stamp", "frame", "azimuth", "confidence")
 
 
 def directions_of(columns: Columns) -> Directions:
-    """Return the directions that a log has.
+    """Return the directions in a log.
 
-    Raise `LogError` if no array has such directions.
+    Raise `LogError` if the values are impossible for a microphone array.
     """
     stamps, numbers, azimuths, confidences = (columns[path] for path in DIRECTION_FIELDS)
     possible = (numbers <= LARGEST_FRAME) & (numbers % BLOCK_FRAMES == 0)
@@ -113,15 +113,15 @@ def directions_of(columns: Columns) -> Directions:
     return Directions(numbers.astype(np.int64), stamps, azimuths, confidences)
 
 
-_COMPONENT = "component_"  # of what a network hears: its groups of names make few things alike
+_COMPONENT = "component_"  # network components; the groups of class names hardly measure similarity
 _WINDOW = WINDOW_FRAMES * FRAME_NANOSECONDS
 EMBEDDING_FIELDS = ("header.stamp", "frame", "frames", "values")
 
 
 def embeddings_of(columns: Columns) -> Embeddings:
-    """Return the embeddings that a log has.
+    """Return the embeddings in a log.
 
-    Raise `LogError` if no recorder writes such embeddings.
+    Raise `LogError` if the values are impossible for a recorder.
     """
     stamps, numbers, frames, values = (columns[path] for path in EMBEDDING_FIELDS)
     possible = (numbers <= LARGEST_FRAME) & (numbers % HOP_FRAMES == 0) & (frames == WINDOW_FRAMES)
@@ -133,19 +133,19 @@ def embeddings_of(columns: Columns) -> Embeddings:
 def mean_embeddings(
     columns: Columns | None, starts: Int64, ends: Int64
 ) -> tuple[EmbeddingSpace | None, Float32]:
-    """Return what a network hears in spans: its components, by how much of a window each is in.
+    """Return the mean embedding components of spans, weighted by the overlap with each window.
 
     Parameters
     ----------
     columns : Columns or None
-        Of one log, with stamps and values; None if it has no embeddings.
+        Embeddings of one log, with stamps and values; None if it has no embeddings.
     starts, ends : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
 
     Returns
     -------
     space : EmbeddingSpace or None
-        With what they can be compared; None for embeddings that do not say it.
+        Means are comparable within the same space; None for embeddings without a source.
     means : np.ndarray [shape=(n, k)], float32
         In steps of the logged integers; NaN for a span without a window.
     """

@@ -1,4 +1,4 @@
-"""Spans of time as arrays: joined, cut, taken from each other, laid over each other, measured."""
+"""Set operations on arrays of time spans: union, intersection, difference, overlay, lengths."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -12,40 +12,39 @@ Rows = NDArray[np.intp]
 
 
 class Spans(NamedTuple):
-    """Spans of time in nanoseconds of UTC; they ascend and do not overlap."""
+    """Spans of time in nanoseconds of UTC, ascending and without overlaps."""
 
     starts: Int64  # shape (n,)
     ends: Int64
 
     @property
     def length(self) -> int:
-        """Sum of the lengths of the spans, in nanoseconds."""
+        """Total length of the spans, in nanoseconds."""
         return int((self.ends - self.starts).sum())
 
 
 class Timed(Protocol):
-    """Whatever has starts and ends, as `Spans` and labelled spans have."""
+    """Anything with starts and ends, such as `Spans` and labelled spans."""
 
     @property
     def starts(self) -> Int64:
-        """When each begins, ascending."""
+        """Starts, ascending."""
 
     @property
     def ends(self) -> Int64:
-        """When each ends."""
+        """Ends, in the order of the starts."""
 
 
 class Overlay(NamedTuple):
-    """Parts of the time, in nanoseconds of UTC, in which no span of any layer begins or ends."""
+    """Intervals, in nanoseconds of UTC, in which no span of any layer begins or ends."""
 
     starts: Int64  # shape (n,)
     ends: Int64
-    # shape (m, n), for each of what was laid over each other the row of its span; -1 where it has
-    # none
+    # shape (m, n): the row of the span in each layer; -1 for none
     rows: Int64
 
     def in_all(self) -> "Overlay":
-        """Return the parts in which every layer has a span."""
+        """Return the intervals in which every layer has a span."""
         which = np.logical_and.reduce(self.rows >= 0)
         return Overlay(self.starts[which], self.ends[which], self.rows[:, which])
 
@@ -65,7 +64,7 @@ def one(start: int, end: int) -> Spans:
 
 
 def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
-    """Find the first span of each group of spans no more than a pause apart.
+    """Return the first span of each group of spans at most a pause apart.
 
     Parameters
     ----------
@@ -75,7 +74,7 @@ def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
     Returns
     -------
     np.ndarray [shape=(m,)], intp
-        Rows of the spans that begin more than a pause after the end of all before them.
+        Rows of the spans that begin more than a pause after the end of all earlier spans.
     """
     if not len(starts):
         return np.empty(0, np.intp)
@@ -84,14 +83,14 @@ def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
 
 
 def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
-    """Join spans that overlap or are no more than a pause apart.
+    """Merge spans that overlap or are at most a pause apart.
 
     Parameters
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
         Nanoseconds, in any order.
     pause : int, optional
-        Nanoseconds; 0 joins spans that touch.
+        Nanoseconds; 0 merges adjacent spans.
     """
     order = np.argsort(starts, kind="stable")
     starts, ends = starts[order], ends[order]
@@ -100,30 +99,29 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
 
 
 def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
-    """Count up from each of some numbers.
+    """Concatenate ranges of consecutive numbers.
 
     Parameters
     ----------
     firsts, counts : np.ndarray [shape=(n,)], int
-        Where to begin, and how many numbers to count.
+        First number and length of each range.
 
     Returns
     -------
     rows, numbers : np.ndarray [shape=(counts.sum(),)]
-        The row of `firsts` that each number belongs to, and the numbers: `firsts[0]`,
-        `firsts[0] + 1` … of row 0, then those of row 1.
+        Range of each number, and the numbers: `firsts[0]`, `firsts[0] + 1` … of row 0, then row 1.
     """
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(counts.sum()) + np.repeat(firsts - (np.cumsum(counts) - counts), counts)
 
 
 def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
-    """Cut spans to the parts that lie in other spans.
+    """Intersect spans with other spans.
 
     Returns
     -------
     of_a, of_b : np.ndarray [shape=(n,)], intp
-        The rows of `a` and of `b` that each piece lies in.
+        Rows of `a` and of `b` that contain each piece.
     """
     low = np.searchsorted(b.ends, a.starts, side="right")
     high = np.searchsorted(b.starts, a.ends, side="left")
@@ -133,12 +131,12 @@ def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
 
 
 def common(a: Spans, b: Spans) -> Spans:
-    """Return the time that is in both."""
+    """Return the intersection of two sets of spans."""
     return pieces(a, b)[0]
 
 
 def cut(spans: Spans, start: int, end: int) -> Spans:
-    """Return the time of spans between two times, without a look at all the other spans."""
+    """Return the part of spans between two times, without visiting all spans."""
     first = np.searchsorted(spans.ends, start, side="right")
     last = max(np.searchsorted(spans.starts, end), first)
     rows = slice(first, last)
@@ -146,24 +144,24 @@ def cut(spans: Spans, start: int, end: int) -> Spans:
 
 
 def without(a: Spans, b: Spans) -> Spans:
-    """Return the time that is in the first spans and not in the second."""
+    """Return the time in the first spans that is not in the second."""
     return remains(a, b)[0]
 
 
 def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
-    """Cut spans to the parts that lie outside of other spans.
+    """Cut spans to the parts outside of other spans.
 
     Parameters
     ----------
     a : Timed
-        Ascending by their starts and by their ends.
+        Ascending by start and by end.
 
     Returns
     -------
     spans : Spans
-        What is in `a` and not in `b`, in the order of `a`.
+        The parts of `a` outside of `b`, in the order of `a`.
     of_a : np.ndarray [shape=(n,)], intp
-        The row of `a` that each piece is left of.
+        Row of `a` for each part.
     """
     if not len(a.starts) or not len(b.starts):
         return Spans(a.starts, a.ends), np.arange(len(a.starts))
@@ -175,7 +173,7 @@ def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
 
 
 def rows_at(spans: Timed, times: Int64) -> Int64:
-    """Find the span that each time lies in.
+    """Find the span that contains each time.
 
     Parameters
     ----------
@@ -185,7 +183,7 @@ def rows_at(spans: Timed, times: Int64) -> Int64:
     Returns
     -------
     np.ndarray [shape=(n,)], int64
-        Rows of `spans`; -1 for a time in none of them.
+        Rows of `spans`; -1 for a time outside of all spans.
     """
     if not len(spans.starts):
         return np.full(len(times), -1)
@@ -194,15 +192,14 @@ def rows_at(spans: Timed, times: Int64) -> Int64:
 
 
 def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
-    """Cut the time wherever a span of one of several layers begins or ends.
+    """Cut the time wherever a span of any layer begins or ends.
 
     Parameters
     ----------
     layers : sequence of Timed
         At least one; the spans of a layer ascend and do not overlap.
     every : int, optional
-        Nanoseconds: cut the time also at the multiples of this, where it is not 0; every layer
-        then has a span.
+        Nanoseconds: cut also at multiples of this, unless 0; every layer must then have a span.
     """
     edges = [times for spans in layers for times in (spans.starts, spans.ends)]
     if every:
@@ -214,7 +211,7 @@ def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
 
 
 def lengths(spans: Spans, edges: Int64) -> Int64:
-    """Measure how much time of spans lies between each two successive edges.
+    """Return the length of the spans between successive edges.
 
     Parameters
     ----------

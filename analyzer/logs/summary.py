@@ -1,4 +1,4 @@
-"""The summary of logs: topics, sizes, labels, gaps and health."""
+"""Summary of logs: topics, sizes, labels, gaps and health."""
 
 import struct
 from collections import Counter
@@ -34,19 +34,19 @@ Span = tuple[int, int]
 
 @dataclass
 class TopicSummary:
-    """One topic."""
+    """Messages of one topic."""
 
-    type: str  # empty if there is no schema
-    encoding: str  # of its messages
+    type: str  # empty without a schema
+    encoding: str  # message encoding
     messages: int = 0
-    # of payloads before compression; None if the messages were counted by an index
+    # payload bytes before compression; None if the messages were counted by an index
     bytes: int | None = 0
-    # first and last log time; by an index, those of the chunks that hold it
+    # first and last log time; if counted by an index, of the chunks with this topic
     span: Span | None = None
 
     @property
     def rate(self) -> float:
-        """Messages a second between its first and its last one."""
+        """Messages per second between the first and the last message."""
         first, last = self.span or (0, 0)
         return (self.messages - 1) * NANOSECONDS / (last - first) if last > first else 0.0
 
@@ -56,9 +56,9 @@ class TopicSummary:
         Parameters
         ----------
         size : int or None
-            Bytes of their payloads before compression; None if that is not known.
+            Payload bytes before compression; None if unknown.
         span : (int, int) or None
-            Their first and last log time, in nanoseconds of UTC; None if that is not known.
+            First and last log time, in nanoseconds of UTC; None if unknown.
         """
         self.messages += count
         self.bytes = None if self.bytes is None or size is None else self.bytes + size
@@ -67,34 +67,34 @@ class TopicSummary:
 
 @dataclass
 class LogSummary:
-    """What is in some logs."""
+    """Contents of some logs."""
 
-    files: list[Path] = field(default_factory=list)  # those that could be read
-    # those that are still being written, or were cut short
+    files: list[Path] = field(default_factory=list)  # readable files
+    # still being written, or cut short
     unfinished: list[Path] = field(default_factory=list)
-    layers: list[Path] = field(default_factory=list)  # those that speak of another log
-    damaged: dict[Path, str] = field(default_factory=dict)  # what is wrong with the others
+    layers: list[Path] = field(default_factory=list)  # files that are layers of another log
+    damaged: dict[Path, str] = field(default_factory=dict)  # error per damaged file
     size: int = 0  # bytes on disk
     chunks: int = 0
-    chunk_bytes: int = 0  # on disk
-    raw_bytes: int = 0  # before compression
-    profiles: set[str] = field(default_factory=set)  # names that occur in the files
+    chunk_bytes: int = 0  # bytes on disk
+    raw_bytes: int = 0  # bytes before compression
+    profiles: set[str] = field(default_factory=set)  # names in any of the files
     libraries: set[str] = field(default_factory=set)
     attachments: set[str] = field(default_factory=set)
     metadata: set[str] = field(default_factory=set)
-    schema_versions: set[str] = field(default_factory=set)  # as their `hearthlog` records say
+    schema_versions: set[str] = field(default_factory=set)  # from the `hearthlog` records
     topics: dict[str, TopicSummary] = field(default_factory=dict)
-    # by microphone and label; those of a layer are under the name of its topic
+    # by microphone and label; for a layer, by topic name and label
     label_seconds: dict[str, Counter[str]] = field(default_factory=dict)
-    segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number, likewise
-    segment_seconds: dict[str, Counter[str]] = field(default_factory=dict)  # but for reviews
-    # `segments` and `seconds` of them whose labels are likelier wrong than right, likewise
+    segments: dict[str, Counter[str]] = field(default_factory=dict)  # number of segments, likewise
+    segment_seconds: dict[str, Counter[str]] = field(default_factory=dict)  # likewise, no reviews
+    # `segments` and `seconds` of segments that are more likely wrong than right, likewise
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
     gaps: list[LoggedGap] = field(default_factory=list)
-    # what the files say of themselves: microphone, device, feature set, model
+    # microphone, device, feature set and model, as recorded in the files
     streams: list[dict[str, Any]] = field(default_factory=list)
-    health: Status | None = None  # the worst that was said, and of that the last
-    latest_health: Status | None = None  # of the latest file; while it is written, of its end
+    health: Status | None = None  # worst status; of equal levels the latest
+    latest_health: Status | None = None  # of the latest file; at its end while it is being written
 
     @property
     def span(self) -> Span | None:
@@ -112,21 +112,21 @@ class LogSummary:
 
     @property
     def gap_seconds(self) -> float:
-        """Seconds that were not heard, of all microphones together."""
+        """Seconds in gaps, summed over all microphones."""
         return sum(gap.seconds for gap in self.gaps)
 
     @property
     def compression_ratio(self) -> float | None:
-        """Bytes before compression for each byte on disk; None without chunks."""
+        """Bytes before compression per byte on disk; None without chunks."""
         return self.raw_bytes / self.chunk_bytes if self.chunk_bytes else None
 
     def add(self, other: "LogSummary") -> None:
-        """Add what other files hold to this summary.
+        """Merge the summary of other files into this one.
 
         Parameters
         ----------
         other : LogSummary
-            Of files that are not in this one; stays as it is.
+            Summary of different files; not modified.
         """
         self.files += other.files
         self.unfinished += other.unfinished
@@ -160,17 +160,17 @@ class LogSummary:
 
 
 def worse(one: Status | None, other: Status | None) -> Status | None:
-    """Return the status of the higher level, of equal levels the later one.
+    """Return the status with the higher level; of equal levels the later one.
 
     Parameters
     ----------
     one, other : Status or None
-        None where nothing was said.
+        None for no status.
 
     Returns
     -------
     Status or None
-        None if nothing was said at all.
+        None if both are None.
     """
     statuses = [status for status in (one, other) if status is not None]
     return max(statuses, key=lambda status: (status.level, status.time), default=None)
@@ -188,7 +188,7 @@ _TIMES = 16  # bytes of an attachment before its name
 
 
 def summarise(paths: Iterable[Path]) -> LogSummary:
-    """Count what is in some logs."""
+    """Summarise the contents of some logs."""
     total = LogSummary()
     for path in paths:
         try:
@@ -214,7 +214,7 @@ def _channels(file: LogFile) -> list[tuple[Channel, Schema | None]]:
 
 
 def _without_messages(file: LogFile) -> LogSummary:
-    """Summarise a log without a look at its messages."""
+    """Summarise a log without reading its messages."""
     chunks = file.chunks[file.chunks["index_length"] >= 0]
     summary = LogSummary(
         files=[file.path],
@@ -236,7 +236,7 @@ def _without_messages(file: LogFile) -> LogSummary:
 
 
 def _name(file: LogFile, location: RecordLocation) -> str:
-    """Read the name of a metadata record or an attachment, and nothing else of it."""
+    """Read only the name of a metadata record or an attachment."""
     head = file.read(location.offset + HEAD.size, _TIMES + _NAME_LENGTH.size + _NAME_LIMIT)
     start = 0 if location.opcode == Opcode.METADATA else _TIMES
     try:
@@ -248,7 +248,7 @@ def _name(file: LogFile, location: RecordLocation) -> str:
 
 
 def _is_counted(file: LogFile) -> bool:
-    """Tell whether the index says how many messages each channel has, and which these are."""
+    """Whether the index has the message counts of all channels and defines these channels."""
     if file.statistics is None or file.late:
         return False
     counts = file.statistics.channel_message_counts
@@ -270,7 +270,7 @@ def _count_by_index(file: LogFile, summary: LogSummary) -> None:
 
 
 def _stated(file: LogFile, summary: LogSummary) -> LogContents | None:
-    """Read what a finished log says of its messages."""
+    """Return the contents that a finished log records about itself."""
     contents = stated_contents(file)
     if contents is not None:
         for channel in _channels(file):
@@ -307,7 +307,7 @@ def _add_contents(summary: LogSummary, contents: LogContents) -> None:
     summary.segments = contents.segments
     summary.unsure = contents.unsure
     for microphone, seconds in contents.seconds.items():
-        of_review = is_review(microphone)  # which has no labels frame by frame
+        of_review = is_review(microphone)  # reviews have no frame labels
         (summary.label_seconds if of_review else summary.segment_seconds)[microphone] = seconds
     lengths = {stream["microphone"]: stream["frame_seconds"] for stream in contents.streams}
     for microphone, counts in contents.frames.items():
@@ -317,5 +317,5 @@ def _add_contents(summary: LogSummary, contents: LogContents) -> None:
     summary.gaps = contents.gaps
     summary.streams = contents.streams
     summary.health = contents.health
-    last = contents.last.values()  # of a finished log, which is not read, the worst has to do
+    last = contents.last.values()  # a finished log is not read: its worst status stands in
     summary.latest_health = reduce(worse, last, None) if last else contents.health

@@ -1,4 +1,4 @@
-"""Text files that people make: read within limits, and refused with the line that is wrong."""
+"""Size-limited readers of user-made text and CSV files, with line numbers in errors."""
 
 import codecs
 import csv
@@ -10,22 +10,22 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.files import read_whole
 
-# A spreadsheet takes such a text for a formula, unless it is a number; apostrophes before it
-# disarm it, and one more is written than it has, so that reading gives the same text back.
-FORMULA = r"^'*[=+\-@\t\r\n＝＋－＠]"  # noqa: RUF001  wide ones, too
+# A spreadsheet evaluates such a text as a formula, unless it is a number. An apostrophe before
+# the text prevents that; existing apostrophes get one more, so that reading restores the text.
+FORMULA = r"^'*[=+\-@\t\r\n＝＋－＠]"  # noqa: RUF001  full-width characters, too
 NUMBER = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
-_MOST_LINES = 1_000_000  # blank ones too: each takes a microsecond
-_LONGEST = 1 << 20  # characters of a record: fields take fifty times as much memory
+_MOST_LINES = 1_000_000  # including blank lines: each takes a microsecond
+_LONGEST = 1 << 20  # characters of a record: its fields take fifty times as much memory
 
 
 def disarmed(text: str) -> str:
-    """Put an apostrophe before a text that a spreadsheet would take for a formula."""
+    """Prefix an apostrophe to a text that a spreadsheet would evaluate as a formula."""
     is_formula = re.match(FORMULA, text) and not re.fullmatch(NUMBER, text)
     return f"'{text}" if is_formula else text
 
 
 def without_disarming(text: str) -> str:
-    """Return a text as it was before `disarmed`."""
+    """Undo `disarmed`."""
     return text[1:] if text.startswith("'") and re.match(FORMULA, text) else text
 
 
@@ -35,12 +35,12 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
     Parameters
     ----------
     size_limit : int
-        Bytes that the file may have at most.
+        Maximum size in bytes.
 
     Raises
     ------
     DataError
-        If there is no such file, or it cannot be read, is larger, or is in neither.
+        If the file is missing, unreadable, too large, or in another encoding.
     """
     raw = read_whole(path, what, size_limit, DataError)
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -52,7 +52,7 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
 
 
 def numbered_lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are not blank, and their numbers from 1.
+    """Yield the non-blank lines with their numbers from 1.
 
     Raise `DataError` if the text has more than a million lines.
     """
@@ -63,17 +63,17 @@ def numbered_lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
 
 
 def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Yield the records of CSV that are not blank.
+    """Yield the non-blank records of CSV with their line numbers.
 
     Parameters
     ----------
     delimiter : str
-        Between fields.
+        Field separator.
 
     Yields
     ------
     line : int
-        The line in which the record begins, from 1.
+        First line of the record, from 1.
 
     Raises
     ------
@@ -89,17 +89,17 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
 def csv_rows(
     path: Path, text: str, delimiter: str, *, quoted: bool = True
 ) -> Iterator[tuple[int, list[str] | csv.Error]]:
-    """Yield the records of CSV that are not blank, and what is wrong where there is none.
+    """Yield the non-blank records of CSV, or the error of each malformed one.
 
     Parameters
     ----------
     delimiter : str
-        Between fields.
+        Field separator.
 
     Yields
     ------
     line : int
-        The line in which the record begins, from 1.
+        First line of the record, from 1.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Marks of a reviewer: their layers, label files of other programs, enrolled sounds."""
+"""Reviewer marks: mark layers, label files of other programs and enrolled sounds."""

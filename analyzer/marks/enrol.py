@@ -1,4 +1,4 @@
-"""Enrol sounds in the training set of a home: each is a log of features with one mark."""
+"""Enrolment of sounds in a home's training set: a log of features with one mark each."""
 
 import shutil
 import tempfile
@@ -44,38 +44,38 @@ from hearthlog.schemas.logs.files import (
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.new_files import new_file, private_folder
 
-SECONDS = 5.0  # of a microphone, by default
+SECONDS = 5.0  # default length of a microphone recording
 LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0
-_PATIENCE = 10.0  # seconds for a microphone to wake
+_PATIENCE = 10.0  # seconds that a microphone may take to start
 _STAMP = "header.stamp"
 _ENERGY = "energy"
 
 
 @dataclass(frozen=True)
 class Enrolled:
-    """A log in the training set of a home, and its length in seconds."""
+    """A log in the training set of a home, with its length in seconds."""
 
     log: Path
     seconds: float
-    warning: str = ""  # what is missing of the file, or wrong with the sound
+    warning: str = ""  # what is missing in the file, or wrong with the sound
 
 
 def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
     """Enrol an audio file, or its first seconds.
 
-    Its frames get the times that its name or its metadata say, else times that end now; or earlier
-    ones, for enrolled logs of one class do not overlap.
+    Frame times come from the file name or metadata, else they end now; earlier if needed, because
+    enrolled logs of one class must not overlap.
 
     Parameters
     ----------
     seconds : float, optional
-        How much of it; at least 1. All of it by default.
+        Length to enrol, at least 1; by default the complete file.
 
     Raises
     ------
     DataError
-        If the label cannot be the name of a class, if there is less than a second of sound, or if
-        the sound is only silence and the label is not.
+        If the label is no valid class name, if there is less than a second of sound, or if the
+        sound is only silence and the label is not.
     SourceError
         If the file is missing, is no audio, or is shorter than a frame.
     LogError
@@ -103,20 +103,20 @@ def enrol_microphone(
     seconds: float = SECONDS,
     listening: Callable[[], None] = lambda: None,
 ) -> list[Enrolled]:
-    """Enrol what a microphone hears now.
+    """Enrol a live recording from a microphone.
 
     Parameters
     ----------
     device : str
-        As `hearthlog devices` lists it; empty for the default one.
+        As listed by `hearthlog devices`; empty for the default device.
     seconds : float
-        How long to listen; at least 1.
+        Length of the recording; at least 1.
 
     Raises
     ------
     DataError
-        If the label cannot be the name of a class, if there is less than a second of sound, or if
-        the sound is only silence and the label is not.
+        If the label is no valid class name, if there is less than a second of sound, or if the
+        sound is only silence and the label is not.
     SourceError
         If the microphone cannot be found or opened.
     LogError
@@ -138,21 +138,21 @@ def enrol_microphone(
 def enrol_log(  # noqa: PLR0913, PLR0917
     home: Path, label: str, log: Path, start: int, end: int, microphone: str | None = None
 ) -> Enrolled:
-    """Enrol a span of time of a log, or of a folder of logs: its features, message for message.
+    """Enrol a time span of a log, or of a folder of logs, by copying its feature messages.
 
     Parameters
     ----------
     start, end : int
         Nanoseconds of UTC: the frames from `start` on, before `end`.
     microphone : str, optional
-        Which one heard it; the only one of the log by default.
+        Name of the microphone; by default the only one of the log.
 
     Raises
     ------
     DataError
-        If the label cannot be the name of a class, if the log is of several microphones and none is
-        named, if it has no features with an energy, if there is less than a second of sound, or if
-        the sound is only silence and the label is not.
+        If the label is no valid class name, if the log has several microphones and none is named,
+        if it has no features with an energy, if there is less than a second of sound, or if the
+        sound is only silence and the label is not.
     LogError
         If there is no such log, if one is damaged, or if nothing can be written.
     """
@@ -169,9 +169,9 @@ def enrol_log(  # noqa: PLR0913, PLR0917
 
 
 def cut_path(home: Path, label: str, start: int) -> Path:
-    """Name the enrolled span of a log that begins at a time, in nanoseconds of UTC."""
+    """Return the path of an enrolled span of a log; `start` is in nanoseconds of UTC."""
     path = log_path(home / ENROLLED, label, start)
-    # Not a name as of a recorder's log: this one has not all of its topics.
+    # Unlike the name of a recorder's log, because this log lacks some topics.
     return path.with_stem(f"{path.stem}{CUT}")
 
 
@@ -214,7 +214,7 @@ def _enrol(
 ) -> tuple[list[Enrolled], str]:
     """Record to a temporary folder, and copy the logs to the training set if they have sound.
 
-    Return them, and what is wrong with the sound.
+    Return the enrolled logs, and a problem with the sound, if any.
     """
     microphone = MicrophoneSettings()
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
@@ -242,11 +242,11 @@ def _enrol(
 
 
 def _feature_set(home: Path) -> dict[str, str]:
-    """Return the setting that gives the features of the latest log, else of an enrolled sound."""
+    """Return the feature set setting of the latest log, else of an enrolled sound."""
     try:
         logs = find_logs(home, enrolled=True)
     except LogError:
-        return {}  # the sound is the first of the home
+        return {}  # first sound of the home
     logs.sort(key=lambda log: ENROLLED not in log.relative_to(home).parts)
     key = "feature_set"
     return next(({key: each[key]} for each in latest_records(logs) if each.get(key)), {})
@@ -272,7 +272,7 @@ def _check_sound(label: str, energies: NDArray[np.floating[Any]]) -> None:
 def _frames(
     logs: Sequence[Path], microphone: str, start: int | None = None, end: int | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
-    """Read the times of the frames of some logs, and their energies."""
+    """Read the times and energies of the frames of some logs."""
     name = topic(microphone, "features")
     columns = read_columns(logs, {name}, start, end, {_STAMP, "values"}).get(name)
     if columns is None:
@@ -285,7 +285,7 @@ def _frames(
 
 
 def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) -> Enrolled:
-    """Mark all of a new log, or delete the log."""
+    """Mark a new log completely; delete the log on failure."""
     start, end = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
     try:
         write_marks(path, [Mark(microphone, start, end, label)])
@@ -296,7 +296,7 @@ def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) 
 
 
 def _free_start(home: Path, label: str, seconds: float, end: int) -> int:
-    """Return the start of the last span that ends by a time and overlaps no enrolled log."""
+    """Return the start of the latest span that ends by `end` and overlaps no enrolled log."""
     length = int(seconds * NANOSECONDS)
     logs = filter(is_log, (home / ENROLLED).rglob(f"{label}_*{SUFFIX}"))
     spans = [span for log in logs if (span := time_span(log)) is not None]

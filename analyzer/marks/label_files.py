@@ -1,4 +1,4 @@
-"""Label files of any format, imported as marks and written from marks."""
+"""Import and export of label files in any supported format."""
 
 import re
 import unicodedata
@@ -31,21 +31,22 @@ from hearthlog.schemas.files import read_toml
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.new_files import new_file
 
-_CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # that a name may have
+_CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # C1 control characters, allowed in names
 
 
 def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
-    """Yield the labels of a file as they are there.
+    """Yield the labels of a file, unconverted.
 
     Yields
     ------
     FileLabel or LineError
-        In the order of the file; an error for a line that is no label.
+        In the order of the file; an error for each line that is no label.
 
     Raises
     ------
     DataError
-        If the file cannot be read, is too large or no label file, or has nothing to choose from.
+        If the file cannot be read, is too large or no label file, or has no columns or tiers to
+        choose.
     """
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)
@@ -59,11 +60,11 @@ def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
 
 
 def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> None:
-    """Write marks as a label file that `read_rows` reads again.
+    """Write marks as a label file that `read_rows` can read.
 
     Raise `DataError` if there are no marks, if the file would be too large, or if the marks are
-    of several microphones and the format has no place for them. Raise `LogError` if the file
-    exists, or cannot be written.
+    of several microphones and the format supports only one. Raise `LogError` if the file exists
+    or cannot be written.
     """
     if not marks:
         raise DataError("no marks to export: nothing was imported or marked in these logs yet")
@@ -84,19 +85,19 @@ def _codec(format_: LabelFormat) -> LabelCodec:
 
 
 def _without_controls(mark: Mark) -> Mark:
-    """Replace the characters of names that would steer a terminal."""
+    """Replace terminal control characters in names."""
     return mark._replace(
         reviewer=mark.reviewer.translate(_CONTROLS), corrects=mark.corrects.translate(_CONTROLS)
     )
 
 
-_LONGEST = 200  # characters of a label; to normalise many accents takes the square of their number
+_LONGEST = 200  # characters of a label; normalising accents takes quadratic time
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue"})
 _SEPARATORS = re.compile(r"[\s_-]+")
 
 
 class ClassNames(NamedTuple):
-    """What labels mean."""
+    """Classes of labels: exact, or by similar spelling."""
 
     certain: Mapping[str, str]
     folded: Mapping[str, str]
@@ -105,8 +106,8 @@ class ClassNames(NamedTuple):
 def read_class_map(path: Path) -> dict[str, str]:
     """Read a table of labels and their classes.
 
-    Raise `DataError` if the file cannot be read, has something else than names of classes, or
-    names two for one label.
+    Raise `DataError` if the file cannot be read, has values other than class names, or two
+    classes for one label.
     """
     classes: dict[str, str] = {}
     for label, name in read_toml(path, "map", DataError).items():
@@ -122,13 +123,13 @@ def read_class_map(path: Path) -> dict[str, str]:
 
 
 def find_class_names(labels: Iterable[str], class_map: Mapping[str, str] | None) -> ClassNames:
-    """Find the classes that labels mean; without a map, any name may be that of a new one.
+    """Find the classes of labels; without a map, any valid name may be a new class.
 
     Parameters
     ----------
     class_map : mapping of str to str or None
-        As `read_class_map` returns it. With a map, only classes that it or hearthlog knows are
-        found for labels that are no names.
+        As `read_class_map` returns it. With a map, labels that are no valid names match only
+        classes of the map or of hearthlog.
     """
     given = class_map or {}
     classes = set(given.values())
@@ -145,14 +146,14 @@ def find_class_names(labels: Iterable[str], class_map: Mapping[str, str] | None)
 
 
 def _spelt(label: str) -> str:
-    """Return a label as it is compared: capitals and the width of blanks make no difference."""
+    """Return a label normalised for comparison: case-folded, with single blanks."""
     if len(label) > _LONGEST:
         return label
     return " ".join(unicodedata.normalize("NFC", label).casefold().split())
 
 
 def _folded(label: str) -> str:
-    """Return the name of a class that is spelt like a label; empty if there is none."""
+    """Return the class name with the spelling of a label; empty if there is none."""
     if len(label) > _LONGEST:
         return ""
     letters = unicodedata.normalize("NFD", _spelt(label).translate(_UMLAUTS))
@@ -165,7 +166,7 @@ def _folded(label: str) -> str:
 
 
 class ImportOptions(NamedTuple):
-    """How a label file is read."""
+    """Options for reading a label file."""
 
     microphone: str | None = None
     class_map: Mapping[str, str] | None = None
@@ -174,7 +175,7 @@ class ImportOptions(NamedTuple):
 
 
 class Folded(NamedTuple):
-    """A label that is no name of a class, the name that is spelt like it, and their number."""
+    """A label that is no class name, the class name with its spelling, and the label count."""
 
     label: str
     name: str
@@ -195,13 +196,12 @@ def import_labels(
     options: ImportOptions,
     agree: Callable[[Sequence[Folded]], None],
 ) -> Imported:
-    """Read a label file as marks that do not overlap, in the logs that cover them.
+    """Read a label file as non-overlapping marks, by covering log.
 
     Parameters
     ----------
     agree : callable
-        Is called once if labels are taken as names of classes that are only spelt like them; raises
-        if that is not wanted.
+        Called once if labels match class names only by spelling; raises to reject them.
 
     Raises
     ------
@@ -228,12 +228,12 @@ def import_labels(
 
 
 def read_lines(path: Path, coverage: Mapping[str, Coverage], microphone: str) -> list[PlacedMark]:
-    """Read a label file whose labels may overlap, and may lie where nothing was recorded.
+    """Read a label file with labels that may overlap and may lie outside of recorded time.
 
     Returns
     -------
     list of PlacedMark
-        In the order of the file, with their lines, or their places in a file that has none.
+        In the order of the file, with line numbers, or places in formats without lines.
 
     Raises
     ------
@@ -260,7 +260,7 @@ def _placed(
     left_out: SkippedLabels,
     moved: Counter[str],
 ) -> Iterator[PlacedMark]:
-    """Yield the labels of a file as marks, whose labels are those of the file."""
+    """Yield the labels of a file as marks, with unconverted labels."""
     for row in read_rows(path, options.choice):
         try:
             if isinstance(row, LineError):
@@ -278,7 +278,7 @@ def _placed(
 def _named(
     path: Path, placed: Iterable[PlacedMark], names: Mapping[str, str], left_out: SkippedLabels
 ) -> Iterator[PlacedMark]:
-    """Yield marks whose labels are classes."""
+    """Yield marks with class names as labels."""
     for each in placed:
         name = names.get(each.mark.label)
         if name is None:
@@ -293,7 +293,7 @@ def _heard(
     coverage: Mapping[str, Coverage],
     left_out: SkippedLabels,
 ) -> Iterator[PlacedMark]:
-    """Yield marks of what was recorded."""
+    """Yield the marks within recorded time."""
     for each in placed:
         mark = each.mark
         if coverage[mark.microphone].split(mark.start, mark.end):
@@ -318,10 +318,10 @@ def _unnamed(path: Path, placed: PlacedMark) -> LineError:
 def _without_overlaps(
     path: Path, placed: Iterable[PlacedMark], left_out: SkippedLabels
 ) -> Iterator[PlacedMark]:
-    """Yield marks by microphone and time, cut where one that starts earlier goes on.
+    """Yield marks by microphone and time, cut where an earlier mark still lasts.
 
-    One of which another class takes more than a frame, or all, is a loss. Of those that start and
-    end together the first in the file stays.
+    A mark that loses more than a frame, or all, to another class is skipped and reported. Of marks
+    with equal start and end, the first in the file is kept.
     """
     last: PlacedMark | None = None
     for each in sorted(placed, key=lambda each: each.mark[:3]):

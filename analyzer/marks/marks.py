@@ -1,4 +1,4 @@
-"""Marks of a reviewer and the time she reviewed, in a review layer beside the log."""
+"""Marks and reviewed spans in the review layer next to a log."""
 
 import re
 import tempfile
@@ -44,14 +44,14 @@ _KINDS = {
 }
 _SPAN = ("header.stamp", "duration")
 _ORIGIN = ("reviewer", "made", "corrects")
-# Of a row, behind its microphone, start and end.
+# Fields of a row after microphone, start and end.
 _OWN = {
     message_types.SEGMENT: ("label",),
     message_types.MARK: ("label", *_ORIGIN, "reason"),
     message_types.REVIEWED: (*_ORIGIN, "chosen"),
 }
 _FIELDS = {type_: (*_SPAN, *own) for type_, own in _OWN.items()}
-Key = tuple[str, str]  # a labelling, as `review`, and a type of messages
+Key = tuple[str, str]  # labelling, such as `review`, and message type
 Row = tuple[Any, ...]
 
 
@@ -61,14 +61,14 @@ def read_rows(path: Path) -> dict[Key, list[Row]]:
     Returns
     -------
     dict of (str, str) to list of tuple
-        By labelling and type: microphone, start and end in nanoseconds of UTC, and of a segment its
-        label; of a mark label, reviewer, made, corrects and reason; of a reviewed span reviewer,
-        made, corrects and chosen.
+        By labelling and type: microphone, start and end in nanoseconds of UTC; then label for
+        segments; label, reviewer, made, corrects and reason for marks; reviewer, made, corrects
+        and chosen for reviewed spans.
 
     Raises
     ------
     LogError
-        If it cannot be read, is damaged or cut off, or holds other topics.
+        If the layer cannot be read, is damaged or cut off, or holds other topics.
     """
     with LogFile(path) as file:
         complete = file.complete
@@ -92,7 +92,7 @@ def read_rows(path: Path) -> dict[Key, list[Row]]:
 
 
 def layer_bytes(name: str, spans: Mapping[Key, Sequence[Any]], metadata: dict[str, str]) -> bytes:
-    """Return the content of a review layer."""
+    """Return the file content of a review layer."""
     batches = [
         (
             Topic(labelling_topic(microphone, labelling, _KINDS[type_]), type_),
@@ -101,7 +101,7 @@ def layer_bytes(name: str, spans: Mapping[Key, Sequence[Any]], metadata: dict[st
         for (labelling, type_), same in spans.items()
         for microphone in sorted({span.microphone for span in same})
     ]
-    # In another folder, where nobody takes it for a log being recorded.
+    # In another folder, where no reader mistakes the file for an active log.
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
         writer = LogWriter(Path(folder) / name, [topic for topic, _ in batches], metadata)
         writer.write_columns([_batch(*batch) for batch in batches])
@@ -132,13 +132,13 @@ def _batch(topic: Topic, spans: Sequence[Any]) -> TopicBatch:
     return TopicBatch(topic.name, ends, fields)
 
 
-LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
-PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
-PERSON, QUEUE, RANDOM = CHOICES = ("person", "queue", "random")  # how a reviewed span was chosen
+LATEST = (1 << 31) * NANOSECONDS - 1  # maximum of builtin_interfaces/Time
+PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer or a labelling
+PERSON, QUEUE, RANDOM = CHOICES = ("person", "queue", "random")  # how a reviewed span was selected
 
 
 class Mark(NamedTuple):
-    """The label of a span of time by a reviewer.
+    """A reviewer's label of a span of time.
 
     Attributes
     ----------
@@ -149,11 +149,11 @@ class Mark(NamedTuple):
     reviewer : str
         Empty if unknown.
     made : int
-        When the mark was made, in nanoseconds of UTC; 0 if unknown.
+        Time at which the mark was made, in nanoseconds of UTC; 0 if unknown.
     corrects : str
-        The labelling that it corrects: `live`, or the name of a model; empty if unknown.
+        The corrected labelling: `live`, or the name of a model; empty if unknown.
     reason : str
-        Of a mark that was made with others, such as `group 3 of 5b4e0d1c`; else empty.
+        Origin of a mark made as part of a group, such as `group 3 of 5b4e0d1c`; else empty.
     """
 
     microphone: str
@@ -175,17 +175,17 @@ class MarkedSpan(NamedTuple):
 
 
 class ReviewedSpan(NamedTuple):
-    """A span that a reviewer has looked at: what is not marked in it was labelled rightly.
+    """A span that a reviewer has checked: labels without a mark in it are correct.
 
     Attributes
     ----------
     reviewer : str
         Empty if unknown.
     made : int
-        When it was looked at, in nanoseconds of UTC; 0 if unknown.
+        Time of the review, in nanoseconds of UTC; 0 if unknown.
     chosen : str
-        How the span was chosen: `person`, `queue`, or `random`. What was drawn at random is kept to
-        measure how right labels are, and not learned from.
+        How the span was selected: `person`, `queue`, or `random`. Random spans are reserved to
+        measure label accuracy, and not used for training.
     """
 
     microphone: str
@@ -198,20 +198,20 @@ class ReviewedSpan(NamedTuple):
 
 
 class Reviewed(NamedTuple):
-    """What reviewers have said of a log, or of one of its scenarios."""
+    """Marks and reviewed spans of a log, or of one of its scenarios."""
 
     marks: list[Mark]
     reviewed: list[ReviewedSpan]
 
 
 def read_review(log: Path) -> dict[str, Reviewed]:
-    """Read all that reviewers have said of a log.
+    """Read all marks and reviewed spans of a log.
 
     Returns
     -------
     dict of str to Reviewed
-        By the name of the scenario, of the sounds of the home by an empty one; empty if there is no
-        review layer.
+        By scenario, with an empty name for the sounds of the home; empty if there is no review
+        layer.
 
     Raises
     ------
@@ -229,7 +229,7 @@ def read_marks(log: Path, scenario: str = "") -> list[Mark]:
     ----------
     log : Path
     scenario : str, optional
-        The marks of this scenario, by its name, instead of those of the sounds of the home.
+        Name of a scenario, to read its marks instead of those of the sounds of the home.
 
     Returns
     -------
@@ -239,13 +239,13 @@ def read_marks(log: Path, scenario: str = "") -> list[Mark]:
     Raises
     ------
     LogError
-        As of `read_review`.
+        As `read_review` does.
     """
     return read_review(log).get(scenario, _NOTHING).marks.copy()
 
 
 def read_reviewed(log: Path, scenario: str = "") -> list[ReviewedSpan]:
-    """Read the spans of a log that a reviewer has looked at.
+    """Read the reviewed spans of a log.
 
     Returns
     -------
@@ -255,7 +255,7 @@ def read_reviewed(log: Path, scenario: str = "") -> list[ReviewedSpan]:
     Raises
     ------
     LogError
-        As of `read_review`.
+        As `read_review` does.
     """
     return read_review(log).get(scenario, _NOTHING).reviewed.copy()
 
@@ -264,7 +264,7 @@ _NOTHING = Reviewed([], [])
 
 
 def _read_layer(path: Path) -> dict[str, Reviewed]:
-    """Read a layer; if another process replaces it meanwhile, read again, and it may be gone."""
+    """Read a layer; retry if another process replaces it meanwhile, empty if it is gone."""
     while (before := _identity(path)) is not None:
         try:
             rows = read_rows(path)
@@ -279,7 +279,7 @@ def _read_layer(path: Path) -> dict[str, Reviewed]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what differs between two files of one name; None if there is no file."""
+    """Return inode and modification time of a file, to detect replacement; None if missing."""
     try:
         status = path.stat()
     except OSError:
@@ -288,7 +288,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _reviewed(path: Path, rows: Mapping[Key, Sequence[Row]], scenario: str) -> Reviewed:
-    """Take what is said of a scenario out of a layer, and check it."""
+    """Extract and check the marks and reviewed spans of a scenario."""
 
     def of_type(type_: str) -> Sequence[Row]:
         return rows.get((review_labelling(scenario), type_), ())
@@ -313,22 +313,22 @@ def write_marks(  # noqa: PLR0913
     not_reviewed: Iterable[ReviewedSpan] = (),
     scenario: str = "",
 ) -> Path:
-    """Add marks to the review layer of a log; where they overlap older marks, they replace these.
+    """Add marks to the review layer of a log; they replace overlapping older marks.
 
-    The layer is replaced in one step. Processes that write to the same folder wait for each other.
-    Marks of a scenario, and those of the sounds of the home, leave each other as they are.
+    The layer is replaced atomically. Concurrent writers to the same folder wait for each other.
+    Marks of other scenarios, or of the sounds of the home, are kept.
 
     Parameters
     ----------
     deleted : iterable of MarkedSpan
-        Where older marks are deleted, or cut off; before the new marks are added.
+        Spans in which older marks are deleted or cut, before the new marks are added.
     not_reviewed : iterable of ReviewedSpan
-        Spans of the layer that are taken out of it, before those are added.
+        Reviewed spans to remove from the layer, before `reviewed` is added.
 
     Returns
     -------
     Path
-        The layer; without marks and reviewed spans there is no such file.
+        The layer; without marks and reviewed spans the file does not exist.
 
     Raises
     ------
@@ -371,7 +371,7 @@ def _by_topic(layer: Mapping[str, Reviewed]) -> dict[Key, Sequence[Mark | Review
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Keep other writers of review layers out of the folder."""
+    """Lock the folder against other writers of review layers."""
     with ExitStack() as stack:
         try:
             stack.enter_context(locked_folder(path.parent))
@@ -381,7 +381,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _checked(marks: Iterable[Mark]) -> list[Mark]:
-    """Sort marks; raise DataError if one is invalid."""
+    """Return sorted marks; raise DataError if a mark is invalid."""
     ordered = sorted(marks)
     for mark in ordered:
         _check(mark, "mark")
@@ -394,7 +394,7 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
 
 
 def _checked_reviewed(spans: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:
-    """Sort reviewed spans; raise DataError if one is invalid."""
+    """Return sorted reviewed spans; raise DataError if a span is invalid."""
     ordered = sorted(set(spans))
     for span in ordered:
         _check(span, "review")
@@ -414,7 +414,7 @@ def _check(span: Mark | ReviewedSpan, what: str) -> None:
 
 
 def _subtract(old: Sequence[Mark], new: Sequence[Mark | MarkedSpan]) -> Iterator[Mark]:
-    """Yield what is left of old marks outside of new ones."""
+    """Yield the parts of old marks outside of new ones."""
     for microphone in {mark.microphone for mark in old}:
         own = [mark for mark in new if mark.microphone == microphone]
         starts, ends = [mark.start for mark in own], [mark.end for mark in own]
@@ -438,10 +438,10 @@ def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]
 
 
 def new_marks(marks: Iterable[Mark], existing: Sequence[Mark]) -> list[Mark]:
-    """Return the marks that are not among existing ones, up to 1 ms of rounding of their times.
+    """Return the marks that do not exist yet, comparing times to within 1 ms.
 
-    A mark without reviewer, time or labelling equals one that has them: so a file that has no
-    place for them does not make marks anonymous, nor one with rounded times move them.
+    A mark without reviewer, time or labelling equals an existing mark with them: importing a file
+    without these fields does not remove them, and rounded times do not move marks.
     """
     ordered = sorted(existing)
     keys = [mark[:2] for mark in ordered]

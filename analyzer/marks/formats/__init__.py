@@ -1,1 +1,1 @@
-"""Label files of other programs, read as marks and written from marks: a module for each format."""
+"""Label file formats of other programs, one module each, read and written as marks."""

@@ -1,4 +1,4 @@
-"""ELAN: a tier for each microphone and reviewer, and tiers below it for the other fields of marks.
+"""ELAN codec: one tier per microphone and reviewer, with dependent tiers for other mark fields.
 
 Times in ELAN are whole milliseconds.
 """
@@ -32,11 +32,11 @@ from hearthlog.schemas.errors import listed
 from hearthlog.schemas.frames import seconds_text, time_text
 
 _MILLISECOND = 1_000_000  # ns
-_START = "hearthlog:start"  # the property that says when the document begins
-_MARKS = "marks"  # a type of tiers, as these two
+_START = "hearthlog:start"  # property with the start time of the document
+_MARKS = "marks"  # tier type, as are the names in `_ORIGIN`
 _ORIGIN = ("made", "corrects")
-_DEEPEST = 20  # elements within elements; ELAN has 5
-_ENDLESS = re.compile(r"<[^<>]{65536}")  # a tag that would take the parser minutes
+_DEEPEST = 20  # maximum nesting of elements; ELAN has 5
+_ENDLESS = re.compile(r"<[^<>]{65536}")  # a tag that would keep the parser busy for minutes
 _SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
 _INSTANCE = "http://www.w3.org/2001/XMLSchema-instance"
 _NO_XML = dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), "\N{REPLACEMENT CHARACTER}")
@@ -45,17 +45,17 @@ _NO_XML = dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), "\N{REPLACEMEN
 class _Annotation(NamedTuple):
     line: int
     tier: Mapping[str, str]
-    start: str  # a time slot
+    start: str  # time slot
     end: str
     label: str
 
 
 class _Wrong(Exception):  # noqa: N818
-    """An error in XML that is well-formed, but no document of ELAN."""
+    """Well-formed XML that is no ELAN document."""
 
 
 class _Document(ContentHandler):
-    """Gathers the times and labels of some tiers of a document; without any, of the top ones."""
+    """Collects the times and labels of the chosen tiers, by default of the top tiers."""
 
     def __init__(self, chosen: Sequence[str]) -> None:
         super().__init__()
@@ -68,17 +68,17 @@ class _Document(ContentHandler):
         self._locator: Locator | None = None
         self._depth = 0
         self._tier: dict[str, str] = {}
-        self._open: dict[str, str] = {}  # the annotation or the property that is being read
+        self._open: dict[str, str] = {}  # current annotation or property
         self._line = 0
         self._text: list[str] = []
 
     @property
     def line(self) -> int:
-        """The line that is being read."""
+        """Current line number."""
         return (self._locator.getLineNumber() if self._locator else None) or 1
 
     def setDocumentLocator(self, locator: Locator) -> None:  # noqa: N802
-        """Keep the locator, which knows the line."""
+        """Store the locator, for line numbers."""
         self._locator = locator
 
     def startElement(self, name: str, attrs: AttributesImpl) -> None:  # noqa: N802
@@ -130,10 +130,10 @@ class _Document(ContentHandler):
 
 
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
-    """Yield the annotations that have a time of their own, of some tiers or of the top ones.
+    """Yield the time-aligned annotations of the chosen tiers, by default of the top tiers.
 
-    Raise `DataError` if the text is not XML, declares a DTD, is no document of ELAN, has times
-    in another unit or a recording with an offset, or has no such tier.
+    Raise `DataError` if the text is not XML, declares a DTD, is no ELAN document, has times
+    in another unit or a recording with an offset, or lacks a chosen tier.
     """
     document = _Document(choice.tiers)
     endless = _ENDLESS.search(text)
@@ -142,7 +142,7 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
         raise DataError(f"{path}:{line}: is no document of ELAN")
     try:
         source = InputSource()
-        source.setCharacterStream(StringIO(text))  # decoded, so that no declaration counts
+        source.setCharacterStream(StringIO(text))  # decoded, so declarations are ignored
         parse(source, document, forbid_dtd=True)
     except SAXParseException as error:
         line = error.getLineNumber() or 1
@@ -188,7 +188,7 @@ def _seconds(path: Path, annotation: _Annotation, milliseconds: str | None) -> s
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a document whose times begin with the first frame of all its microphones.
+    """Return an ELAN document with times since the first frame of any of its microphones.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
 
 def _in_milliseconds(marks: Sequence[Mark], zero: int) -> list[tuple[int, int]]:
-    """Round spans; none becomes empty, and none overlaps the next one of its microphone."""
+    """Round spans to milliseconds, without empty spans or overlaps within a microphone."""
     spans = [(0, 0)] * len(marks)
     last: dict[str, int] = {}
     for i in sorted(range(len(marks)), key=marks.__getitem__):
@@ -239,7 +239,7 @@ def _in_milliseconds(marks: Sequence[Mark], zero: int) -> list[tuple[int, int]]:
 
 
 def _add_slots(root: ET.Element, spans: Sequence[tuple[int, int]]) -> None:
-    """Add the time slots, two for each annotation, in the order of time."""
+    """Add the time slots, two for each annotation, in order of time."""
     order = ET.SubElement(root, "TIME_ORDER")
     slots = [(start, f"ts{2 * i}") for i, (start, _) in enumerate(spans, 1)]
     slots += [(end, f"ts{2 * i + 1}") for i, (_, end) in enumerate(spans, 1)]
@@ -248,7 +248,7 @@ def _add_slots(root: ET.Element, spans: Sequence[tuple[int, int]]) -> None:
 
 
 def _add_tiers(root: ET.Element, marks: Sequence[Mark]) -> list[str]:
-    """Add the tiers; return the types of those below others."""
+    """Add the tiers; return the types of the dependent ones."""
     kinds: list[str] = []
     identity = len(marks)
     for microphone, reviewer in sorted({(mark.microphone, mark.reviewer) for mark in marks}):

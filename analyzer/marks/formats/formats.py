@@ -1,6 +1,6 @@
-"""The formats of label files: the one table that readers, writers and the command line use.
+"""Table of label file formats, used by readers, writers and the command line.
 
-A format is a `LabelCodec` in the `CODECS` of a module of this folder, and a row of its name here.
+A format is a `LabelCodec` in the `CODECS` of a module in this folder, and a row in this table.
 """
 
 from pathlib import Path
@@ -14,16 +14,16 @@ _MEGABYTE = 1 << 20
 class LabelFormat(NamedTuple):
     """A format of label files."""
 
-    name: str  # of the program, or of the format
+    name: str  # of the program or the format
     suffix: str
     module: str
     size_limit: int = 16 * _MEGABYTE  # enough for a hundred thousand labels
-    has_columns: bool = False  # that may be chosen
+    has_columns: bool = False  # whether columns can be chosen
     has_tiers: bool = False
 
     @property
     def pattern(self) -> str:
-        """How its files are named, and what they are: `*.eaf (ELAN)`."""
+        """File name pattern with the program name: `*.eaf (ELAN)`."""
         named = self.suffix == f".{self.name.lower()}"
         return f"*{self.suffix}" if named else f"*{self.suffix} ({self.name})"
 
@@ -34,7 +34,7 @@ FORMATS = (
     AUDACITY,
     RAVEN,
     LabelFormat("CSV", ".csv", "tables", has_columns=True),
-    # XML takes more for as many labels.
+    # XML needs more bytes for the same number of labels.
     LabelFormat("ELAN", ".eaf", "elan", 64 * _MEGABYTE, has_tiers=True),
     LabelFormat("Label Studio", ".json", "labelstudio"),
     LabelFormat("RTTM", ".rttm", "tables"),
@@ -43,6 +43,6 @@ PATTERNS = listed([each.pattern for each in FORMATS])
 
 
 def find_format(path: Path) -> LabelFormat | None:
-    """Return the format of a file by the end of its name; None if it is none of `FORMATS`."""
+    """Return the format of a file by its suffix; None if it is not in `FORMATS`."""
     fitting = [each for each in FORMATS if path.name.endswith(each.suffix)]
     return max(fitting, key=lambda each: len(each.suffix), default=None)

@@ -1,4 +1,4 @@
-"""Labels of a label file, the marks they become, and errors of those that are skipped."""
+"""Labels of a label file, their conversion to marks, and errors of skipped labels."""
 
 import re
 from collections import Counter
@@ -19,17 +19,17 @@ OTHER = "label"
 
 
 def place_text(path: Path, place: int | str) -> str:
-    """Write the place of a label for an error: `file:line`, or `file: place`."""
+    """Format the place of a label for an error: `file:line`, or `file: place`."""
     return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
 
 
 class LineError(DataError):
-    """A label of a file that cannot be a mark.
+    """A label of a file that cannot become a mark.
 
     Parameters
     ----------
     alike : str, optional
-        What labels of the kind must have in common to be counted together.
+        Key under which labels of the same kind are counted together.
     """
 
     def __init__(self, where: str, kind: str, reason: str, alike: str = "") -> None:
@@ -39,12 +39,12 @@ class LineError(DataError):
 
 
 class SkippedLabels:
-    """Labels of a file that are left out: how many of each kind, and the first of them.
+    """Skipped labels of a file: the number and the first of each kind.
 
     Parameters
     ----------
     strict : bool
-        Whether none may be left out.
+        Whether to raise an error instead of skipping.
     """
 
     def __init__(self, *, strict: bool) -> None:
@@ -53,10 +53,7 @@ class SkippedLabels:
         self._first: dict[tuple[str, str], LineError] = {}
 
     def add(self, error: LineError) -> None:
-        """Leave out a label.
-
-        Raise `LineError` if none may be left out.
-        """
+        """Skip a label; raise its `LineError` if strict."""
         if self._strict:
             raise error
         key = error.kind, error.alike
@@ -64,26 +61,26 @@ class SkippedLabels:
         self._first.setdefault(key, error)
 
     def kinds(self) -> Iterator[tuple[int, LineError]]:
-        """Yield how many there are of each kind, and the first; the most first."""
+        """Yield the count and the first error of each kind, most frequent first."""
         for key, count in self._counts.most_common():
             yield count, self._first[key]
 
 
 _SECONDS = re.compile(r"[-+]?([0-9]{1,10}(\.[0-9]{0,18})?|\.[0-9]{1,18})([eE][-+]?[0-9]{1,2})?")
 _DECIMAL_COMMA = re.compile(r"([-+]?[0-9]*),([0-9]+([eE][-+]?[0-9]{1,2})?)")
-_LENGTH_TOLERANCE = NANOSECONDS  # between a labelled recording and the logs of it
-_SHOWN = 64  # characters of a text
+_LENGTH_TOLERANCE = NANOSECONDS  # between a labelled recording and its logs
+_SHOWN = 64  # characters of a text in an error
 
 
 class FileLabel(NamedTuple):
-    """A label as it is in a file: text, empty where the file has none.
+    """A label as in the file: texts, empty if missing.
 
     Attributes
     ----------
     start, end : str
         Seconds since `zero`, or ISO 8601.
     made : str
-        When the label was made, ISO 8601.
+        Time at which the label was made, ISO 8601.
     zero : str
         ISO 8601; by default the first frame of the microphone.
     length : str
@@ -103,12 +100,12 @@ class FileLabel(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What of a file is read, where it has more than one thing that may be labels.
+    """Parts of a file to read as labels, if there are several.
 
     Attributes
     ----------
     tiers : sequence of str
-        Of ELAN; empty for all.
+        ELAN tiers; empty for all top tiers.
     """
 
     tiers: Sequence[str] = ()
@@ -116,7 +113,7 @@ class Choice(NamedTuple):
 
 
 class LabelCodec(NamedTuple):
-    """The functions of a format.
+    """Reader and writer of a format.
 
     Attributes
     ----------
@@ -125,9 +122,9 @@ class LabelCodec(NamedTuple):
         `Choice`; a `LineError` for a line that is no label. Raises `DataError`, with file and
         place, if the text is not of this format.
     write : callable
-        Returns the text of a file that `read` reads again, from its path (for messages), at least
-        one mark, and the coverage of all of their microphones. Raises `DataError` if the format
-        has no place for several microphones.
+        Returns the text of a file that `read` can read, from its path (for messages), at least
+        one mark, and the coverage of all their microphones. Raises `DataError` if the format
+        supports only one microphone.
     """
 
     read: Callable[[Path, str, Choice], Iterator[FileLabel | LineError]]
@@ -135,7 +132,7 @@ class LabelCodec(NamedTuple):
 
 
 class PlacedMark(NamedTuple):
-    """A mark, and its line or place in the file."""
+    """A mark with its line or place in the file."""
 
     place: int | str
     mark: Mark
@@ -144,19 +141,19 @@ class PlacedMark(NamedTuple):
 def make_mark(
     path: Path, label: FileLabel, coverage: Mapping[str, Coverage], microphone: str | None
 ) -> PlacedMark:
-    """Make a mark of a label in a file.
+    """Convert a label of a file to a mark.
 
     Parameters
     ----------
     microphone : str or None
-        The microphone of a label that names none; not needed if there is only one.
+        Microphone of labels that name none; not needed if there is only one.
 
     Raises
     ------
     LineError
         With file and place, if the microphone is not in the logs or must be named, if a time or a
         name is invalid, if the label is empty or a point, ends before it starts or starts before
-        the first frame, or if it is of a recording of another length.
+        the first frame, or if the labelled recording has another length.
     """
     where = place_text(path, label.place)
     if not label.label:
@@ -183,18 +180,18 @@ def make_mark(
 
 
 def is_seconds(text: str) -> bool:
-    """Tell whether a text is a number of seconds that can be read."""
+    """Whether a text is a valid number of seconds."""
     return _SECONDS.fullmatch(text) is not None
 
 
 def with_point(number: str) -> str:
-    """Return a number that has a decimal comma with a point; any other text as it is."""
+    """Replace the decimal comma of a number with a point; other texts are returned unchanged."""
     comma = _DECIMAL_COMMA.fullmatch(number)
     return f"{comma[1]}.{comma[2]}" if comma else number
 
 
 def add_seconds(where: str, start: str, duration: str) -> str:
-    """Return the end of a label of which start and duration are known.
+    """Return the end of a label from its start and duration.
 
     Parameters
     ----------
@@ -204,7 +201,7 @@ def add_seconds(where: str, start: str, duration: str) -> str:
     Raises
     ------
     LineError
-        If one is no number, or has more than 10 digits before the point or 18 behind it.
+        If a value is no number, or has more than 10 digits before the point or 18 after it.
     """
     return f"{_seconds(where, start) + _seconds(where, duration):f}"
 
@@ -216,7 +213,7 @@ def _seconds(where: str, text: str) -> Decimal:
 
 
 def made_text(mark: Mark) -> str:
-    """Write the time at which a mark was made in ISO 8601; empty if it is unknown."""
+    """Return the time at which a mark was made in ISO 8601; empty if unknown."""
     return time_text(mark.made) if mark.made else ""
 
 
@@ -238,7 +235,7 @@ def _zero(where: str, label: FileLabel, coverage: Coverage) -> int:
 
 
 def _origin(where: str, label: FileLabel) -> tuple[str, int, str]:
-    """Return the reviewer, when the label was made, and the labelling that it corrects."""
+    """Return the reviewer, the time of the label, and the corrected labelling."""
     reviewer, corrects = label.reviewer.strip(), label.corrects.strip()
     for text in (reviewer, corrects):
         if not PERSON_NAME.fullmatch(text):
@@ -251,7 +248,7 @@ def _origin(where: str, label: FileLabel) -> tuple[str, int, str]:
 
 
 def _time(where: str, text: str, zero: int) -> int:
-    """Read seconds since `zero`, or ISO 8601, in nanoseconds of UTC."""
+    """Parse seconds since `zero`, or ISO 8601, to nanoseconds of UTC."""
     if _SECONDS.fullmatch(text):
         return zero + round(Decimal(text) * NANOSECONDS)
     try:

@@ -1,4 +1,4 @@
-"""Tasks of Label Studio: one for each microphone, with an item for each mark."""
+"""Label Studio codec: one task per microphone, with one item per mark."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +25,12 @@ _NO_TASK = "unreadable task"
 
 
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
-    """Yield the items of a file that Label Studio exports as JSON, or that it would import.
+    """Yield the items of a Label Studio JSON export or import file.
 
     Yields
     ------
     FileLabel or LineError
-        In the order of the file; also an error for what is no task.
+        In the order of the file; an error for each entry that is no task.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
         If the text is not JSON.
     """
     try:
-        # Numbers stay text: nothing is lost, and none is too long.
+        # Numbers stay text, so that no digits are lost and no length is too large.
         tasks = json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: is not JSON ({error})") from error
@@ -52,7 +52,7 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a task for each microphone.
+    """Return Label Studio tasks, one per microphone.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def _task(microphone: str, marks: Sequence[Mark], coverage: Coverage) -> str:
 
 
 def _item(number: int, mark: Mark, zero: int, length: str) -> str:
-    """Write an item; its times in pieces, for `json` would round them."""
+    """Format an item; times are inserted as text, because `json` would round them."""
     origin = {"reviewer": mark.reviewer, "made": made_text(mark), "corrects": mark.corrects}
     item = {
         "id": f"mark{number}",
@@ -93,7 +93,7 @@ def _item(number: int, mark: Mark, zero: int, length: str) -> str:
 
 
 def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLabel | LineError]:
-    """Yield the annotated items of a task; the predicted ones if it has no annotations."""
+    """Yield the items of a task's annotations; of its predictions if it has no annotations."""
     kind = next((kind for kind in ("annotations", "predictions") if kind in task), None)
     if kind is None or not isinstance(task[kind], list):
         reason = "has no annotations and no predictions"
@@ -122,7 +122,7 @@ def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLa
 
 
 def _of_item(path: Path, place: str, item: Any) -> FileLabel | LineError | None:
-    """Read an item; None for one without a label (a rating, a remark, a relation)."""
+    """Parse an item; None for one without a label (a rating, a remark, a relation)."""
     kind = item.get("type") if isinstance(item, dict) else None
     if not isinstance(kind, str) or not kind.endswith(_TYPE):
         return None
@@ -149,7 +149,7 @@ def _of_item(path: Path, place: str, item: Any) -> FileLabel | LineError | None:
 
 
 def _completed(annotation: Mapping[str, Any]) -> tuple[str, str]:
-    """Return who made an annotation, and when."""
+    """Return author and time of an annotation."""
     by = annotation.get("completed_by")
     if isinstance(by, dict):
         reviewer = _text(by.get("email")) or _text(by.get("id"))

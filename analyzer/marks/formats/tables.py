@@ -1,4 +1,4 @@
-"""Label files of one line a label: CSV, Raven, Audacity and RTTM."""
+"""Label files with one line per label: CSV, Raven, Audacity and RTTM."""
 
 import csv
 import io
@@ -38,33 +38,33 @@ _NAMES: Mapping[str, Sequence[str]] = {
 COLUMNS = tuple(_NAMES)
 _TEXTS = set(COLUMNS[3:])
 _NUMBERS = ("start", "end", "duration")
-_SELECTION = "selection"  # a number, in tables of Raven
+_SELECTION = "selection"  # row number, in tables of Raven
 _UNIT = re.compile(r"(\((s|sec)\)|\[(s|sec)\])$")
 
 
 def is_table(text: str) -> bool:
-    """Tell whether the first line of a text names the columns of a table."""
+    """Whether the first line of a text has the column names of a table."""
     names = {_plain(name) for name in _first_line(text).split("\t")}
     start, end, duration = (names.intersection(_NAMES[field]) for field in _NUMBERS)
     return bool(start and (end or duration))
 
 
 def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
-    """Yield the rows of a table, each once: Raven may list it for every view and channel.
+    """Yield the rows of a table without duplicates, as Raven may repeat them per view and channel.
 
-    Fields are separated by tabs, semicolons or commas: by what the first line has most of. Unless
-    it is commas, numbers may have decimal commas.
+    The field separator is the most frequent of tab, semicolon and comma in the first line. Unless
+    it is the comma, numbers may have decimal commas.
 
     Parameters
     ----------
     choice : Choice
-        Its columns, by their names, or by their numbers from 1 if the first line has no names.
+        Columns by name, or by number from 1 if the first line has no names.
 
     Raises
     ------
     DataError
-        If columns that are needed are not found, if several may be one of them, or if the text has
-        too many lines or too long ones.
+        If required columns are missing or ambiguous, or if the text has too many or too long
+        lines.
     """
     first = _first_line(text)
     delimiter = max("\t;,", key=first.count)
@@ -91,7 +91,7 @@ def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | Li
             yield LineError(where, UNREADABLE, reason)
             continue
         row = {
-            name: values[i] if i < len(values) else ""  # empty ones may be missing at the end
+            name: values[i] if i < len(values) else ""  # trailing empty fields may be missing
             for name, i in columns.items()
         }
         if _SELECTION in row:
@@ -119,7 +119,7 @@ def _label(
 def _find(
     where: str, names: Sequence[str], chosen: Mapping[str, str], *, named: bool
 ) -> dict[str, int]:
-    """Return the column of each field of a label that the table has."""
+    """Return the column number of each label field in the table."""
     plain = [_plain(name) for name in names]
     unknown = [name for name in chosen.values() if _plain(name) not in plain]
     if unknown:
@@ -158,7 +158,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return the name of a column without capitals, underscores and unit."""
+    """Return a column name in lower case, without underscores and unit."""
     return _UNIT.sub("", name.strip().casefold().replace("_", " ")).rstrip()
 
 
@@ -170,7 +170,7 @@ _CSV_COLUMNS = ("start", "end", "label", "microphone", "reviewer", "made", "corr
 
 
 def write_csv(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a table with all fields of the marks.
+    """Return a CSV table with all fields of the marks.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def write_csv(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage
     Returns
     -------
     str
-        The text of the file; an apostrophe stands before what a spreadsheet would run.
+        The text of the file; spreadsheet formulas are disarmed with an apostrophe.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -193,7 +193,7 @@ def write_csv(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage
     return text.getvalue()
 
 
-_BAND = ("0.000", "8000.000")  # Hz, of sound at 16 kHz
+_BAND = ("0.000", "8000.000")  # Hz, for sound at 16 kHz
 _RAVEN_COLUMNS = (
     "Selection",
     "View",
@@ -211,7 +211,7 @@ _RAVEN_COLUMNS = (
 
 
 def write_raven(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a table with columns for all fields of the marks, which Raven keeps.
+    """Return a Raven table with all fields of the marks as columns, which Raven preserves.
 
     Parameters
     ----------
@@ -240,12 +240,12 @@ def write_raven(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Covera
 
 
 def read_audacity(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
-    """Yield the labels of a track, whose times may have decimal commas.
+    """Yield the labels of an Audacity label track; times may have decimal commas.
 
     Raise `DataError` if the text has too many lines.
     """
     for number, line in numbered_lines(path, text):
-        if line.startswith("\\"):  # the pitch of a spectral selection
+        if line.startswith("\\"):  # frequencies of a spectral selection
             continue
         start, end, label, *_ = [*(field.strip() for field in line.split("\t")), "", ""]
         if not end:
@@ -256,7 +256,7 @@ def read_audacity(path: Path, text: str, choice: Choice) -> Iterator[FileLabel |
 
 
 def write_audacity(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
-    """Write a track, which has no place for microphones and reviewers.
+    """Return an Audacity label track, which has no fields for microphones and reviewers.
 
     Parameters
     ----------
@@ -282,11 +282,11 @@ def write_audacity(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Cov
 
 
 _SPEAKER = "SPEAKER"
-_FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
+_FIELDS = 9, 10  # the last field, lookahead of a system, was added later
 
 
 def read_rttm(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
-    """Yield the labels; lines of other types, and comments, are left out.
+    """Yield the labels; lines of other types, and comments, are skipped.
 
     Raise `DataError` if the text has too many lines.
     """
@@ -307,7 +307,7 @@ def read_rttm(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | Lin
 
 
 def write_rttm(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a line for each mark.
+    """Return RTTM text with one line per mark.
 
     Parameters
     ----------
