@@ -1,1 +1,1 @@
-"""The sounds that recur in a home: found, described, grouped, and named by a person."""
+"""Discovery of recurring sounds and voices in a home."""

@@ -1,4 +1,4 @@
-"""Groups of alike sounds: descriptors of sounds, clusters among them, and the file of groups."""
+"""Groups of similar sounds: descriptors, clusters, and the groups file."""
 
 import fcntl
 import hashlib
@@ -24,38 +24,38 @@ from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 from hearthlog.schemas.new_files import open_lock, replaced_file
 
-LEAST = 8  # sounds of a group, by default
-MOST_GROUPS = 1_000  # in a file
+LEAST = 8  # default minimum of sounds per group
+MOST_GROUPS = 1_000  # per file
 MOST_DIMENSIONS = 16
-_CLOSE = 3  # neighbours by which a density is judged
-MOST_EXAMPLES = 200  # that are kept of a group
-_FEWEST_EMBEDDED = 16  # sounds, of which a space is made
+_CLOSE = 3  # neighbours of a density estimate
+MOST_EXAMPLES = 200  # kept per group
+_FEWEST_EMBEDDED = 16  # sounds needed to build an embedding space
 _LARGEST_CLUSTER = (
-    0.75  # of the sounds: a cluster of more is several things, and what is between them
+    0.75  # of the sounds: a larger cluster merges several things and the gaps between them
 )
-_RADIUS = 95  # percentile of the distances of its examples to the next one
-_LEAST_RADIUS = 1e-6  # of sounds that are all the same
+_RADIUS = 95  # percentile of the distances from examples to their nearest example
+_LEAST_RADIUS = 1e-6  # for groups of identical sounds
 _AT_ONCE = 1024  # points
-_ROUNDING = 1e-9  # of squares of distances that are computed by products
+_ROUNDING = 1e-9  # error of squared distances computed by matrix products
 NO_GROUP = -1
 
 
 @dataclass(frozen=True)
 class Space:
-    """A space in which sounds lie, and examples of groups there.
+    """A descriptor space with examples of groups.
 
     Attributes
     ----------
     mean, scale : np.ndarray [shape=(width,)], float64
-        Of the descriptors that the space was made of.
+        Of the descriptors the space was fitted on.
     axes : np.ndarray [shape=(d, width)], float64
-        Their principal axes.
+        Principal axes of the descriptors.
     examples : np.ndarray [shape=(k, d)], float64
-        Points of sounds of the groups.
+        Points of example sounds.
     of : np.ndarray [shape=(k,)], int64
-        The row of the group of each example, ascending.
+        Group row of each example, ascending.
     radii : np.ndarray [shape=(g,)], float64
-        A sound within this distance of an example is of the group.
+        A sound within this distance of an example belongs to the group.
     """
 
     mean: Float64
@@ -66,13 +66,13 @@ class Space:
     radii: Float64
 
     def points(self, descriptors: Float32) -> Float64:
-        """Return where described sounds lie, shape (n, d)."""
+        """Return the points of descriptors, shape (n, d)."""
         return ((descriptors - self.mean) / self.scale) @ self.axes.T
 
     def find(self, points: Float64) -> Int64:
-        """Return the row of the group of each point; `NO_GROUP` for one that is of none.
+        """Return the group row of each point; `NO_GROUP` for a point without a group.
 
-        Of several groups it is that to whose examples a point is nearest, by their radii.
+        If several groups match, the nearest example relative to the group's radius decides.
         """
         examples = [self.examples[self.of == row] for row in range(len(self.radii))]
         nearest, found = np.full(len(points), np.inf), np.full(len(points), NO_GROUP)
@@ -91,20 +91,20 @@ _Space = TypeVar("_Space", bound=Space)
 
 @dataclass(frozen=True)
 class Groups(Space):
-    """Groups, and the spaces in which they lie: by features, and with what a network hears, too.
+    """Groups in two spaces: features alone, and features with embeddings.
 
-    A group has examples in both, or in the one of features alone.
+    A group has examples in both spaces, or in the feature space alone.
 
     Attributes
     ----------
     numbers : np.ndarray [shape=(g,)], int64
-        Of the groups; a number is never used again.
+        Group numbers, never reused.
     names : list of str
-        Classes that a person named groups; empty where nobody did.
+        Classes assigned by a person; empty for unnamed groups.
     id : str
-        What no other groups have: of which file a mark has its group.
+        Unique id of these groups; identifies the groups file that a mark refers to.
     embedding : EmbeddingSpace or None
-        Of the embeddings that sounds are described by, too; None for none.
+        Space of the embeddings in the descriptors; None without embeddings.
     """
 
     features: tuple[str, ...]
@@ -117,13 +117,13 @@ class Groups(Space):
     def of_sounds(
         self, descriptors: Float32, embeddings: Float32, embedding: EmbeddingSpace | None
     ) -> Int64:
-        """Return the row of the group of each sound; `NO_GROUP` for one that is of none.
+        """Return the group row of each sound; `NO_GROUP` for a sound without a group.
 
         Parameters
         ----------
         descriptors : np.ndarray [shape=(n, width)], float32
         embeddings : np.ndarray [shape=(n, k)], float32
-            NaN for a sound without any.
+            NaN for a sound without an embedding.
         """
         of, heard = np.empty(len(descriptors), np.int64), self.are_comparable(embeddings)
         heard &= embedding == self.embedding
@@ -134,30 +134,30 @@ class Groups(Space):
         return of
 
     def space(self, *, embedded: bool) -> Space:
-        """Return the space with embeddings, if it is wanted and there; else that of features."""
+        """Return the space with embeddings if requested and available, else the feature space."""
         return self.embedded if embedded and self.embedded is not None else self
 
     def are_comparable(self, embeddings: Float32) -> Bool:
-        """Return which sounds have embeddings that can be compared with the groups."""
+        """Return which sounds have embeddings comparable with those of the groups."""
         if self.embedded is None or embeddings.shape[1] != len(self.embedded.mean) - len(self.mean):
             return np.zeros(len(embeddings), bool)
         return is_embedded(embeddings)
 
 
 def is_embedded(embeddings: Float32) -> Bool:
-    """Tell which sounds have an embedding."""
+    """Return which sounds have an embedding."""
     if not embeddings.shape[1]:
         return np.zeros(len(embeddings), bool)
     return np.isfinite(embeddings.sum(axis=1))
 
 
 def make_space(descriptors: Float32) -> Space:
-    """Make a space of descriptors, in which there is no group yet.
+    """Fit a space without groups to descriptors.
 
     Parameters
     ----------
     descriptors : np.ndarray [shape=(n, width)], float32
-        At least two, of which some differ.
+        At least two, not all equal.
     """
     from sklearn.decomposition import PCA  # noqa: PLC0415
 
@@ -176,12 +176,12 @@ def new_groups(
     embedding: EmbeddingSpace | None = None,
     embeddings: Float32 | None = None,
 ) -> Groups:
-    """Make the spaces of some sounds, without any group.
+    """Fit the spaces of some sounds, without groups.
 
     Parameters
     ----------
     descriptors : np.ndarray [shape=(n, width)], float32
-        At least two, of which some differ.
+        At least two, not all equal.
     embeddings : np.ndarray [shape=(n, k)], float32, optional
     """
     embedded = None
@@ -206,22 +206,22 @@ def add_groups(
     least: int = LEAST,
     embedded: Float64 | None = None,
 ) -> Groups:
-    """Add the clusters of points that no group knows yet, the largest first: HDBSCAN.
+    """Add new HDBSCAN clusters as groups, largest first.
 
-    Those of all points are looked for, for what is left beside the groups of an earlier time would
-    fall into others than it did among all.
+    All points are clustered, since the points outside existing groups would cluster differently
+    alone.
 
     Parameters
     ----------
     points : np.ndarray [shape=(n, d)], float64
-        In the order of time.
+        In time order.
     of : np.ndarray [shape=(n,)], int64
-        The row of the group that knows a point, or `NO_GROUP`. A cluster is new if most of its
-        points are of none.
+        Group row of each point, or `NO_GROUP`. A cluster is new if most of its points have no
+        group.
     least : int, optional
-        Sounds of a group, at least.
+        Minimum of sounds per group.
     embedded : np.ndarray [shape=(n, d)], float64, optional
-        Where the sounds lie by their embeddings, too: then clusters are looked for there.
+        Points in the embedding space; clusters are then searched there.
     """
     from sklearn.cluster import HDBSCAN  # noqa: PLC0415
 
@@ -244,7 +244,7 @@ def add_groups(
 
 
 def identified(groups: Groups) -> Groups:
-    """Give groups that were made now an id, which others have only if they are the same."""
+    """Assign an id to new groups; equal ids mean equal groups."""
     arrays = [groups.mean, groups.scale, groups.axes, groups.examples, groups.of]
     if groups.embedded is not None:
         arrays.append(groups.embedded.examples)
@@ -253,9 +253,9 @@ def identified(groups: Groups) -> Groups:
 
 
 def _distances(points: Float64, examples: Float64, radius: float) -> Float64:
-    """Return how far each point is from the nearest example; infinity beyond the radius.
+    """Return the distance of each point to the nearest example; infinity beyond the radius.
 
-    Products of matrices, which are fast and not exact, only tell which points are surely beyond.
+    Fast but inexact matrix products only exclude the points that are surely beyond the radius.
     """
     own, theirs = (points**2).sum(axis=1), (examples**2).sum(axis=1)
     squares = own[:, np.newaxis] + theirs - 2.0 * points @ examples.T
@@ -281,7 +281,7 @@ def _add(groups: Groups, points: Float64, embedded: Float64 | None) -> Groups:
 
 
 def _with_examples(space: _Space, points: Float64 | None, row: int) -> _Space:
-    """Add a group to a space; None for one that has no examples there."""
+    """Add a group to a space; None if the group has no examples there."""
     from scipy.spatial import cKDTree  # noqa: PLC0415
 
     if points is None:
@@ -298,26 +298,26 @@ def _with_examples(space: _Space, points: Float64 | None, row: int) -> _Space:
 
 
 _ENERGY = "energy"
-_WEIGHT = 0.3  # power of the energy: the loud part of a sound says most, and its end a little
+_WEIGHT = 0.3  # power of the energy: the loud part of a sound dominates, the decay counts a little
 _LEAST_ENERGY = 1e-12
-_DESCRIBED_AT_ONCE = 16_384  # frames of sounds, or one sound: what a small box has room for
+_DESCRIBED_AT_ONCE = 16_384  # frames of sounds, or one sound: fits the memory of a small box
 
 
 def descriptor_width(names: Sequence[str]) -> int:
-    """Return how many numbers describe a sound of these features."""
+    """Return the descriptor length for these features."""
     return 3 * len(_used(names)) + 1
 
 
 def describe(values: Float32, names: Sequence[str], first: Int64, last: Int64) -> Float32:
-    """Describe sounds by their features: mean, deviation, and how fast they change; and the length.
+    """Return descriptors of sounds: feature mean, deviation and rate of change, and the length.
 
     Parameters
     ----------
     values : np.ndarray [shape=(frames, f)], float32
     names : sequence of str
-        Of the features. Their energy weighs the frames, and is not in the result.
+        Feature names. The energy weights the frames and is not part of the result.
     first, last : np.ndarray [shape=(n,)], int64
-        Rows of each sound: from `first` on, before `last`.
+        Feature rows of each sound; `last` is exclusive.
 
     Returns
     -------
@@ -367,13 +367,13 @@ def _weights(values: Float32, names: Sequence[str]) -> Float64:
 GROUPS = "groups.safetensors"  # in a folder of logs
 _KEY = "hearthlog_groups"
 _FORMAT: Final = 1
-_FORMAT_OF_EMBEDDINGS: Final = 2  # which a version that cannot use them refuses
+_FORMAT_OF_EMBEDDINGS: Final = 2  # refused by versions without embedding support
 _LARGEST = 64 << 20  # bytes
 _LARGEST_HEADER = 1 << 20
 _LEAST_NUMBER, _MOST_NUMBER = 1, (1 << 31) - 1
-_SMALL, _LARGE = 1e-6, 1e6  # of radii and scales; all other numbers are at most as large
+_SMALL, _LARGE = 1e-6, 1e6  # limits of radii and scales; all other numbers are at most as large
 _ARRAYS = {"mean": 1, "scale": 1, "axes": 2, "examples": 2, "of": 1, "radii": 1}  # of a space
-_EMBEDDED = "embedded_"  # before those of the space with embeddings
+_EMBEDDED = "embedded_"  # prefix of the arrays of the embedding space
 _WHOLE = {"of", "numbers"}
 
 _Name = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
@@ -400,7 +400,7 @@ class _Head(BaseModel):
 
 @contextmanager
 def locked_groups(path: Path) -> Iterator[None]:
-    """Keep others from the file of groups, who wait.
+    """Hold an exclusive lock on the groups file.
 
     Raise `DataError` if its folder cannot be written.
     """
@@ -415,7 +415,7 @@ def locked_groups(path: Path) -> Iterator[None]:
 
 
 def save_groups(groups: Groups, path: Path) -> None:
-    """Write the file of groups, in place of the one that is there.
+    """Write the groups file, replacing an existing one.
 
     Raise `LogError` if it cannot be written.
     """
@@ -432,9 +432,9 @@ def save_groups(groups: Groups, path: Path) -> None:
 
 
 def load_groups(path: Path) -> Groups | None:
-    """Read the file of groups; None if there is none.
+    """Read the groups file; None if it does not exist.
 
-    Raise `DataError` if it is no such file, or damaged.
+    Raise `DataError` if it is not a groups file, or damaged.
     """
     if not path.exists():
         return None
@@ -466,7 +466,7 @@ def load_groups(path: Path) -> Groups | None:
 
 
 def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
-    """Return what does not fit; empty if all does."""
+    """Return the inconsistency of a groups file; empty if there is none."""
     expected = {"numbers": 1, **_ARRAYS}
     if head.embedding is not None:
         expected |= {_EMBEDDED + name: dimensions for name, dimensions in _ARRAYS.items()}
@@ -497,7 +497,7 @@ def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
 def _fits(
     arrays: dict[str, NDArray[Any]], prefix: str, count: int, widths: tuple[int, int]
 ) -> bool:
-    """Return whether shapes, classes and scales of the arrays of a space are consistent."""
+    """Return whether shapes, group rows and scales of a space's arrays are consistent."""
     mean, scale, axes, examples, of, radii = (arrays[prefix + name] for name in _ARRAYS)
     return bool(
         mean.shape == scale.shape == axes.shape[1:]

@@ -1,4 +1,4 @@
-"""Voices of a home: found again in each conversation, their file, summaries, and enrolment."""
+"""Voices of a home: matching across conversations, voices file, summaries and enrolment."""
 
 import hashlib
 from collections.abc import Iterable
@@ -37,22 +37,22 @@ from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import replaced_file
 
 NO_VOICE = -1
-MOST_VOICES = 1_000  # in a file
-LEAST_SECONDS = 20.0  # of speech, in which voices are looked for
-_LEAST_WINDOWS = 20  # of a voice: ten seconds
-_MOST = 2_000  # voices of conversations, among which those of the home are looked for
+MOST_VOICES = 1_000  # per file
+LEAST_SECONDS = 20.0  # of speech needed to search for voices
+_LEAST_WINDOWS = 20  # per voice: ten seconds
+_MOST = 2_000  # conversation voices among which home voices are searched
 
 
 @dataclass(frozen=True)
 class HomeVoices:
-    """The voices of a home.
+    """Voices of a home.
 
     Attributes
     ----------
     numbers : np.ndarray [shape=(g,)], int64
-        A number is never used again.
+        Voice numbers, never reused.
     names : list of str
-        That a person gave; empty where nobody did.
+        Assigned by a person; empty for unnamed voices.
     """
 
     numbers: Int64
@@ -67,17 +67,17 @@ def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoice
     Parameters
     ----------
     known : HomeVoices or None
-        Those of an earlier time, which are not changed; None if there are none.
+        Voices of an earlier run, which stay unchanged; None for the first run.
 
     Returns
     -------
     of : np.ndarray [shape=(n,)], int64
-        The row of the voice of each voice of a conversation; `NO_VOICE` for one that is of none.
+        Home voice row of each conversation voice; `NO_VOICE` if none matches.
 
     Raises
     ------
     DataError
-        If none is known and there is too little speech to tell voices apart.
+        If there are no earlier voices and too little speech to separate voices.
     """
     if known is None and speech.seconds < LEAST_SECONDS:
         raise DataError(
@@ -98,12 +98,12 @@ def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoice
 
 
 def seconds_of(counts: Float64) -> Float64:
-    """Return how long so many windows are."""
+    """Return the duration of a number of windows in seconds."""
     return counts * (HOP_FRAMES * FRAME_SECONDS)
 
 
 def _known_again(evidence: VoiceEvidence, known: VoiceEvidence, spread: Float64) -> Int64:
-    """Return the known voice that each is likeliest of, if one voice is likelier than two."""
+    """Return the likeliest existing voice of each row, if one voice is likelier than two."""
     best = np.zeros(len(evidence.counts))
     of = np.full(len(best), NO_VOICE)
     for row in range(len(known.counts)):
@@ -114,7 +114,7 @@ def _known_again(evidence: VoiceEvidence, known: VoiceEvidence, spread: Float64)
 
 
 def _with_new(voices: HomeVoices, rest: VoiceEvidence, spread: Float64) -> HomeVoices:
-    """Add the voices of what is of none, if one of them speaks for long enough."""
+    """Add voices from unmatched evidence, if a voice speaks long enough."""
     largest = np.sort(np.argsort(-rest.counts, kind="stable")[:_MOST])
     rest = rest.rows(largest)
     if not len(rest.counts):
@@ -163,10 +163,10 @@ class _Head(BaseModel):
 
 
 def save_voices(voices: HomeVoices, path: Path) -> None:
-    """Write the file of voices, in place of the one that is there.
+    """Write the voices file, replacing an existing one.
 
-    Raise `DataError` if it could not be read again, for the features of the voices are too
-    large. Raise `LogError` if it cannot be written.
+    Raise `DataError` if the voice features are too large for the file to be read again. Raise
+    `LogError` if the file cannot be written.
     """
     head = _Head(format=_FORMAT, id=voices.id, names=voices.names)
     arrays = {"numbers": voices.numbers, **voices.evidence._asdict()}
@@ -182,9 +182,9 @@ def save_voices(voices: HomeVoices, path: Path) -> None:
 
 
 def load_voices(path: Path) -> HomeVoices | None:
-    """Read the file of voices; None if there is none.
+    """Read the voices file; None if it does not exist.
 
-    Raise `DataError` if it is no such file, or damaged.
+    Raise `DataError` if it is not a voices file, or damaged.
     """
     if not path.exists():
         return None
@@ -236,16 +236,16 @@ class VoiceTurn(NamedTuple):
 
 @dataclass(frozen=True)
 class VoiceSummary:
-    """A voice.
+    """Summary of a voice.
 
     Attributes
     ----------
     name : str
-        That a person gave; empty where nobody did.
+        Assigned by a person; empty if unnamed.
     days : int
-        On how many days, at home.
+        Number of local days with this voice.
     hours : list of int
-        How many of its turns began in each hour of the day, at home.
+        Number of turns that began in each local hour of the day.
     """
 
     number: int
@@ -258,14 +258,14 @@ class VoiceSummary:
 
 
 class SpokenSpans(NamedTuple):
-    """Turns of the voices of one microphone, in the order of time.
+    """Voice turns of one microphone, in time order.
 
     Attributes
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
     texts : np.ndarray [shape=(n,)] of str
-        The name of the voice, or `voice 3`; `no voice` for what is of none.
+        Name of the voice, or `voice 3`; `no voice` for unmatched turns.
     """
 
     starts: Int64
@@ -276,12 +276,12 @@ class SpokenSpans(NamedTuple):
 def summarise(
     speech: HomeSpeech, voices: HomeVoices, of: Int64, zone: tzinfo
 ) -> list[VoiceSummary]:
-    """Summarise the voices that speak, that with most speech first.
+    """Summarise the voices that speak, most speech first.
 
     Parameters
     ----------
     of : np.ndarray [shape=(n,)], int64
-        As `find_voices` returns it.
+        Result of `find_voices`.
     """
     found = []
     for row in range(len(voices.numbers)):
@@ -310,7 +310,7 @@ def _summary(
 
 
 def longest(speech: HomeSpeech, rows: Int64) -> Int64:
-    """Order turns by their lengths, the longest first."""
+    """Sort turns by length, longest first."""
     lengths = (speech.turns.ends - speech.turns.starts)[rows]
     return rows[np.argsort(-lengths, kind="stable")]
 
@@ -327,12 +327,12 @@ def turn_at(speech: HomeSpeech, row: int) -> VoiceTurn:
 
 
 def spoken_spans(speech: HomeSpeech, voices: HomeVoices, of: Int64) -> dict[str, SpokenSpans]:
-    """Return when which voice speaks, by microphone.
+    """Return the voice turns of each microphone.
 
     Parameters
     ----------
     of : np.ndarray [shape=(n,)], int64
-        As `find_voices` returns it.
+        Result of `find_voices`.
     """
     named = zip(voices.names, voices.numbers.tolist(), strict=True)
     texts = np.array([*(name or f"voice {number}" for name, number in named), "no voice"], object)
@@ -348,14 +348,14 @@ def spoken_spans(speech: HomeSpeech, voices: HomeVoices, of: Int64) -> dict[str,
 
 
 _QUIET = 10 ** (-30 / 10)  # of the loud frames
-_MOST_FRAMES = 6_000  # of a voice
-_SURELY = 2.0  # the logarithm by which two voices are likelier than one
+_MOST_FRAMES = 6_000  # per voice
+_SURELY = 2.0  # log likelihood ratio of two voices over one
 
 
 def check_voices(recordings: Iterable[Recording], features: FeatureSet) -> None:
-    """Check that nobody is enrolled with two voices.
+    """Check that each enrolled recording set holds one voice.
 
-    Raise `DataError` if two voices are heard in what is enrolled as one.
+    Raise `DataError` if one person's recordings contain two voices.
     """
     if not has_voices(features.feature_names):
         return
@@ -373,7 +373,7 @@ def check_voices(recordings: Iterable[Recording], features: FeatureSet) -> None:
 
 
 def is_of_two(values: Float32, features: FeatureSet) -> bool:
-    """Tell whether two voices are heard in speech; in less than a window there is one."""
+    """Return whether speech contains two voices; False for less than a window."""
     if len(values) < WINDOW_FRAMES:
         return False
     of, points = voices_of(values[:_MOST_FRAMES], features.feature_names)
@@ -391,24 +391,24 @@ def _loud(values: Float32, features: FeatureSet) -> Float32:
     return values[power > np.percentile(power, 90) * _QUIET]
 
 
-_LEAST = 2 * NANOSECONDS  # of a turn
+_LEAST = 2 * NANOSECONDS  # per turn
 _ENOUGH = 60 * NANOSECONDS
 
 
 def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list[Enrolled]:
-    """Enrol the longest turns of a voice, a minute of them, in a training set of voices.
+    """Enrol one minute of a voice's longest turns in a training set of voices.
 
-    They are of as many times as there are. What is there already counts.
+    The turns are spread over as many separate times as possible. Existing recordings count.
 
     Parameters
     ----------
     rows : np.ndarray [shape=(n,)], int64
-        Its turns.
+        Turns of the voice.
 
     Raises
     ------
     DataError
-        If it never speaks for two seconds.
+        If no turn of the voice lasts two seconds.
     LogError
         If a log is damaged, or nothing can be written.
     """
@@ -418,7 +418,7 @@ def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list
     for row in _of_all_times(speech, rows[lengths >= _LEAST]).tolist():
         turn = turn_at(speech, row)
         path = cut_path(home, label, turn.start)
-        if path in enrolled:  # another microphone heard it, too
+        if path in enrolled:  # already enrolled from another microphone
             continue
         if left < _LEAST:
             break

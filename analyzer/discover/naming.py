@@ -1,4 +1,4 @@
-"""A group that gets a name: every sound of it becomes a mark, and is none again when asked."""
+"""Naming of groups: marks on every sound of a group, and their removal."""
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ from hearthlog.schemas.messages.topics import LIVE
 
 
 class Looked(NamedTuple):
-    """In which sounds names are looked for."""
+    """Selection of sounds to search for named groups."""
 
     choice: str
     start: int | None = None
@@ -29,7 +29,7 @@ class Looked(NamedTuple):
 
 
 class Marked(NamedTuple):
-    """What a name of a group has changed."""
+    """Changes made by naming a group."""
 
     made: int = 0
     left: int = 0
@@ -43,14 +43,14 @@ def name_groups(  # noqa: PLR0913, PLR0917
     reviewer: str,
     progress: Progress = ignore_progress,
 ) -> tuple[dict[int, Marked], list[str]]:
-    """Mark the sounds of groups; marks that they have get the name, if they had another one.
+    """Mark the sounds of groups; existing marks of a group get its new name.
 
-    One log is read at a time, so a box with little memory can name what another one has grouped.
+    Logs are read one at a time, so a box with little memory can name groups found by another.
 
     Parameters
     ----------
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Receives the share of the logs read, 0 to 1.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def name_groups(  # noqa: PLR0913, PLR0917
 def _spans(
     log: Path, groups: Groups, looked: Looked, losses: list[str]
 ) -> dict[int, list[MarkedSpan]]:
-    """Find the sounds of groups in a log, by the numbers of the groups."""
+    """Return the sounds of groups in a log, by group number."""
     found: dict[int, list[MarkedSpan]] = {}
     for sounds in read_log_sounds(log, *looked):
         if sounds.features != groups.features:
@@ -118,7 +118,7 @@ def _mark(
 
 
 def unmark_group(logs: Iterable[Path], reason: str) -> int:
-    """Take back the marks of a group; return how many there were.
+    """Remove the marks of a group; return their number.
 
     Raise `LogError` if a review layer cannot be read or written.
     """
@@ -132,7 +132,7 @@ def unmark_group(logs: Iterable[Path], reason: str) -> int:
 
 
 def reason_of(groups: Groups, number: int) -> str:
-    """Return the reason that the marks of a group have, which those of other files have not."""
+    """Return the reason stored in a group's marks, unique to this groups file."""
     return f"group {number} of {groups.id}"
 
 

@@ -1,4 +1,4 @@
-"""Sounds of a home: their spans, read log by log, and the group of each."""
+"""Sounds of a home: spans, reading of logs, and group assignment."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -35,11 +35,11 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
 
 ALL, UNSURE, NOT_KNOWN = CHOICES = ("all", "unsure", "unknown")
-# A sound may have two frames of silence within it, and has four frames; stamps follow a clock.
+# A sound has at least four frames and may contain two silent ones; stamps follow a clock.
 _PAUSE = 3 * FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2
 _LEAST_NANOSECONDS = 3 * FRAME_NANOSECONDS - FRAME_NANOSECONDS // 2
-_BEFORE = np.int64(-1 << 62)  # any time
-_UNSURE_CONFIDENCE = 0.5  # as of the clips of what a model is unsure of
+_BEFORE = np.int64(-1 << 62)  # before any time
+_UNSURE_CONFIDENCE = 0.5  # same as for clips that the model is unsure of
 
 
 class LabelledStamps(NamedTuple):
@@ -58,7 +58,7 @@ class LabelledStamps(NamedTuple):
     confidence: Float32
 
     def rows(self, rows: Bool) -> "LabelledStamps":
-        """Return some of the labels."""
+        """Select rows."""
         return LabelledStamps(self.stamps[rows], self.labels[rows], self.confidence[rows])
 
 
@@ -70,11 +70,11 @@ class SoundSpans(NamedTuple):
     starts, ends : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC, ascending.
     first, last : np.ndarray [shape=(n,)], int64
-        Rows of the features: from `first` on, before `last`.
+        Feature rows; `last` is exclusive.
     labels : np.ndarray [shape=(n,)], str
-        The label that most of the sounding frames have.
+        Most frequent label of the sounding frames.
     confidence : np.ndarray [shape=(n,)], float64
-        Mean confidence of their labels.
+        Mean confidence of the labels.
     """
 
     starts: Int64
@@ -85,7 +85,7 @@ class SoundSpans(NamedTuple):
     confidence: Float64
 
     def chosen(self, choice: str) -> "SoundSpans":
-        """Return all, those that the model is unsure of, or those that it does not know."""
+        """Return all sounds, the sounds with unsure labels, or the sounds of unknown class."""
         if choice == ALL:
             return self
         keep = self.labels == UNKNOWN
@@ -94,7 +94,7 @@ class SoundSpans(NamedTuple):
         return self.rows(keep)
 
     def rows(self, rows: Bool) -> "SoundSpans":
-        """Return some of the sounds."""
+        """Select rows."""
         return SoundSpans(
             self.starts[rows],
             self.ends[rows],
@@ -106,12 +106,12 @@ class SoundSpans(NamedTuple):
 
 
 def find_sounds(stamps: Int64, labels: LabelledStamps) -> SoundSpans:
-    """Find the sounds of a log: runs of labels other than silence.
+    """Return the sounds of a log: runs of labels other than silence.
 
     Parameters
     ----------
     stamps : np.ndarray [shape=(m,)], int64
-        Of the frames that have features, ascending.
+        Of the frames with features, ascending.
     """
     heard = labels.rows(labels.labels != SILENCE)
     rows = np.minimum(np.searchsorted(stamps, heard.stamps), max(len(stamps) - 1, 0))
@@ -135,7 +135,7 @@ def find_sounds(stamps: Int64, labels: LabelledStamps) -> SoundSpans:
 
 
 def _most_frequent(labels: NDArray[Any], sound: Int64, count: int) -> NDArray[np.str_]:
-    """Return the most frequent label of each sound; the first in the alphabet of several."""
+    """Return the most frequent label of each sound; ties go to the first in the alphabet."""
     names, codes = np.unique(labels.astype(np.str_), return_inverse=True)
     shape = count, max(len(names), 1)
     counts = np.bincount(sound * shape[1] + codes, minlength=shape[0] * shape[1])
@@ -146,17 +146,17 @@ _FIELDS = {"header.stamp", "values", "label", "confidence"}
 
 
 class LogSounds(NamedTuple):
-    """Sounds of one microphone in one log.
+    """Sounds of one microphone in one log, with their descriptors.
 
     Attributes
     ----------
     descriptors : np.ndarray [shape=(n, width)], float32
     embedding : EmbeddingSpace or None
-        Of the embeddings; None if the log has none.
+        Space of the embeddings; None if the log has no embeddings.
     embeddings : np.ndarray [shape=(n, k)], float32
-        By which they are described, too; NaN for a sound without any.
+        NaN for a sound without an embedding.
     lost : int
-        Sounds that are left out, for they have features that are no numbers.
+        Number of sounds dropped because of NaN or infinite features.
     """
 
     microphone: str
@@ -170,16 +170,16 @@ class LogSounds(NamedTuple):
 
 @dataclass(frozen=True)
 class HomeSounds:
-    """Sounds of a home, in the order of `logs`, and in each of time.
+    """Sounds of a home, in the order of `logs`, and by time within a log.
 
     Attributes
     ----------
     log, microphone : np.ndarray [shape=(n,)], int64
-        Of each sound: where it is in these lists.
+        Indices of each sound into these lists.
     descriptors : np.ndarray [shape=(n, width)], float32
-        On the disk.
+        On disk.
     embeddings : np.ndarray [shape=(n, k)], float32
-        On the disk; NaN for a sound without any, or with one of another network or projection.
+        On disk; NaN without an embedding, or with an embedding of another network or projection.
     """
 
     features: tuple[str, ...]
@@ -206,15 +206,15 @@ def read_sounds(  # noqa: PLR0913, PLR0917
     progress: Progress = ignore_progress,
     groups: Groups | None = None,
 ) -> Iterator[HomeSounds]:
-    """Read the sounds of a home; what describes them is on the disk meanwhile.
+    """Read the sounds of a home; their descriptors stay on disk meanwhile.
 
     Parameters
     ----------
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Receives the share of the logs read, 0 to 1.
     groups : Groups, optional
-        By which they are to be known: only their embeddings are read. Without groups those of the
-        last log that has any.
+        Groups to match: only embeddings of their space are read. Without groups, the space of
+        the last log with embeddings is used.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def read_sounds(  # noqa: PLR0913, PLR0917
         tempfile.TemporaryFile(prefix="hearthlog-embeddings") as embedded,
     ):
         reader = _Reader(choice, (start, end), groups, store, embedded)
-        # The last log first: what it has been described by, the others have to be, too.
+        # Last log first: its descriptor format applies to all others.
         for number, entry in enumerate(reversed(entries), 1):
             try:
                 reader.read(entry.path)
@@ -263,12 +263,12 @@ def read_log_sounds(
 
 
 def lost_text(log: Path, lost: int) -> str:
-    """Say how many sounds of a log are left out, and why."""
+    """Return a message with the number of dropped sounds of a log, and the reason."""
     return f"{log}: {lost} sounds with features that are no numbers; left out"
 
 
 class _Reader:
-    """Reads logs, the last one first: as its sounds are described, all have to be."""
+    """Reader of logs, last log first; its descriptor format applies to all others."""
 
     def __init__(
         self,
@@ -286,7 +286,7 @@ class _Reader:
         self._features: tuple[str, ...] = ()
         self._any_embedding = groups is None
         self._embedding = None if groups is None else groups.embedding
-        self._width = 0  # of what is embedded
+        self._width = 0  # of the embeddings
         self._without_embedding = self._count = 0
         self._other_embeddings: set[EmbeddingSpace] = set()
         self._logs: list[Path] = []
@@ -307,7 +307,7 @@ class _Reader:
             self.without += 1
 
     def _embed(self, sounds: LogSounds) -> None:
-        """Keep embeddings, if they can be compared with those of the later logs."""
+        """Store embeddings that are comparable with those of later logs."""
         if self._any_embedding and self._embedding is None:
             self._embedding = sounds.embedding
         own = sounds.embeddings
@@ -361,9 +361,9 @@ def _on_disk(store: IO[bytes], count: int, width: int) -> Float32:
 
 
 def _by_time(columns: Columns, *fields: str) -> tuple[Any, ...]:
-    """Return the stamps of messages and some of their fields, in the order of the stamps.
+    """Return stamps and some fields of messages, sorted by stamp.
 
-    In logs that were joined, frames begin anew, and where a clock was set back, times do.
+    Frame numbers restart in merged logs, and times go back where a clock was set back.
     """
     stamps = columns["header.stamp"]
     values = [stamps, *(columns[name] for name in fields)]
@@ -373,34 +373,34 @@ def _by_time(columns: Columns, *fields: str) -> tuple[Any, ...]:
     return tuple(each[order] for each in values)
 
 
-_MOST = 20_000  # sounds among which groups are looked for
+_MOST = 20_000  # sounds used to search for groups
 _AT_ONCE = 10_000
 
 
 def discover(
     sounds: HomeSounds, groups: Groups | None, least: int = LEAST
 ) -> tuple[Groups, Int64, Float64]:
-    """Group sounds: those of the groups that are known, and the others by new groups.
+    """Group sounds: assign existing groups, then find new groups among the others.
 
     Parameters
     ----------
     groups : Groups or None
-        Those of an earlier time, which are not changed; None if there are none.
+        Groups of an earlier run, which stay unchanged; None for the first run.
     least : int, optional
-        Sounds of a new group, at least. Of more than 20,000 sounds so many are drawn, always the
-        same ones, and groups are looked for among these.
+        Minimum of sounds in a new group. Groups are searched in at most 20,000 sounds, drawn
+        deterministically.
 
     Returns
     -------
     of : np.ndarray [shape=(n,)], int64
-        The row of the group of each sound; `NO_GROUP` for one that is of none.
+        Group row of each sound; `NO_GROUP` for a sound without a group.
     points : np.ndarray [shape=(n, d)], float64
-        Where the sounds lie by their features.
+        Points of the sounds in the feature space.
 
     Raises
     ------
     DataError
-        If the groups are of other features, or there are too few sounds to group.
+        If the groups use other features, or there are too few sounds to group.
     """
     count = len(sounds.descriptors)
     if groups is not None and groups.features != sounds.features:
@@ -433,7 +433,7 @@ def discover(
 
 
 def unembedded_note(sounds: HomeSounds, groups: Groups) -> str:
-    """Return a note on sounds that were grouped by features alone; empty if there are none."""
+    """Return a note on sounds grouped by features alone; empty if there are none."""
     others = sorted({space.network for space in sounds.other_embeddings})
     if groups.embedding is None:
         others = sorted({*others, sounds.embedding.network} if sounds.embedding else others)
@@ -454,7 +454,7 @@ def unembedded_note(sounds: HomeSounds, groups: Groups) -> str:
 
 
 def _points(sounds: HomeSounds, groups: Groups) -> tuple[Float64, Float64]:
-    """Return where sounds lie by their features, and with their embeddings; NaN without."""
+    """Return points in the feature space and the embedding space; NaN without an embedding."""
     points = np.empty((len(sounds.descriptors), len(groups.axes)))
     space = groups.embedded
     embedded = np.full((len(points), 0 if space is None else len(space.axes)), np.nan)
@@ -468,7 +468,7 @@ def _points(sounds: HomeSounds, groups: Groups) -> tuple[Float64, Float64]:
 
 
 def _drawn(sounds: HomeSounds) -> Int64:
-    """Draw sounds by a hash of their times, and order them by these."""
+    """Draw sounds by a hash of their times, sorted by that hash."""
     starts = sounds.spans.starts
     rows = np.arange(len(starts))
     if len(rows) > _MOST:
@@ -484,14 +484,14 @@ def _hashed(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 class GroupSpans(NamedTuple):
-    """Sounds of known groups, in the order of time.
+    """Sounds of existing groups, in time order.
 
     Attributes
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
     texts : np.ndarray [shape=(n,)] of str
-        The name of the group of each, or `group 3`.
+        Group name, or `group 3`.
     """
 
     starts: Int64
@@ -506,17 +506,17 @@ def group_spans(
     end: int | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[dict[str, GroupSpans], list[str]]:
-    """Find the sounds of groups that are known; no group is added.
+    """Find the sounds of existing groups; no group is added.
 
     Parameters
     ----------
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Receives the share of the logs read, 0 to 1.
 
     Raises
     ------
     DataError
-        If no log has features and labels, or the groups are of other features.
+        If no log has features and labels, or the groups use other features.
     """
     texts = np.array(
         [

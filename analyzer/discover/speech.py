@@ -1,4 +1,4 @@
-"""Speech of a home: its spans, the loudest microphone, and the turns of each voice."""
+"""Speech of a home: spans, loudest microphone, and voice turns."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -30,24 +30,24 @@ from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, microphone_of, parse_topic, topic
 
-# Mean probability of speech in a segment of another label. Chosen by scenes of household sounds and
-# a model that had not heard them: at 0.3 no other sound becomes speech, at 0.15 twice as many do.
+# Mean probability of speech in a segment of another label. Tuned on scenes of household sounds
+# unseen by the model: at 0.3 no other sound becomes speech, at 0.15 twice as much speech is found.
 _LIKELY = 0.3
 
 
 def is_doubtful(segments: Columns) -> Bool:
-    """Tell which segments are of a sound that is not labelled speech, and may be."""
+    """Return which segments are not labelled speech but may be speech."""
     return ~_is_of(segments, SPEECH) & ~_is_of(segments, SILENCE)
 
 
 def speech_spans(segments: Columns, labels: Columns | None = None) -> Spans:
-    """Return when somebody speaks.
+    """Return the spans of speech.
 
     Parameters
     ----------
     labels : Columns, optional
-        Of the frames. A sound to which they give a probability of speech of 0.3, in the mean, is
-        speech as well, whatever it is called: somebody who reads may pass for one who coughs.
+        Frame labels. A sound with a mean speech probability of 0.3 counts as speech, whatever
+        its label: reading aloud may be labelled as coughing.
     """
     starts = segments["header.stamp"]
     ends = starts + segments["duration"]
@@ -65,7 +65,7 @@ def _is_of(segments: Columns, kind: str) -> Bool:
 
 
 def _speech_likelihood(labels: Columns, starts: Int64, ends: Int64) -> Float64:
-    """Return the mean probability of speech in spans; 0 where labels have none."""
+    """Return the mean probability of speech in spans; 0 without labels."""
     names = array_names(labels.metadata, "probabilities")
     own = [place for place, name in enumerate(names) if class_name(name) == SPEECH]
     probabilities = labels["probabilities"]
@@ -81,8 +81,8 @@ def _speech_likelihood(labels: Columns, starts: Int64, ends: Int64) -> Float64:
 
 
 _ALIKE = 0.7  # correlation of loudness
-_LATE = (0, -1, 1, -2, 2, -3, 3)  # frames: clocks differ, and so does the way through a device
-_SHORT = 10  # frames, too few to compare: the time alone decides
+_LATE = (0, -1, 1, -2, 2, -3, 3)  # frames: clocks and device latencies differ
+_SHORT = 10  # frames, too few to compare: time alone decides
 _LEAST_ENERGY = 1e-12
 _TINY = 1e-12
 
@@ -93,11 +93,11 @@ class SpeechFrames(NamedTuple):
     Attributes
     ----------
     frames : np.ndarray [shape=(n,)], int64
-        When each begins, in frames since 1970; ascending.
+        Start of each frame, in frames since 1970; ascending.
     loudness : np.ndarray [shape=(n,)], float64
         In dB.
     turn : np.ndarray [shape=(n,)], int64
-        The turn that each is of, from 0 on; ascending.
+        Turn index of each frame, from 0; ascending.
     """
 
     frames: Int64
@@ -105,12 +105,12 @@ class SpeechFrames(NamedTuple):
     turn: Int64
 
     def rows(self, rows: Bool) -> "SpeechFrames":
-        """Return some of the frames."""
+        """Select rows."""
         return SpeechFrames(self.frames[rows], self.loudness[rows], self.turn[rows])
 
 
 def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames:
-    """Return frames of speech as they are compared.
+    """Return frames of speech in comparable form.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames
         In nanoseconds of UTC, ascending.
     energy : np.ndarray [shape=(n,)], float32
     starts : np.ndarray [shape=(turns,)], int64
-        Stamps of the frames at which turns begin.
+        Stamps of the first frame of each turn.
     """
     loudness = 10.0 * np.log10(np.maximum(energy.astype(np.float64), _LEAST_ENERGY))
     frames = (stamps + FRAME_NANOSECONDS // 2) // FRAME_NANOSECONDS
@@ -126,16 +126,16 @@ def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames
 
 
 def louder_elsewhere(speech: Sequence[SpeechFrames]) -> list[Bool]:
-    """Tell which turns another microphone hears as well, and louder.
+    """Return which turns another microphone records louder.
 
-    That is so if in most of a turn's frames the other one hears speech, too, and if its loudness
-    and theirs correlate by more than 0.7; for a turn of less than half a second the first is
-    enough. Of what is as loud the first microphone's is kept.
+    A turn is dropped if the other microphone has speech in most of its frames, and the loudness
+    of both correlates by more than 0.7; turns below half a second need only the first condition.
+    Of equally loud turns the first microphone's is kept.
 
     Returns
     -------
     list of np.ndarray [shape=(turns,)], bool
-        For each microphone.
+        One per microphone.
     """
     kept = list(speech)
     louder: list[Bool] = []
@@ -146,13 +146,13 @@ def louder_elsewhere(speech: Sequence[SpeechFrames]) -> list[Bool]:
             if before != place and _is_of_one_time(own, other):
                 is_louder |= _is_louder(own, counts, other, or_as_loud=before < place)
         louder.append(is_louder)
-        # what was left out is no reason to leave out others, or nobody would have heard it
+        # dropped turns must not drop others, or no microphone would keep the speech
         kept[place] = own.rows(~is_louder[own.turn])
     return louder
 
 
 def _is_of_one_time(own: SpeechFrames, other: SpeechFrames) -> bool:
-    """Tell whether some of the frames may be the same; most logs of a home are of other times."""
+    """Return whether frames may overlap in time; most logs of a home do not."""
     if not (len(own.frames) and len(other.frames)):
         return False
     early, late = min(_LATE), max(_LATE)
@@ -184,26 +184,26 @@ def _is_louder(own: SpeechFrames, counts: Int64, other: SpeechFrames, *, or_as_l
 _FIELDS = {"header.stamp", "values", "duration", "label", "probabilities"}
 _NEVER = 1 << 62
 _PAUSE = 30 * NANOSECONDS  # between conversations
-_MOST_FRAMES = 6_000  # of a conversation: five minutes
+_MOST_FRAMES = 6_000  # per conversation: five minutes
 _LEAST_FRAMES = 10
-LEAST_WINDOWS = 10  # of a voice in a conversation: five seconds
-_LARGE = 1e6  # for a feature of sound
-_BREATH = FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2  # within a turn; stamps follow a clock
+LEAST_WINDOWS = 10  # per voice in a conversation: five seconds
+_LARGE = 1e6  # limit of a plausible feature value
+_BREATH = FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2  # pause within a turn; stamps follow a clock
 
 
 class Turns(NamedTuple):
-    """When somebody speaks without a pause, in the order of logs, and in each of time.
+    """Turns (speech without a pause), in the order of logs, and by time within a log.
 
-    What several microphones hear at once is of the one that hears it loudest.
+    Speech recorded by several microphones belongs to the loudest.
 
     Attributes
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
     log, microphone : np.ndarray [shape=(n,)], int64
-        Where each is in the lists of `HomeSpeech`.
+        Indices into the lists of `HomeSpeech`.
     voice : np.ndarray [shape=(n,)], int64
-        The row of the voice in its conversation.
+        Row of the conversation voice.
     """
 
     starts: Int64
@@ -220,7 +220,7 @@ class HomeSpeech:
     Attributes
     ----------
     without : int
-        Logs that have no segments, or speech without features by which voices are told apart.
+        Number of logs without segments, or with speech but without the features for voices.
     """
 
     logs: list[Path]
@@ -232,7 +232,7 @@ class HomeSpeech:
 
     @property
     def seconds(self) -> float:
-        """How long somebody speaks."""
+        """Total duration of speech."""
         return float((self.turns.ends - self.turns.starts).sum()) / NANOSECONDS
 
 
@@ -242,12 +242,12 @@ def read_speech(
     end: int | None = None,
     progress: Progress = ignore_progress,
 ) -> HomeSpeech:
-    """Read the speech of a home, by the recorder's segments, log by log.
+    """Read the speech of a home from the recorder's segments, log by log.
 
     Parameters
     ----------
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Receives the share of the logs read, 0 to 1.
     """
     reader = _Reader(start, end)
     entries = home.between(start or 0, end or _NEVER)
@@ -267,7 +267,7 @@ class _Reader:
         self._logs: list[Path] = []
         self._microphones: list[str] = []
         self._turns = [Turns(*(np.empty(0, np.int64) for _ in Turns._fields))]
-        self._recent: list[tuple[Turns, SpeechFrames]] = []  # of logs of one time
+        self._recent: list[tuple[Turns, SpeechFrames]] = []  # logs that overlap in time
         self._recent_end = 0
         dimensions = len(voice_space().spread)
         self._voices = [VoiceEvidence(np.empty(0), np.empty((0, dimensions)))]
@@ -292,7 +292,7 @@ class _Reader:
         self._without += not is_used
 
     def _spoken(self, log: Path, segments: dict[str, Columns]) -> dict[str, Spans]:
-        """Return when somebody speaks, for each microphone that hears it."""
+        """Return the spans of speech of each microphone."""
         named = {microphone_of(name): self._inside(each) for name, each in segments.items()}
         doubtful = [topic(name, "label") for name, each in named.items() if is_doubtful(each).any()]
         labels = _columns(log, doubtful)
@@ -303,9 +303,9 @@ class _Reader:
         return {name: each for name, each in spans.items() if len(each.starts)}
 
     def _inside(self, segments: Columns) -> Columns:
-        """Return the segments of the time that is asked for, which may begin before, or end later.
+        """Return the segments that overlap the requested time.
 
-        They are known later than they begin, so that they are not chosen by their log times.
+        Segments are logged later than they begin, so log times cannot select them.
         """
         start, end = self._span
         starts = segments["header.stamp"]
@@ -354,7 +354,7 @@ class _Reader:
         return starts, ends, voice + self._count - count
 
     def _settle(self) -> None:
-        """Leave out the turns that another microphone hears louder, as far as logs were read."""
+        """Drop turns that another microphone records louder, as far as logs were read."""
         if self._recent:
             turns, speech = zip(*self._recent, strict=True)
             for own, louder in zip(turns, louder_elsewhere(speech), strict=True):
@@ -388,19 +388,19 @@ def _is_segments(name: str) -> bool:
 
 
 def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:
-    """Tell apart the voices in the features of a conversation.
+    """Separate the voices in the features of a conversation.
 
     Parameters
     ----------
     values : np.ndarray [shape=(frames, f)], float32
-        Of speech.
+        Features of speech.
 
     Returns
     -------
     of : np.ndarray [shape=(n,)], int64
-        The voice of each window, from 0 on.
+        Voice of each window, from 0.
     points : np.ndarray [shape=(n, d)], float64
-        Where they lie.
+        Points of the windows in the voice space.
     """
     space = voice_space()
     points = space.points(describe_speech(values, names))
@@ -410,7 +410,7 @@ def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:
 def speech_voices(
     stamps: Int64, values: Float32, names: Sequence[str]
 ) -> tuple[Int64, Int64, Int64]:
-    """Return the turns of a conversation: their starts, their ends, and whose they are.
+    """Return the turns of a conversation: starts, ends and voices.
 
     Parameters
     ----------
@@ -423,14 +423,14 @@ def speech_voices(
 
 
 def _can_be(values: Float32, names: Sequence[str]) -> Bool:
-    """Tell which frames a sound can have; others, in a damaged log, would be of any voice."""
+    """Return which frames have plausible features; damaged logs may hold others."""
     energy = values[:, list(names).index(ENERGY)]
     possible: Bool = (np.abs(values) <= _LARGE).all(axis=1) & (energy >= 0.0)
     return possible
 
 
 def _conversations(stamps: Int64) -> Iterator[slice]:
-    """Yield the rows of conversations, of which long ones are cut."""
+    """Yield the rows of conversations; long conversations are cut."""
     breaks = np.flatnonzero(np.diff(stamps) > _PAUSE) + 1
     for first, last in zip([0, *breaks], [*breaks, len(stamps)], strict=True):
         parts = -(-(last - first) // _MOST_FRAMES)
@@ -441,7 +441,7 @@ def _conversations(stamps: Int64) -> Iterator[slice]:
 
 
 def _of_frames(of: Int64, frames: int) -> Int64:
-    """Return the voice of each frame: that of the window whose middle is nearest."""
+    """Return the voice of each frame, from the window with the nearest middle."""
     middles = window_starts(frames) + WINDOW_FRAMES / 2
     return of[np.searchsorted((middles[1:] + middles[:-1]) / 2, np.arange(frames))]
 

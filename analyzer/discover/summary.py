@@ -1,4 +1,4 @@
-"""Summaries of the groups of a home, and their file for the pages that show them."""
+"""Summaries of the groups of a home, and their file for pages."""
 
 import json
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import replaced_file
 
-SUMMARY: Final = "groups.safetensors.json"  # in a folder of logs, beside the file of groups
-MOST_GROUPS = 1_000  # in a file
-MOST_LABELS, MOST_MICROPHONES = 8, 64  # of a group
+SUMMARY: Final = "groups.safetensors.json"  # in a folder of logs, next to the groups file
+MOST_GROUPS = 1_000  # per file
+MOST_LABELS, MOST_MICROPHONES = 8, 64  # per group
 LONGEST_TEXT = 200  # characters
 _FORMAT: Final = 1
 _LARGEST = 4 << 20  # bytes
 _MOST_COUNT = (1 << 31) - 1
-_LATEST = (1 << 32) * NANOSECONDS  # beyond what messages can hold
+_LATEST = (1 << 32) * NANOSECONDS  # beyond the range of message times
 
 
 def _is_time(text: str) -> str:
@@ -48,7 +48,7 @@ class _Part(BaseModel):
 
 
 class Example(_Part):
-    """A sound that stands for its group; times in ISO 8601, of UTC."""
+    """Example sound of a group; times in ISO 8601, UTC."""
 
     log: Annotated[str, Field(max_length=4096)]
     microphone: _Text
@@ -57,20 +57,20 @@ class Example(_Part):
 
 
 class GroupSummary(_Part):
-    """A group of sounds that are alike.
+    """Summary of a group of similar sounds.
 
     Attributes
     ----------
     name : str
-        The class that a person named it; empty where nobody did.
+        Class assigned by a person; empty if unnamed.
     days : int
-        On how many days, at home.
+        Number of local days with such sounds.
     hours : list of int
-        How many of them began in each hour of the day, at home.
+        Number of sounds that began in each local hour of the day.
     alike : float
-        0: they differ as any sounds of the home do; 1: they are all the same.
+        Similarity: 0, as different as any sounds of the home; 1, identical.
     labels : dict of str to float
-        What share of them each of their most frequent labels has, the most frequent first.
+        Share of each of the most frequent labels, most frequent first.
     """
 
     number: Annotated[int, Field(ge=1, le=_MOST_COUNT)]
@@ -86,7 +86,7 @@ class GroupSummary(_Part):
 
 
 class GroupsSummary(_Part):
-    """The groups of a home, the largest first, as they were found last."""
+    """Groups of a home from the last run, largest first."""
 
     format: Annotated[int, Field(ge=1, le=_FORMAT)] = _FORMAT
     id: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
@@ -96,7 +96,7 @@ class GroupsSummary(_Part):
     groups: Annotated[list[GroupSummary], Field(max_length=MOST_GROUPS)]
 
     def named(self, names: Mapping[int, str]) -> "GroupsSummary":
-        """Return the same with other names for groups, by their numbers."""
+        """Return a copy with other group names, by number."""
         groups = [
             each.model_copy(update={"name": names.get(each.number, each.name)})
             for each in self.groups
@@ -105,12 +105,12 @@ class GroupsSummary(_Part):
 
 
 def summary_path(groups_file: Path) -> Path:
-    """Return the file of the summary of groups; of `groups.safetensors` it is `SUMMARY`."""
+    """Return the path of a groups file's summary; `SUMMARY` for `groups.safetensors`."""
     return groups_file.with_name(f"{groups_file.name}.json")
 
 
 def save_summary(summary: GroupsSummary, path: Path) -> None:
-    """Write a summary, in place of the one that is there.
+    """Write a summary, replacing an existing one.
 
     Raise `LogError` if it cannot be written.
     """
@@ -121,7 +121,7 @@ def save_summary(summary: GroupsSummary, path: Path) -> None:
 def load_summary(path: Path) -> GroupsSummary:
     """Read a summary.
 
-    Raise `DataError` if there is none, or it is no such file, or damaged.
+    Raise `DataError` if it is missing, not a summary, or damaged.
     """
     if not path.exists():
         raise DataError(f"{path}: no such summary of groups; `hearthlog discover` writes it")
@@ -141,7 +141,7 @@ _SHOWN = 3
 def summarise(
     sounds: HomeSounds, groups: Groups, of: Int64, points: Float64, zone: tzinfo
 ) -> list[GroupSummary]:
-    """Summarise the groups that some sounds are of, the largest first."""
+    """Summarise the groups of some sounds, largest first."""
     apart = _typical_distance(points)
     found = []
     for row, number in enumerate(groups.numbers.tolist()):
@@ -203,21 +203,21 @@ def _typical_distance(points: Float64) -> float:
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
-_USUAL = 0.8  # of the sounds are in the usual hours
+_USUAL = 0.8  # share of the sounds within the busiest hours
 
 
 def busiest_hours(hours: list[int]) -> str:
-    """Return the shortest span of the day that has four fifths of the sounds, as `07 to 09`.
+    """Return the shortest span of the day with four fifths of the sounds, such as `07 to 09`.
 
     Parameters
     ----------
     hours : list of int
-        How many began in each hour of the day.
+        Number of sounds that began in each hour of the day.
 
     Returns
     -------
     str
-        Empty if that takes more than half of the day.
+        Empty if the span exceeds half a day.
     """
     twice = np.cumsum([0, *hours, *hours])
     for length in range(1, _HOURS // 2 + 1):

@@ -1,4 +1,4 @@
-"""Voices: seconds of speech as points of a learned space, and how alike they are."""
+"""Voices: seconds of speech as points of a learned space, and their similarity."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -10,50 +10,50 @@ from safetensors.numpy import load
 
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 
-_INDEPENDENT = 0.2  # of a window: windows overlap, and what is said lasts
-_MOST_CERTAIN = 4.0  # windows: nobody sounds the same twice, however long one speaks
-_SMOOTHED = 1  # windows at either side
+_INDEPENDENT = 0.2  # share of a window: windows overlap, and speech is correlated
+_MOST_CERTAIN = 4.0  # windows: a voice varies, however long the speech
+_SMOOTHED = 1  # windows on each side
 _ROUNDS = 2
 
 
 class VoiceEvidence(NamedTuple):
-    """Points of speech, taken together.
+    """Sums of points of speech.
 
     Attributes
     ----------
     counts : np.ndarray [shape=(n,)], float64
-        How many points there are of each.
+        Number of points per row.
     sums : np.ndarray [shape=(n, d)], float64
-        Their sums.
+        Sum of the points per row.
     """
 
     counts: Float64
     sums: Float64
 
     def rows(self, rows: Int64 | Bool) -> "VoiceEvidence":
-        """Return some of it."""
+        """Select rows."""
         return VoiceEvidence(self.counts[rows], self.sums[rows])
 
 
 def summed(points: Float64, of: Int64, count: int) -> VoiceEvidence:
-    """Take points together.
+    """Sum points by row.
 
     Parameters
     ----------
     points : np.ndarray [shape=(n, d)], float64
     of : np.ndarray [shape=(n,)], int64
-        What each is of, from 0 to `count`, which is left out.
+        Row of each point, 0 to `count`; points with `count` are dropped.
     """
     own = (of == np.arange(count)[:, np.newaxis]).astype(np.float64)
     return VoiceEvidence(own.sum(axis=1), own @ points)
 
 
 def same_voice(one: VoiceEvidence, others: VoiceEvidence, spread: Float64) -> Float64:
-    """Return by how much likelier one voice is than two: the logarithm of the ratio.
+    """Return the log likelihood ratio of one voice over two.
 
-    Both are means of points of which those of a voice have variance 1 around its own mean, and
-    voices the variance `spread` (the two-covariance model of Brümmer and de Villiers, Odyssey
-    2010).
+    Evidence is a mean of points; points of one voice have variance 1 around the voice's mean, and
+    voice means have variance `spread` (the two-covariance model of Brümmer and de Villiers,
+    Odyssey 2010).
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def same_voice(one: VoiceEvidence, others: VoiceEvidence, spread: Float64) -> Fl
 
 
 class _Weighed(NamedTuple):
-    """Evidence as independent points, and how likely each is of one voice, as a logarithm."""
+    """Evidence as independent points, with the log likelihood of one voice."""
 
     counts: Float64  # shape (n,)
     sums: Float64  # shape (d, n)
@@ -78,7 +78,7 @@ class _Weighed(NamedTuple):
 
 
 def _weighed(evidence: VoiceEvidence, spread: Float64) -> _Weighed:
-    """Return evidence of the same means by as many independent points as it is worth."""
+    """Return evidence with equal means and the effective number of independent points."""
     counts = _INDEPENDENT * evidence.counts
     counts = counts / (1.0 + counts / _MOST_CERTAIN)
     sums = np.ascontiguousarray(evidence.sums.T) * (counts / evidence.counts)
@@ -91,7 +91,7 @@ def _ratio(one: _Weighed, others: _Weighed, spread: Float64) -> Float64:
 
 
 def _likelihood(counts: Float64, sums: Float64, spread: Float64) -> Float64:
-    """Return the logarithm of how likely one voice is, beside the mean of all voices."""
+    """Return the log likelihood of one voice, relative to the mean of all voices."""
     variance = spread[:, np.newaxis]
     scale = 1.0 + counts * variance
     terms = (sums**2 * (variance / scale)).sum(axis=0)
@@ -100,7 +100,7 @@ def _likelihood(counts: Float64, sums: Float64, spread: Float64) -> Float64:
 
 
 def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
-    """Join what is likelier of one voice than of two, the likeliest first.
+    """Merge evidence that is likelier of one voice than of two, likeliest first.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
     Returns
     -------
     np.ndarray [shape=(n,)], int64
-        The voice of each row, from 0 on.
+        Voice of each row, from 0.
     """
     counts, sums = evidence.counts.copy(), evidence.sums.copy()
     size = len(counts)
@@ -142,18 +142,18 @@ def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
 
 
 def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
-    """Tell the voices of a conversation apart.
+    """Separate the voices of a conversation.
 
     Parameters
     ----------
     points : np.ndarray [shape=(n, d)], float64
-        Of its windows, in the order of time.
+        Points of its windows, in time order.
     spread : np.ndarray [shape=(d,)], float64
 
     Returns
     -------
     np.ndarray [shape=(n,)], int64
-        The voice of each window, from 0 on.
+        Voice of each window, from 0.
     """
     of = merged_voices(VoiceEvidence(np.ones(len(points)), points), spread)
     for _ in range(_ROUNDS):
@@ -166,7 +166,7 @@ def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
 
 
 def _likeness(points: Float64, voices: VoiceEvidence, spread: Float64) -> Float64:
-    """Return the expected log likelihoods of points, but for what all voices have in common."""
+    """Return the expected log likelihoods of points, up to a term common to all voices."""
     counts, sums = _INDEPENDENT * voices.counts, _INDEPENDENT * voices.sums
     variance = spread / (1.0 + counts[:, np.newaxis] * spread)
     mean = variance * sums
@@ -175,7 +175,7 @@ def _likeness(points: Float64, voices: VoiceEvidence, spread: Float64) -> Float6
 
 
 def _smoothed(values: Float64) -> Float64:
-    """Take the mean of each row and its neighbours."""
+    """Average each row with its neighbours."""
     width = 2 * _SMOOTHED + 1
     padded = np.pad(values, ((_SMOOTHED, _SMOOTHED), (0, 0)), "edge")
     smoothed: Float64 = np.lib.stride_tricks.sliding_window_view(padded, width, 0).mean(axis=-1)
@@ -188,26 +188,26 @@ HOP_FRAMES = 10
 _NAMES = (
     *("zero_crossing_rate", "energy_entropy", "spectral_centroid", "spectral_spread"),
     *("spectral_entropy", "spectral_flux", "spectral_rolloff"),
-    *(f"mfcc_{number}" for number in range(2, 14)),  # the first one is the level
+    *(f"mfcc_{number}" for number in range(2, 14)),  # mfcc_1 is the level
 )
 ENERGY = "energy"
 _LOUD_PERCENTILE = 90
-_LOUD = 10 ** (-20 / 10)  # of the energy at that percentile
+_LOUD = 10 ** (-20 / 10)  # relative to the energy at that percentile
 _LEAST_DEVIATION = 0.05
 _TINY = 1e-9
 
 
 class VoiceSpace(NamedTuple):
-    """A space in which seconds of one voice scatter alike in all directions.
+    """A space in which windows of one voice scatter equally in all directions.
 
     Attributes
     ----------
     mean : np.ndarray [shape=(width,)], float64
-        Of descriptions of speech.
+        Mean of speech descriptors.
     axes : np.ndarray [shape=(d, width)], float64
-        Along each of them the variance of one voice is 1.
+        Scaled so that the variance of one voice is 1 along each axis.
     spread : np.ndarray [shape=(d,)], float64
-        Variance of the means of voices along each axis, descending.
+        Variance of voice means along each axis, descending.
     """
 
     mean: Float64
@@ -215,30 +215,30 @@ class VoiceSpace(NamedTuple):
     spread: Float64
 
     def points(self, described: Float64) -> Float64:
-        """Return where described windows lie, shape (n, d)."""
+        """Return the points of window descriptors, shape (n, d)."""
         points: Float64 = (described - self.mean) @ self.axes.T
         return points
 
 
 @cache
 def voice_space() -> VoiceSpace:
-    """Return the space that comes with hearthlog."""
+    """Return the voice space shipped with hearthlog."""
     arrays = load((files(__package__) / FILE).read_bytes())
     return VoiceSpace(*(arrays[name].astype(np.float64) for name in VoiceSpace._fields))
 
 
 def has_voices(names: Sequence[str]) -> bool:
-    """Tell whether features of these names can tell voices apart."""
+    """Return whether features of these names can separate voices."""
     return {ENERGY, *_NAMES} <= set(names)
 
 
 def window_starts(frames: int) -> Int64:
-    """Return where windows of some frames begin: one at least, if there is a frame."""
+    """Return the window starts for a number of frames; at least one window if there is a frame."""
     return np.arange(0, max(frames - WINDOW_FRAMES, 0) + 1, HOP_FRAMES)
 
 
 def describe_speech(values: Float32, names: Sequence[str]) -> Float64:
-    """Describe windows of speech: means and deviations of its features, in its loud frames.
+    """Return window descriptors: means and deviations of speech features in loud frames.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Logs in other formats, merged or cut."""
+"""Export, merging and cutting of logs."""

@@ -1,4 +1,4 @@
-"""Messages as Arrow record batches, and as Parquet files."""
+"""Conversion of messages to Arrow record batches and Parquet files."""
 
 import json
 from collections.abc import Sequence
@@ -22,21 +22,15 @@ _TYPES = {
     "int32": pa.int32(), "uint32": pa.uint32(), "int64": pa.int64(), "uint64": pa.uint64(),
     "float32": pa.float32(), "float64": pa.float64(), TIME: _MOMENT, DURATION: pa.duration("ns"),
 }  # fmt: skip
-_BYTES = {"byte", "char", "uint8"}  # arrays of them are binary
+_BYTES = {"byte", "char", "uint8"}  # arrays of these types become binary
 _HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
 
 
 def schema_of(table: Table, selection: LogSelection) -> pa.Schema:
-    """Return the Arrow schema of a table: log time, publish time, sequence, then its fields.
+    """Return the Arrow schema of a table: log time, publish time, sequence, then the fields.
 
-    Its metadata are those of the channels that are equal in all logs, and the `hearthlog` records
-    of the logs as a JSON list.
-
-    Parameters
-    ----------
-    table : Table
-    selection : LogSelection
-        Whose `hearthlog` records are among the metadata.
+    The schema metadata hold the channel metadata that are equal in all logs, and the `hearthlog`
+    records of the logs of `selection` as a JSON list.
     """
     first, *others = [channel.metadata for channel, _ in table.channels]
     agreed = {k: v for k, v in first.items() if all(other.get(k) == v for other in others)}
@@ -46,14 +40,14 @@ def schema_of(table: Table, selection: LogSelection) -> pa.Schema:
 
 
 def column_name(path: str) -> str:
-    """Name the column of a field: by its path, after `message.` where a time has that name."""
+    """Return the column name of a field: its path, after `message.` if a time column has it."""
     return f"message.{path}" if path in _HEADS else path
 
 
 def type_of(field: Field) -> pa.DataType:
     """Return the Arrow type of a field; stamps are timestamp[ns, UTC], durations duration[ns].
 
-    Arrays are lists, and arrays of bytes, as those of images, binary.
+    Arrays become lists; arrays of bytes, such as images, become binary.
     """
     if _is_binary(field):
         return pa.binary(field.size or -1)
@@ -73,17 +67,16 @@ def _is_binary(field: Field) -> bool:
 
 
 def batch_of(pieces: Sequence[TypedColumns], table: Table, schema: pa.Schema) -> pa.RecordBatch:
-    """Turn messages of one table into a record batch, in the order of their log times.
+    """Convert messages of one table to a record batch in log-time order.
 
-    A field that the messages of a piece lack is null in them.
+    Fields that a piece lacks are null.
 
     Parameters
     ----------
     pieces : sequence of TypedColumns
         At least one.
-    table : Table
     schema : pa.Schema
-        As `schema_of` returns it for the table.
+        Result of `schema_of` for the table.
     """
     batches = [
         pa.RecordBatch.from_arrays(
@@ -95,7 +88,7 @@ def batch_of(pieces: Sequence[TypedColumns], table: Table, schema: pa.Schema) ->
 
 
 def _arrays(piece: TypedColumns, table: Table) -> list[pa.Array]:
-    """Make the columns of the fields, by name; nulls for those that the messages do not have."""
+    """Return the field columns by name; nulls for fields missing from the messages."""
     found = piece.columns.fields
     return [
         array_of(found[path], field)
@@ -106,7 +99,7 @@ def _arrays(piece: TypedColumns, table: Table) -> list[pa.Array]:
 
 
 def in_order_of_time(batches: Sequence[pa.RecordBatch]) -> pa.RecordBatch:
-    """Join batches of one schema, sorted by log time."""
+    """Concatenate batches of one schema, sorted by log time."""
     if len(batches) == 1:
         return batches[0]
     (joined,) = pa.Table.from_batches(batches).combine_chunks().to_batches()
@@ -115,7 +108,7 @@ def in_order_of_time(batches: Sequence[pa.RecordBatch]) -> pa.RecordBatch:
 
 
 def head_arrays(columns: Columns) -> dict[str, pa.Array]:
-    """Return log times, publish times and sequence numbers, by the names of their columns."""
+    """Return log times, publish times and sequence numbers by column name."""
     return {
         "log_time": pa.array(columns.log_times).cast(_MOMENT),
         "publish_time": pa.array(columns.publish_times).cast(_MOMENT),
@@ -124,13 +117,13 @@ def head_arrays(columns: Columns) -> dict[str, pa.Array]:
 
 
 def array_of(values: NDArray[Any], field: Field) -> pa.Array:
-    """Turn a column of messages into an Arrow array.
+    """Convert a message column to an Arrow array.
 
     Parameters
     ----------
     values : np.ndarray [shape=(n, ...)]
-        As `Columns` has them: times as int64 nanoseconds; arrays as one row each, or as objects
-        where their lengths differ.
+        Format of `Columns`: times as int64 nanoseconds; arrays as one row each, or as objects if
+        their lengths differ.
     """
     kind = type_of(field)
     if not field.type:
@@ -144,7 +137,7 @@ def array_of(values: NDArray[Any], field: Field) -> pa.Array:
 
 
 def _array_of_arrays(values: NDArray[Any], field: Field, kind: pa.DataType) -> pa.Array:
-    """Turn a column of arrays of numbers into an Arrow array."""
+    """Convert a column of numeric arrays to an Arrow array."""
     if values.dtype == object:
         ends = np.cumsum([len(row) for row in values])
         flat = np.concatenate(list(values))
@@ -161,12 +154,12 @@ def _array_of_arrays(values: NDArray[Any], field: Field, kind: pa.DataType) -> p
 
 
 def _offsets(ends: Int64) -> pa.Array:
-    """Return where each row of a list begins, and the end of the last."""
+    """Return the start offset of each list row, and the end of the last row."""
     return pa.array(np.concatenate([[0], ends]), pa.int32())
 
 
 def _with_bytes(value: Any, field: Field) -> Any:
-    """Make bytes of the arrays of bytes in messages, and nulls of messages without fields."""
+    """Convert byte arrays in messages to bytes, and messages without fields to nulls."""
     if isinstance(value, dict):
         parts = {path: _with_bytes(part, field.elements[path]) for path, part in value.items()}
         return parts or None
@@ -179,9 +172,9 @@ _ROW_GROUP = 32 << 20  # bytes
 
 
 class ParquetFile:
-    """A Parquet file being written, row group by row group.
+    """Writer of a Parquet file, one row group at a time.
 
-    Stamps are of type timestamp[ns, UTC]; the metadata are those of `schema_of`.
+    Stamps have type timestamp[ns, UTC]; the metadata come from `schema_of`.
     """
 
     def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:
@@ -201,11 +194,11 @@ class ParquetFile:
             self._write_group()
 
     def finish(self) -> None:
-        """Write what is left, and the index."""
+        """Write the remaining rows and the index."""
         self._write_group().close()
 
     def _write_group(self) -> pq.ParquetWriter:
-        """Write a row group; the writer is made late, for there may be thousands of tables."""
+        """Write a row group; opens the writer late because there may be thousands of tables."""
         if self._writer is None:
             texts = [field.name for field in self._schema if field.type == pa.string()]
             self._writer = pq.ParquetWriter(

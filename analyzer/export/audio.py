@@ -1,4 +1,4 @@
-"""Clips of sound as WAV files, and segments as a label track of Audacity."""
+"""Export of audio clips as WAV files, and of segments as an Audacity label track."""
 
 import wave
 from collections.abc import Callable, Iterable, Sequence
@@ -23,17 +23,17 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.messages.topics import topic as topic_of
 
-_HOLE = 5_000_000  # ns: stamps are as good as 1 ms, and what is lost is a frame at least
-_FILE_LIMIT = 2 << 30  # bytes; WAV has no more than 4 GiB
+_HOLE = 5_000_000  # ns: stamps are accurate to 1 ms, and a loss is at least one frame
+_FILE_LIMIT = 2 << 30  # bytes; the WAV limit is 4 GiB
 
 
 class WavFiles:
-    """The clips of one topic, those that follow each other without a hole in one file.
+    """Writer of one topic's clips; consecutive clips without a gap share a file.
 
     Parameters
     ----------
     name : callable
-        Gives the path of the file that begins at a time, in nanoseconds of UTC.
+        Returns the path of the file that begins at a given time (nanoseconds of UTC).
     """
 
     def __init__(self, name: Callable[[int], Path]) -> None:
@@ -43,10 +43,10 @@ class WavFiles:
         self._size = 0
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
-        """Append the clips of messages; begin a new file after a hole, or where the format changes.
+        """Append clips; start a new file after a gap or a format change.
 
-        Raise `LogError` if the messages hold no sound that WAV can hold; the callable `name`
-        may raise it too.
+        Raise `LogError` if the messages hold no audio that fits WAV; the callable `name` may raise
+        it too.
         """
         try:
             for piece in pieces:
@@ -67,7 +67,7 @@ class WavFiles:
             self._size += len(clip.data)
 
     def finish(self) -> None:
-        """Complete the file that is open."""
+        """Complete the open file."""
         file, self._file, self._size = self._file, None, 0
         if file is not None:
             file.close()
@@ -98,10 +98,10 @@ WAV = Exporter(_save_wav, RAW_AUDIO, CLIP_FIELDS)
 
 
 class LabelTrack:
-    """A label track being written: start, end and label, separated by tabs.
+    """Writer of a label track: start, end and label, separated by tabs.
 
-    Times are seconds since the first frame of the microphone in the span or, without frames, since
-    the first segment. A segment that began before is cut.
+    Times are seconds since the microphone's first frame in the span or, without frames, since
+    the first segment. Segments that began earlier are clipped.
     """
 
     def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:
@@ -111,7 +111,7 @@ class LabelTrack:
     def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append segments.
 
-        Raise `LogError` if one of these fields is missing.
+        Raise `LogError` if a required field is missing.
         """
         for piece in pieces:
             self._write(piece.columns)
@@ -130,12 +130,12 @@ class LabelTrack:
         lines = [
             f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(printable(label).split())}\n"
             for start, end, label in rows
-            if end > 0  # or it ended before, and was logged in the span
+            if end > 0  # otherwise the segment ended before the span and was logged in it
         ]
         self._stream.write("".join(lines).encode())
 
     def finish(self) -> None:
-        """Complete the file, which needs nothing."""
+        """Do nothing: the file is complete after each write."""
 
 
 def _first_frame(topic: str, selection: LogSelection) -> int | None:

@@ -1,4 +1,4 @@
-"""Logs as bags of ROS 1 and ROS 2, and a folder of logs as one bag in place."""
+"""Export of logs as ROS 1 and ROS 2 bags, and a folder of logs described as one bag."""
 
 import re
 import warnings
@@ -46,7 +46,7 @@ _LITTLE_ENDIAN = b"\x00\x01"
 
 
 def _save_rosbag1(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
-    """Write a bag; the sequence numbers of headers, which ROS 2 does not have, are 0."""
+    """Write a ROS 1 bag; header sequence numbers, which ROS 2 lacks, are 0."""
     selection = selection.decodable()
     with Writer(files.path) as writer:
         bag = _Bag(writer)
@@ -57,7 +57,7 @@ def _save_rosbag1(selection: LogSelection, files: OutputFiles, progress: Progres
 
 
 class _Topic(NamedTuple):
-    """A connection of the bag, and how messages come to it."""
+    """A bag connection and the conversion of its messages."""
 
     connection: Connection
     types: Typestore
@@ -71,26 +71,26 @@ class _Topic(NamedTuple):
 
 
 class _Connections(list[Connection]):
-    """Connections of a bag, among which each is found at once by its number."""
+    """Bag connections with constant-time lookup by number."""
 
     def __contains__(self, connection: object) -> bool:
         return isinstance(connection, Connection) and connection == self[connection.id]
 
 
 class _Bag:
-    """The bag being written."""
+    """Writer of a ROS 1 bag."""
 
     def __init__(self, writer: Writer) -> None:
         self.fault: LogError | None = None
         self._writer = writer
         self._writer.connections = _Connections()
-        self._types = get_typestore(Stores.EMPTY)  # of ROS 1: the bag has one for each name
+        self._types = get_typestore(Stores.EMPTY)  # ROS 1 types: a bag has one definition per name
         self._topics: dict[Hashable, _Topic | None] = {}
         self._connections: dict[Hashable, Connection] = {}
         self._trimmed = 0
 
     def write(self, batch: list[RawMessages]) -> None:
-        """Append messages, in the order of their log times."""
+        """Append messages in log-time order."""
         rows = []
         for each in batch:
             topic = self._topic(each)
@@ -124,17 +124,17 @@ class _Bag:
         warnings.warn(HearthlogWarning(text, topic, each=True), stacklevel=2)
 
     def _trim(self) -> None:
-        """Replace the places of messages in written chunks by their number, which is enough."""
+        """Replace message positions of written chunks by their count, which is sufficient."""
         for chunk in self._writer.chunks[self._trimmed : -1]:
             counts = {key: range(len(each)) for key, each in chunk.connections.items()}
             chunk.connections = counts  # type: ignore[assignment]
         self._trimmed = len(self._writer.chunks) - 1
 
     def _topic(self, messages: RawMessages) -> _Topic | None:
-        """Find the connection for messages; None if the bag has no place for them."""
+        """Return the connection for messages; None if the bag cannot hold them."""
         channel, schema = messages.channel, messages.schema
         if schema is None or unreadable(channel, schema):
-            return None  # which was said of its topic
+            return None  # already reported for this topic
         latching = int(held_count(channel) > 0)
         key = channel.topic, schema.name, schema.encoding, schema.data, latching
         if key not in self._topics:
@@ -150,10 +150,10 @@ class _Bag:
         return self._topics[key]
 
     def _define(self, name: str, types: Typestore) -> tuple[str, str]:
-        """Return the definition of a type in the bag; LogError if that of another topic differs.
+        """Return the bag definition of a type; LogError if another topic's definition differs.
 
-        ROS 1 keeps neither comments nor bounds, and readers have one definition for a name. Of
-        constants, those that come first stay.
+        ROS 1 keeps neither comments nor bounds, and readers use one definition per name. The first
+        set of constants is kept.
         """
         built_on: dict[str, tuple[str, str]] = {}
         types.gendefhash(name, built_on)
@@ -173,7 +173,7 @@ class _Bag:
         return self._types.generate_msgdef(name)
 
     def _connect(self, topic: str, name: str, text: str, digest: str, latching: int) -> Connection:
-        """Add a connection unless there is one like it; the writer would search all of them."""
+        """Add a connection unless an equal one exists; the writer would search all of them."""
         key = topic, name, latching
         if key not in self._connections:
             definition_ = MessageDefinition(MessageDefinitionFormat.MSG, text)
@@ -189,9 +189,9 @@ class _Bag:
 
 
 def _readable(raw: RawMessages) -> RawMessages:
-    """Leave out messages that are not of their type, and texts that readers of bags would refuse.
+    """Drop messages that do not match their type, and repair texts that bag readers would refuse.
 
-    Question marks, of one byte, stand for what is not UTF-8.
+    Invalid UTF-8 is replaced by one-byte question marks.
     """
     try:
         decode([raw])
@@ -226,7 +226,7 @@ def _readable(raw: RawMessages) -> RawMessages:
 
 
 def _without_bounds(fields: Sequence[Any]) -> list[Any]:
-    """Leave out the bounds of texts and sequences, which ROS 1 does not have."""
+    """Remove bounds of texts and sequences, which ROS 1 lacks."""
     return [(name, _unbounded(*described)) for name, described in fields]
 
 
@@ -242,14 +242,14 @@ def _unbounded(node: Nodetype, details: Any) -> tuple[Nodetype, Any]:
 
 @lru_cache(256)
 def _types_of(name: str, encoding: str, text: bytes) -> tuple[str, Typestore]:
-    """Return the ROS 2 name of a type, and the types by which messages of it are encoded."""
+    """Return the ROS 2 name of a type, and the types that decode its messages."""
     ours = typestore()
     own = defined_types(name, encoding, text)
     name = name if name in ours.fielddefs else normalize_msgtype(name)
     if not own:
         return name, ours
     for each in (name, *own):
-        if not _TYPE_NAME.fullmatch(each):  # code is made of these types
+        if not _TYPE_NAME.fullmatch(each):  # code is generated from these types
             raise LogError(f"{each!r} is no name of a type")
     types = get_typestore(Stores.EMPTY)
     try:
@@ -270,7 +270,7 @@ _NO_PLACE = (
 
 
 def _save_rosbag2(selection: LogSelection, files: OutputFiles, progress: Progress) -> int:
-    """Write a log and `metadata.yaml`, without topics whose channels rosbag2 cannot tell apart."""
+    """Write a log and `metadata.yaml`, without topics whose channels rosbag2 cannot distinguish."""
     topics = [topic for topic, channels in selection.channels.items() if is_for_rosbag2(channels)]
     if selection.channels and not topics:
         raise LogError(_NO_PLACE)
@@ -283,21 +283,21 @@ def _save_rosbag2(selection: LogSelection, files: OutputFiles, progress: Progres
     with log.open("xb") as stream:
         record, repeated = write_log(selection, stream, log.name, progress)
     assert record is not None  # each topic has one description
-    information = record["serialized_metadata"]  # JSON, which is YAML too
+    information = record["serialized_metadata"]  # JSON, which is valid YAML
     text = f"rosbag2_bagfile_information: {information}\n"
     (files.path / "metadata.yaml").write_text(text, "utf-8")
     return repeated
 
 
 def _warn_of_definitions(selection: LogSelection) -> None:
-    """Warn of types with several definitions: readers of rosbag2 decode all by one of them."""
+    """Warn of types with several definitions: rosbag2 readers decode all by one of them."""
     known: dict[str, Any] = {}
     for topic, channels in selection.channels.items():
         for schema in [schema for _, schema in channels if schema is not None]:
             try:
                 types = defined_types(schema.name, schema.encoding, schema.data)
             except LogError:
-                continue  # its messages are copied all the same
+                continue  # its messages are copied regardless
             for name, (_, fields) in types.items():
                 if known.setdefault(name, fields) != fields:
                     text = f"{name} is defined in two ways, of which readers of rosbag2 take one"
@@ -312,28 +312,28 @@ _DESCRIPTION = {"offered_qos_profiles", "topic_type_hash"}
 
 
 class BagInPlace(NamedTuple):
-    """What was made of a folder of logs."""
+    """Result of describing a folder of logs as a bag."""
 
-    metadata: Path  # the file
-    unfinished: list[Path]  # logs that were not completed, or have no messages; not in the bag
-    overlapping: list[Path]  # logs that begin before an earlier one of the bag ends
+    metadata: Path  # the metadata file
+    unfinished: list[Path]  # incomplete or empty logs, not in the bag
+    overlapping: list[Path]  # logs that begin before an earlier log of the bag ends
 
 
 def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagInPlace:
-    """Write a `metadata.yaml` that makes one bag of all finished logs of a folder, or replace it.
+    """Write or replace a `metadata.yaml` that makes one bag of all finished logs in a folder.
 
-    Layers are left out: rosbag2 reads one file after the other.
+    Layers are omitted: rosbag2 reads files one after the other.
 
     Parameters
     ----------
     progress : callable
-        Is told the share that is done, 0 to 1.
+        Receives the completed share, 0 to 1.
 
     Raises
     ------
     LogError
-        If there is no folder or no finished log in it, if a log is damaged, if a topic is of
-        different types or qualities of service, or if the file cannot be written.
+        If the folder or a finished log is missing, a log is damaged, a topic has different types
+        or qualities of service, or the file cannot be written.
     """
     if not (is_local(folder) and folder.is_dir()):
         raise LogError(f"{folder}: is no folder of this machine; name that of the logs")
@@ -357,7 +357,7 @@ def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagIn
 
 
 def _overlapping(files: Sequence[FileCounts]) -> Iterator[str]:
-    """Give the names of files that begin before an earlier one ends; rosbag2 merges nothing."""
+    """Yield names of files that begin before an earlier file ends; rosbag2 does not merge."""
     latest = 0
     for file in files:
         start, end = file.span
@@ -367,7 +367,7 @@ def _overlapping(files: Sequence[FileCounts]) -> Iterator[str]:
 
 
 def _count(log: Path, folder: Path) -> FileCounts | None:
-    """Count the messages of a log by its index; None if it was not completed, or has none."""
+    """Count the messages of a log from its index; None if the log is incomplete or empty."""
     with LogFile(log) as file:
         statistics = file.statistics
         if not file.complete or statistics is None or not statistics.message_count:
@@ -385,7 +385,7 @@ def _count(log: Path, folder: Path) -> FileCounts | None:
 
 
 def _check_topics(files: Sequence[FileCounts]) -> None:
-    """Check that every topic is the same in all files."""
+    """Check that every topic is described equally in all files."""
     known: dict[str, tuple[object, str]] = {}
     for file in files:
         for name, identity in _identities(file):

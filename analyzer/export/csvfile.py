@@ -1,4 +1,4 @@
-"""A topic as CSV: a column for each number, with the name that the channel gives it."""
+"""Export of a topic as CSV: one column per number, named by the channel."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -25,24 +25,24 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.fields import DURATION, Field
 
-_CONTROLS = r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # CSV has tabs and the ends of lines alone
+_CONTROLS = r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # CSV allows only tabs and line ends
 _IN_THEIR_PLACE = "\ufffd"
 
 
 class CsvFile:
-    """A CSV file being written.
+    """Writer of a CSV file.
 
-    Arrays are spread into columns, such as `mean.energy` where the channel has names for the
-    elements, otherwise `values[0]`; arrays of messages and very long ones are JSON, and bytes are
-    in base64. Stamps are UTC, durations are in seconds. Control characters of texts become U+FFFD,
-    and an apostrophe stands before a text that a spreadsheet would take for a formula.
+    Arrays are spread over columns, such as `mean.energy` if the channel names the elements,
+    otherwise `values[0]`; arrays of messages and very long arrays are JSON, and bytes are
+    base64. Stamps are UTC, durations are seconds. Control characters become U+FFFD, and an
+    apostrophe precedes texts that a spreadsheet would take for a formula.
     """
 
     def __init__(self, stream: BinaryIO, table: Table, selection: LogSelection) -> None:  # noqa: ARG002
         self._stream = stream
         self._table = table
-        self._names: dict[str, list[str]] = {}  # of elements of arrays, in any log
-        self._widths: dict[str, int | None] = {}  # of arrays without names; None: as JSON
+        self._names: dict[str, list[str]] = {}  # element names of arrays, from any log
+        self._widths: dict[str, int | None] = {}  # without names; None: as JSON
         self._schema: pa.Schema | None = None
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
@@ -51,12 +51,12 @@ class CsvFile:
         Parameters
         ----------
         pieces : sequence of TypedColumns
-            Messages of the table. Those of the first call decide how many columns an array has.
+            Messages of the table. The first call fixes the number of columns of each array.
 
         Raises
         ------
         LogError
-            If there is no column for a value, or not one name for each element of an array.
+            If a value has no column, or the names do not match the elements of an array.
         """
         is_first = self._schema is None
         if is_first:
@@ -75,10 +75,10 @@ class CsvFile:
         self._stream.write(text.getvalue())
 
     def finish(self) -> None:
-        """Complete the file, which needs nothing."""
+        """Do nothing: the file is complete after each write."""
 
     def _measure_arrays(self, pieces: Sequence[TypedColumns]) -> None:
-        """Decide which columns the elements of each array have."""
+        """Choose the columns of each array."""
         for path, field in self._table.fields.items():
             if field.size is None or field.elements or field.type == "uint8":
                 continue
@@ -94,7 +94,7 @@ class CsvFile:
                 for array in arrays
             ]
             width = max(widths, default=0)
-            is_unknown = not arrays and not self._names[path]  # only later messages have it
+            is_unknown = not arrays and not self._names[path]  # only later messages have this field
             self._widths[path] = None if is_unknown or width > MOST_COLUMNS else width
 
     def _columns(self, piece: TypedColumns) -> dict[str, pa.Array]:
@@ -116,7 +116,7 @@ class CsvFile:
         return arrays
 
     def _spread(self, piece: TypedColumns, path: str, field: Field) -> dict[str, pa.Array]:
-        """Make a column for each element of an array, and for those that only other logs have."""
+        """Return a column per array element, including elements that only other logs have."""
         width, own = self._widths[path], array_names(piece.columns.metadata, path)
         missing = pa.nulls(len(piece.columns), type_of(field._replace(size=None)))
         columns = {f"{path}.{name}": missing for name in self._names[path]}
@@ -159,7 +159,7 @@ def _harmless(column: pa.Array) -> pa.Array:
 
 
 def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
-    """Make a column for each element of an array field."""
+    """Return a column per element of an array field."""
     element = field._replace(size=None)
     if values.ndim == 2:
         return [array_of(column, element) for column in np.ascontiguousarray(values.T)]

@@ -1,4 +1,4 @@
-"""Export of a selection: tables of topics, their files, and the run of a format."""
+"""Export of a selection: tables of topics, output files, and the run of a format."""
 
 import io
 import os
@@ -41,24 +41,23 @@ from hearthlog.schemas.messages.message_types import number_type
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.new_files import new_file, new_folder
 
-MOST_COLUMNS = 4096  # of an array whose elements have no names; images have more
-_NAMED = 8  # fields in a line
+MOST_COLUMNS = 4096  # per array without element names; images have more
+_NAMED = 8  # fields per line
 
 
 class Table(NamedTuple):
-    """The messages of a topic that fit into one table: of one type, however often it changed.
+    """Messages of one topic and type that fit one table, across definition changes.
 
     Attributes
     ----------
-    topic, type : str
     number : int
         0 for the first table of its topic.
     fields : mapping of str to Field
-        Those that any definition of the type has, wide enough for all, by path.
+        Union of the fields of all definitions, wide enough for each, by path.
     definitions : sequence of mapping of str to Field
         Fields of each definition.
     channels : sequence of (Channel, Schema or None)
-        Those with such messages.
+        Channels with messages of this table.
     """
 
     topic: str
@@ -75,7 +74,7 @@ class Table(NamedTuple):
 
     @property
     def stem(self) -> str:
-        """Name of its file, without a suffix."""
+        """File name without suffix."""
         return file_stem(f"{self.topic} {self.type}" if self.number else self.topic)
 
 
@@ -84,15 +83,14 @@ def tables_of(topic: str, channels: Iterable[Described]) -> list[Table]:
 
     Parameters
     ----------
-    topic : str
     channels : iterable of (Channel, Schema or None)
-        Its channels, whose definitions can be read.
+        Channels of the topic with readable definitions.
 
     Returns
     -------
     list of Table
-        One, unless the topic has several types, or a field of a type changed so that no column
-        holds all of its values.
+        One, unless the topic has several types, or a field's type changed so that no column
+        type holds all its values.
     """
     groups: list[tuple[str, list[Mapping[str, Field]], list[Described]]] = []
     for channel, schema in channels:
@@ -111,7 +109,7 @@ def tables_of(topic: str, channels: Iterable[Described]) -> list[Table]:
 
 
 def _fits(fields: Mapping[str, Field], definitions: list[Mapping[str, Field]]) -> bool:
-    """Add a definition to others if there is one table for all of them."""
+    """Add a definition to others if one table fits all of them; return whether it does."""
     if any(fields == other for other in definitions):
         return True
     try:
@@ -123,7 +121,7 @@ def _fits(fields: Mapping[str, Field], definitions: list[Mapping[str, Field]]) -
 
 
 def table_of(piece: TypedColumns, tables: Sequence[Table]) -> Table:
-    """Find the table of decoded messages among those of their topic."""
+    """Return the table of decoded messages among the tables of their topic."""
     if len(tables) == 1:
         return tables[0]
     return next(
@@ -134,15 +132,14 @@ def table_of(piece: TypedColumns, tables: Sequence[Table]) -> Table:
 
 
 def with_numbers(columns: Columns, table: Table, paths: Collection[str]) -> Columns:
-    """Select fields of messages, their numbers as the types that the table has.
+    """Select fields of messages, with numbers converted to the table's types.
 
     Parameters
     ----------
     columns : Columns
-        Messages of the table, which have these fields.
-    table : Table
+        Messages of the table that have these fields.
     paths : collection of str
-        Of the fields.
+        Field paths.
     """
     fields: dict[str, NDArray[Any]] = {}
     for path in paths:
@@ -154,7 +151,7 @@ def with_numbers(columns: Columns, table: Table, paths: Collection[str]) -> Colu
 
 
 def warn_of_changes(tables: Sequence[Table]) -> None:
-    """Warn where definitions differ between the messages of a topic, and say what becomes of it."""
+    """Warn of definition changes within a topic, and of their effect on the export."""
     for table in tables:
         optional = optional_fields(table.definitions)
         if optional:
@@ -194,12 +191,12 @@ def _why_apart(tables: Sequence[Table]) -> str:
 
 
 class OutputFiles:
-    """The files of an export, under temporary names until all are written.
+    """Files of an export, under temporary names until all are written.
 
     Parameters
     ----------
     path : Path
-        The only file, which does not exist, or an empty folder.
+        The single output file, which must not exist, or an empty folder.
     """
 
     def __init__(self, path: Path, output: Path, suffix: str) -> None:
@@ -210,21 +207,21 @@ class OutputFiles:
 
     @property
     def remedy(self) -> str:
-        """The advice where one file is not enough."""
+        """Advice for exports that need more than one file."""
         return f"name a folder, with --format {self._suffix}, for a file of each"
 
     def new(self, stem: str) -> Path:
-        """Name a new file in the folder, or the only file.
+        """Return the path of a new file in the folder, or of the single file.
 
         Parameters
         ----------
         stem : str
-            Name without a suffix, for a file in a folder; a number is added if it is taken.
+            File name without suffix, in a folder; a number is added if the name is taken.
 
         Raises
         ------
         LogError
-            If there is already the only file.
+            If the single file already exists.
         """
         path = self.path
         if path.is_dir():
@@ -238,16 +235,16 @@ class OutputFiles:
 
 
 class Exporter(NamedTuple):
-    """How a format writes messages.
+    """Export function of a format.
 
     Attributes
     ----------
     save : callable
-        Writes a selection to files; returns how many messages were left out because several logs
-        hold them. Raises LogError if a log is damaged, if there is no message, or one that the
-        format has no place for.
+        Writes a selection to files; returns the number of messages omitted as duplicates of
+        other logs. Raises LogError if a log is damaged, if there is no message, or if the format
+        cannot hold a message.
     type : str
-        The only message type that it takes; empty for any.
+        The only supported message type; empty for any.
     """
 
     save: Callable[[LogSelection, OutputFiles, Progress], int | None]
@@ -256,7 +253,7 @@ class Exporter(NamedTuple):
 
 
 class TableWriter(Protocol):
-    """The files of one table being written."""
+    """Writer of one table's files."""
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append messages of the table.
@@ -264,18 +261,18 @@ class TableWriter(Protocol):
         Parameters
         ----------
         pieces : sequence of TypedColumns
-            The messages of the next span of time, of one definition each; at least one.
+            Messages of the next time span, one definition per piece; at least one.
 
         Raises
         ------
         LogError
-            If the format has no place for them.
+            If the format cannot hold the messages.
         """
 
     def finish(self) -> bool | None:
-        """Complete what was written; return whether the messages have to be read once more.
+        """Complete the files; return whether the messages must be read once more.
 
-        It may raise LogError as `write` does.
+        May raise LogError, as `write` does.
         """
 
 
@@ -286,21 +283,21 @@ def write_tables(
     opened: Callable[[Table], TableWriter],
     type_: str = "",
 ) -> None:
-    """Write the messages of each table with a writer of its own.
+    """Write the messages of each table with a separate writer.
 
-    A topic that the format has no place for is left out, with a warning, unless there is no other.
+    Topics that the format cannot hold are skipped with a warning, unless no topic is left.
 
     Parameters
     ----------
     progress : callable
-        Is told the share that is done, 0 to 1.
+        Receives the completed share, 0 to 1.
     type_ : str
-        Name of the only message type that is written; empty for any.
+        The only message type that is written; empty for any.
 
     Raises
     ------
     LogError
-        If a log is damaged, if there is no message, or if the format has no place for any.
+        If a log is damaged, if there is no message, or if the format can hold none of them.
     """
     writing = _Writing(files, opened, type_)
     selection = selection.decodable()
@@ -312,7 +309,7 @@ def write_tables(
 
 
 def by_topic(pieces: Iterable[TypedColumns]) -> dict[str, list[TypedColumns]]:
-    """Put decoded messages together by their topics."""
+    """Group decoded messages by topic."""
     topics: dict[str, list[TypedColumns]] = {}
     for piece in pieces:
         topics.setdefault(piece.columns.topic, []).append(piece)
@@ -320,7 +317,7 @@ def by_topic(pieces: Iterable[TypedColumns]) -> dict[str, list[TypedColumns]]:
 
 
 class _Writing:
-    """The tables that are being written, and those that could not be."""
+    """Tables in progress, and tables that failed."""
 
     def __init__(
         self, files: OutputFiles, opened: Callable[[Table], TableWriter], type_: str
@@ -333,7 +330,7 @@ class _Writing:
         self._faults: dict[tuple[str, int], LogError] = {}
 
     def read(self, selection: LogSelection, progress: Progress) -> set[str]:
-        """Write the messages of a selection; return the topics that have to be read once more."""
+        """Write the messages of a selection; return the topics that must be read once more."""
         for batch in selection.messages(progress):
             for topic, pieces in by_topic(decode_all(batch)).items():
                 self._write(topic, selection.channels[topic], pieces)
@@ -377,7 +374,7 @@ class _Writing:
         self._made[table.topic, number] = self._files.made[first:]
 
     def _try(self, key: tuple[str, int], step: Callable[[], bool | None]) -> bool | None:
-        """Write to a table; delete it if the format has no place for what is written."""
+        """Write to a table; delete the table if the format cannot hold the data."""
         first = len(self._files.made)
         result = None
         try:
@@ -391,7 +388,7 @@ class _Writing:
         return result
 
     def finish(self) -> bool:
-        """Warn of topics that are left out; return whether there are others."""
+        """Warn of skipped topics; return whether any topic was written."""
         if self._faults and not self._writers:
             raise next(iter(self._faults.values()))
         for (topic, _), fault in self._faults.items():
@@ -407,9 +404,9 @@ def type_name(described: Described) -> str:
 
 
 class TableFile(io.RawIOBase):
-    """A new file that is open only while it is written to: there may be thousands.
+    """New file that is open only during writes: there may be thousands.
 
-    What is written after it was deleted goes nowhere.
+    Writes after deletion are discarded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -419,11 +416,11 @@ class TableFile(io.RawIOBase):
         path.open("xb").close()
 
     def writable(self) -> bool:
-        """Tell that it can be written to."""
+        """Return True."""
         return True
 
     def tell(self) -> int:
-        """Return the bytes that were written."""
+        """Return the number of bytes written."""
         return self._size
 
     def write(self, data: Any, /) -> int:
@@ -443,12 +440,12 @@ def table_exporter(
     type_: str = "",
     fields: Collection[str] = (),
 ) -> Exporter:
-    """Make the exporter of a format whose files are streams of one table each.
+    """Return the exporter of a format with one stream per table.
 
     Parameters
     ----------
     type_ : str
-        Name of the only message type that the format takes; empty for any.
+        The only supported message type; empty for any.
     """
 
     def save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
@@ -462,9 +459,9 @@ def table_exporter(
 
 
 def exportable(selection: LogSelection, format_: ExportFormat) -> LogSelection:
-    """Leave out the topics that a format is not for, as WAV is for clips of sound.
+    """Drop topics that a format does not support (WAV supports audio clips only).
 
-    Raise `LogError` if the selection has logs, and no topic is left.
+    Raise `LogError` if the selection has logs but no topic is left.
     """
     exporter = _exporter(format_)
     if not exporter.type:
@@ -493,16 +490,16 @@ def export(
     Parameters
     ----------
     progress : callable
-        Is told the share that is done, 0 to 1.
+        Receives the completed share, 0 to 1.
     folder : bool
-        Make a folder with one file for each topic (WAV: for each clip); otherwise one file, of one
+        Write a folder with one file per topic (WAV: per clip); otherwise a single file, of one
         topic if the format is `by_topic`.
 
     Raises
     ------
     LogError
-        If a log is damaged, if there is no message, or one that the format has no place for, or
-        if the output cannot be written; there is no output then.
+        If a log is damaged, there is no message, the format cannot hold a message, or the
+        output cannot be written; no output is left then.
     """
     new = new_folder if folder or format_.is_folder else new_file
     with new(output) as temporary:

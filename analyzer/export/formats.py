@@ -1,4 +1,4 @@
-"""The table of export formats, and the names of exported files.
+"""Table of export formats, and names of exported files.
 
 A format is an `Exporter` in a module of this folder, and a row here.
 """
@@ -8,18 +8,18 @@ from typing import NamedTuple
 
 
 class ExportFormat(NamedTuple):
-    """A format of exports."""
+    """An export format."""
 
-    name: str  # and the suffix of its files
+    name: str  # also the file suffix
     module: str
-    exporter: str  # by its name in the module
-    note: str = ""  # whose format it is
-    by_topic: bool = True  # whether a file is for one topic
+    exporter: str  # name of the `Exporter` in the module
+    note: str = ""  # origin of the format
+    by_topic: bool = True  # whether each file holds one topic
     is_folder: bool = False
 
     @property
     def pattern(self) -> str:
-        """How its files are named, and what they are: `*.bag (ROS 1)`."""
+        """Pattern and description of the files: `*.bag (ROS 1)`."""
         return f"*.{self.name} ({self.note})" if self.note else f"*.{self.name}"
 
 
@@ -41,23 +41,23 @@ _LENGTH = 100  # characters
 
 
 def file_stem(topic: str) -> str:
-    """Make a part of a file name from a topic: `mic_features` from `/mic/features`.
+    """Return a file name part for a topic: `mic_features` for `/mic/features`.
 
     Returns
     -------
     str
-        At most 100 letters, digits and `_`; `topic` if nothing is left.
+        At most 100 letters, digits and `_`; `topic` if none remain.
     """
     return re.sub(r"[^A-Za-z0-9]+", "_", topic).strip("_")[:_LENGTH] or "topic"
 
 
 def unused_name(name: str, taken: dict[str, int]) -> str:
-    """Return a name that is not taken, with a number before its suffix if need be.
+    """Return an unused name, with a number before the suffix if necessary.
 
     Parameters
     ----------
     name : str
-        The name that is wanted; becomes `name-2.suffix` and so on.
+        Preferred name; becomes `name-2.suffix` and so on.
     """
     stem, dot, suffix = name.rpartition(".")
     before, behind = (stem, dot + suffix) if stem else (name, "")

@@ -1,4 +1,4 @@
-"""Logs merged, or a part of them cut out: messages are copied as they are."""
+"""Merging and cutting of logs; messages are copied unchanged."""
 
 import hashlib
 import json
@@ -44,18 +44,18 @@ from hearthlog.schemas.salvage.whole_records import (
 
 
 def without_repeats(batch: Sequence[RawMessages]) -> list[RawMessages]:
-    """Leave out messages that another log holds, too.
+    """Drop messages that another log already provides.
 
     Parameters
     ----------
     batch : sequence of RawMessages
-        With all messages of a log time, or none.
+        Holds either all messages of a log time or none.
 
     Returns
     -------
     list of RawMessages
-        Of messages with the same topic, times, sequence and bytes, the first ones stay: as many as
-        one log has. Equal messages of one log are no repeats.
+        The first messages of equal topic, times, sequence and bytes: as many as one log has.
+        Equal messages within one log are not duplicates.
     """
     topics: dict[tuple[str, str, str], list[int]] = {}
     for place, messages in enumerate(batch):
@@ -74,11 +74,11 @@ def without_repeats(batch: Sequence[RawMessages]) -> list[RawMessages]:
 
 
 def _repeated(parts: Sequence[RawMessages]) -> list[Indices]:
-    """Find the rows of each part that repeat one of another source, in an earlier part."""
+    """Return the rows of each part that duplicate a row of another source in an earlier part."""
     dropped: list[list[Indices]] = [[np.arange(0)] for _ in parts]
     numbers = {source: number for number, source in enumerate({part.source for part in parts})}
     sources = [numbers[part.source] for part in parts]
-    records: dict[int, list[tuple[int, Indices, NDArray[np.void]]]] = {}  # by their size
+    records: dict[int, list[tuple[int, Indices, NDArray[np.void]]]] = {}  # by record size
     for place, rows in enumerate(_of_shared_times(parts, sources)):
         for block in message_blocks(parts[place].take(rows), 0):
             data = block.records()
@@ -110,7 +110,7 @@ def _numbered(equal: Indices, sources: Indices) -> Indices:
 
 
 def _of_shared_times(parts: Sequence[RawMessages], sources: Sequence[int]) -> list[Indices]:
-    """Find the rows of each part whose log time another source has as well."""
+    """Return the rows of each part whose log time also occurs in another source."""
     counts = [len(part) for part in parts]
     times = np.concatenate([part.log_times for part in parts])
     of_source = np.repeat(sources, counts)
@@ -125,10 +125,10 @@ def _of_shared_times(parts: Sequence[RawMessages], sources: Sequence[int]) -> li
 _PIECE = 1 << 20  # bytes
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters
-_BRACKETS = 2000  # of all profiles, which have four each in JSON
-_FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
-_DEPTH = 10  # of ROS 2's default profile
-_CHUNK_SPAN = 10 * NANOSECONDS  # as a recorder's
+_BRACKETS = 2000  # in all profiles; each has four in JSON
+_FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several encodings of infinity, including 0
+_DEPTH = 10  # ROS 2 default profile
+_CHUNK_SPAN = 10 * NANOSECONDS  # same as the recorder
 
 
 def merge_logs(
@@ -138,40 +138,40 @@ def merge_logs(
     *,
     latched: bool = False,
 ) -> int:
-    """Write the messages of a selection to one log, in the order of their log times.
+    """Write the messages of a selection to one log, in log-time order.
 
-    Messages of one time keep the order of their log. What several logs hold, with the same topic,
-    times, sequence and bytes, is written once, and so is a chunk that a log holds twice. Channels
-    of equal topic, definition and metadata become one. Metadata records and attachments of the logs
-    are copied, equal ones once; the `rosbag2` record is made anew.
+    Messages of equal time keep the order of their log. Messages that several logs hold (equal
+    topic, times, sequence and bytes) are written once, and so are chunks that a log holds twice.
+    Channels of equal topic, definition and metadata become one. Metadata records and attachments
+    are copied, equal ones once; the `rosbag2` record is rebuilt.
 
     Parameters
     ----------
     progress : callable
-        Is told the share that is done, 0 to 1.
+        Receives the completed share, 0 to 1.
     latched : bool
-        Begin with what a late subscriber would still receive: of each channel that is transient
-        local without end, as many of its last messages before the span as it keeps, with the log
-        time of the first message in the span, and their own publish times.
+        Begin with the messages that a late subscriber would still receive: for each transient
+        local channel without expiry, the last messages before the span up to its depth, with the
+        log time of the first message in the span and their own publish times.
 
     Raises
     ------
     LogError
-        If a log is damaged, if there is no message, if there are more channels than a log can
-        have, or if the output exists or cannot be written.
+        If a log is damaged, there is no message, there are more channels than a log can have,
+        or the output exists or cannot be written.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
         return write_log(selection, stream, output.name, progress, latched=latched).repeated
 
 
 class WrittenLog(NamedTuple):
-    """What came of a log that was written.
+    """Result of writing a log.
 
     Attributes
     ----------
     record : mapping of str to str, or None
-        Its `rosbag2` record; None, and no record, if a topic has channels that rosbag2 cannot tell
-        apart, or no ROS 2 messages.
+        The `rosbag2` record; None, and no record in the log, if a topic has channels that
+        rosbag2 cannot distinguish, or no ROS 2 messages.
     """
 
     record: Mapping[str, str] | None
@@ -191,13 +191,12 @@ def write_log(
     Parameters
     ----------
     progress : callable
-        Is told the share that is done, 0 to 1.
+        Receives the completed share, 0 to 1.
 
     Raises
     ------
     LogError
-        If a log is damaged, if there is no message, or if there are more channels than a log can
-        have.
+        If a log is damaged, there is no message, or there are more channels than a log can have.
     """
     batches = selection.messages(progress, once=True)
     first = next(batches, None)
@@ -227,11 +226,11 @@ def _count_repeated(selection: LogSelection) -> int:
 
 
 def _pass_over(_: Path, __: LogError) -> None:
-    """Leave out a chunk of which a warning tells already."""
+    """Ignore a damaged chunk, which another warning already reports."""
 
 
 class _Log:
-    """The log being written."""
+    """Writer of a merged log."""
 
     def __init__(self, stream: BinaryIO, selection: LogSelection) -> None:
         self._writer = CountedWriter(stream, chunk_span=_CHUNK_SPAN)
@@ -248,7 +247,7 @@ class _Log:
                 self._channel(described)
 
     def write(self, batch: Sequence[RawMessages]) -> None:
-        """Append messages; those of one time keep the order in which they were read."""
+        """Append messages; messages of equal time keep their read order."""
         places: dict[int, int] = {}
         end = 0
         blocks: list[Block] = []
@@ -268,7 +267,7 @@ class _Log:
         self._writer.write(blocks)
 
     def finish(self, name: str) -> Mapping[str, str] | None:
-        """Complete the log; return its `rosbag2` record, if it has one."""
+        """Complete the log; return its `rosbag2` record, or None."""
         topics = self._topics()
         span = self._span if self._counts else (0, 0)
         record = None if topics is None else rosbag2_metadata(name, topics, span)
@@ -303,7 +302,7 @@ class _Log:
     def _copy_large_attachment(
         self, file: LogFile, place: RecordLocation, seen: set[Hashable], names: dict[str, int]
     ) -> None:
-        """Copy an attachment that is larger than is read at once."""
+        """Copy an attachment above the single-read limit."""
         head = _head_of_large(file, place)
         index = head.index_record
         data = RecordLocation(place.opcode, place.offset + head.first, index.data_size)
@@ -343,7 +342,7 @@ class _Log:
         return self._schemas[key]
 
     def _topics(self) -> dict[str, TopicCount] | None:
-        """Describe the topics for rosbag2; None if it cannot describe them."""
+        """Describe the topics for rosbag2; None if rosbag2 cannot represent them."""
         topics: dict[str, TopicCount] = {}
         channels: dict[str, list[Described]] = {}
         for number, (channel, schema) in self._described.items():
@@ -355,7 +354,7 @@ class _Log:
 
 
 def is_for_rosbag2(channels: Sequence[Described]) -> bool:
-    """Return whether rosbag2 has one description for the channels of a topic."""
+    """Return whether rosbag2 can describe all channels of a topic as one."""
     described = [
         ("" if schema is None else schema.name, bag_metadata(channel))
         for channel, schema in channels
@@ -373,7 +372,7 @@ def _profile(logs: Sequence[Path]) -> str:
 
 
 def _head_of_large(file: LogFile, place: RecordLocation) -> AttachmentHead:
-    """Read what stands before the data of an attachment, which must be where the index says."""
+    """Read the header of an attachment, which must be where the index says."""
     _, offset, length = place
     begin = HEAD.pack(Opcode.ATTACHMENT, length - HEAD.size)
     if offset + length > file.size or file.read(offset, HEAD.size) != begin:
@@ -388,14 +387,14 @@ def _head_of_large(file: LogFile, place: RecordLocation) -> AttachmentHead:
 
 
 def _pieces(file: LogFile, place: RecordLocation) -> Iterator[bytes]:
-    """Read bytes of a file, a megabyte at a time."""
+    """Yield bytes of a file in pieces of one megabyte."""
     end = place.offset + place.length
     for start in range(place.offset, end, _PIECE):
         yield file.read(start, min(_PIECE, end - start))
 
 
 def _key(record: McapRecord | None) -> Hashable:
-    """Return a key that equal records share; None for those that are not copied."""
+    """Return a key shared by equal records; None for records that are not copied."""
     if isinstance(record, Metadata) and record.name != ROSBAG2_METADATA:
         return record.name, frozenset(record.metadata.items())
     if isinstance(record, Attachment):
@@ -432,7 +431,7 @@ def _held_messages(
 
 
 def _without_first(parts: Sequence[RawMessages], count: int) -> list[RawMessages]:
-    """Leave out the first messages of several logs."""
+    """Drop the first messages of several logs."""
     order = np.argsort(np.concatenate([part.log_times for part in parts]), kind="stable")
     is_kept = np.zeros(len(order), bool)
     is_kept[order[count:]] = True
@@ -450,11 +449,11 @@ def _earlier(
 
 
 def _logs_of_held(selection: LogSelection, topics: Collection[str]) -> list[Path]:
-    """Find the logs with the messages that channels of some topics keep, from the last log on."""
+    """Return the logs with the retained messages of some topics, from the last log backwards."""
     logs: list[Path] = []
     missing = set(topics)
     counts: Counter[Hashable] = Counter()
-    sources: Counter[str] = Counter()  # logs with messages of a topic
+    sources: Counter[str] = Counter()  # logs per topic
     for path in selection.earlier:
         if not missing:
             break
@@ -479,7 +478,7 @@ def _logs_of_held(selection: LogSelection, topics: Collection[str]) -> list[Path
 
 
 def _has_all(counts: Counter[Hashable], depths: Mapping[Hashable, float]) -> bool:
-    """Return whether the publishers have as many messages as they keep; copies have others."""
+    """Return whether all publishers reached their depth; copies have different publishers."""
     known = counts.keys() & depths.keys()
     return bool(known) and all(counts[each] >= depths[each] for each in known)
 
@@ -494,7 +493,7 @@ def _counts(batches: Iterable[Sequence[RawMessages]]) -> Counter[Hashable]:
 
 
 def _publisher(messages: RawMessages) -> Hashable:
-    """Return a key of who published messages; a topic of ours has one publisher."""
+    """Return a key of the publisher of messages; hearthlog topics have one publisher."""
     channel, schema = messages.channel, messages.schema
     if schema is not None and schema.name.startswith(f"{PACKAGE}/"):
         return channel.topic
@@ -502,20 +501,20 @@ def _publisher(messages: RawMessages) -> Hashable:
 
 
 def _at(time: int, messages: RawMessages) -> RawMessages:
-    """Return messages as if they were logged at another time."""
+    """Return messages with another log time."""
     heads = messages.heads.copy()
     heads["log_time"] = time
     return replace(messages, heads=heads)
 
 
 def held_count(channel: Channel) -> float:
-    """Return how many of its last messages a late subscriber still receives, however old they are.
+    """Return how many past messages a late subscriber still receives, of any age.
 
     Parameters
     ----------
     channel : Channel
-        Its metadata `offered_qos_profiles` has a profile of each publisher. A publisher that is
-        volatile, or whose messages expire, keeps none; one whose depth is not known, ten.
+        Its metadata `offered_qos_profiles` has one profile per publisher. Volatile publishers
+        and publishers with expiring messages keep none; publishers of unknown depth keep ten.
 
     Returns
     -------
@@ -540,16 +539,16 @@ def _held_by(profile: Mapping[str, Any]) -> float:
     depth = profile["depth"]
     if profile["history"] != "keep_last" or not isinstance(depth, int):
         return _DEPTH
-    return min(max(depth, 1), _FOREVER)  # what is larger may not be a float
+    return min(max(depth, 1), _FOREVER)  # larger values may not fit a float
 
 
 def bag_metadata(channel: Channel) -> dict[str, str]:
-    """Return what rosbag2 wants to know of a channel, as a recorder writes it.
+    """Return the channel metadata of rosbag2, in the recorder's form.
 
     Returns
     -------
     dict of str to str
-        `offered_qos_profiles`, as JSON, and `topic_type_hash`; empty ones if it has none.
+        `offered_qos_profiles`, as JSON, and `topic_type_hash`; empty strings if unset.
     """
     return {
         "offered_qos_profiles": json.dumps(_profiles(channel), default=str),
@@ -558,7 +557,7 @@ def bag_metadata(channel: Channel) -> dict[str, str]:
 
 
 def _profiles(channel: Channel) -> list[Any]:
-    """Read the offered quality of service of a channel; empty if it is invalid."""
+    """Read the quality-of-service profiles of a channel; empty if invalid."""
     return list(_parsed_profiles(channel.metadata.get("offered_qos_profiles", "")))
 
 
@@ -566,7 +565,7 @@ def _profiles(channel: Channel) -> list[Any]:
 def _parsed_profiles(text: str) -> list[Any]:
     brackets = sum(map(text.count, "[{"))
     if len(text) >= _PROFILES_LIMIT or brackets > _BRACKETS or "&" in text:
-        return []  # what nests deeply, or has aliases, would take for ever
+        return []  # deep nesting or aliases would take unbounded time
     try:
         return list(dump_qos_v9(parse_qos(text)))
     except (ReaderError, KeyError, TypeError, ValueError, AttributeError, RecursionError):

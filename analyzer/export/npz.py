@@ -1,4 +1,4 @@
-"""A topic as NumPy arrays, in one file that loads without pickle."""
+"""Export of a topic as NumPy arrays, in one file that loads without pickle."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -23,32 +23,32 @@ from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 from hearthlog.schemas.messages.message_types import number_type
 
 _TEXTS_LIMIT = 1 << 30  # bytes
-_MEMORY = 128 << 20  # bytes of all tables at once; what is larger is read alone
+_MEMORY = 128 << 20  # bytes of all tables together; larger tables are read separately
 _OBJECT = 100  # bytes, roughly
 
 
 class NpzFile:
-    """A table in memory, until it is written as one array for each field, by its path.
+    """Table in memory, written as one array per field, named by the field path.
 
-    Stamps are datetime64[ns], durations timedelta64[ns]. Arrays of different lengths lie one
-    after the other, their lengths in `<field>.lengths`; arrays of messages are JSON. The names
-    that the channel has for the elements of an array are in `<field>_names`. A field that some
-    messages lack has only the values of the others, and the rows of these in `<field>.rows`.
+    Stamps are datetime64[ns], durations timedelta64[ns]. Arrays of different lengths are
+    concatenated, with their lengths in `<field>.lengths`; arrays of messages are JSON. Element
+    names from the channel are in `<field>_names`. An optional field holds only the values that
+    are present, with their rows in `<field>.rows`.
 
     Parameters
     ----------
     sizes : Counter
-        Bytes of the tables that are in memory, which it joins, and under None of all.
+        Shared count of bytes in memory by table, with the total under None.
     """
 
     def __init__(self, table: Table, files: OutputFiles, sizes: "Counter[NpzFile | None]") -> None:
         self._table = table
         self._files = files
         self._sizes = sizes
-        self._pieces: list[Columns] | None = []  # None if it is put off
+        self._pieces: list[Columns] | None = []  # None if deferred
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
-        """Append messages; put off the largest table if all are too large."""
+        """Append messages; defer the largest table if memory is exceeded."""
         if self._pieces is None:
             return
         self._pieces += [piece.columns for piece in pieces]
@@ -61,18 +61,18 @@ class NpzFile:
             largest.put_off()
 
     def put_off(self) -> None:
-        """Forget the messages, which have to be read again."""
+        """Drop the messages; they must be read again."""
         self._sizes[None] -= self._sizes.pop(self)
         self._pieces = None
 
     def finish(self) -> bool:
-        """Write the file; return whether the messages were put off, and have to be read again."""
+        """Write the file; return whether the table was deferred and must be read again."""
         if self._pieces is None:
             return True
         arrays = _arrays(self._pieces, self._table)
         self.put_off()
         with ZipFile(self._files.new(self._table.stem), "x") as archive:
-            for key, array in arrays.items():  # np.savez has no place for a field named `file`
+            for key, array in arrays.items():  # np.savez reserves the name `file`
                 with archive.open(f"{key}.npy", "w", force_zip64=True) as part:
                     np.lib.format.write_array(part, array, allow_pickle=False)
         return False
@@ -93,7 +93,7 @@ def _size(columns: Columns) -> int:
 
 
 def _arrays(pieces: Sequence[Columns], table: Table) -> dict[str, NDArray[Any]]:
-    """Join the messages of a table, in the order of their log times."""
+    """Join the messages of a table in log-time order."""
     optional = set(table.optional)
     required = [path for path in table.fields if path not in optional]
     columns = join([with_numbers(piece, table, required) for piece in pieces])
@@ -140,7 +140,7 @@ def _column(path: str, values: NDArray[Any], field: Field) -> dict[str, NDArray[
 
 
 def _texts(path: str, values: NDArray[Any]) -> NDArray[np.str_]:
-    """Make an array of texts of equal size, as NumPy has them."""
+    """Return texts as a fixed-width array, as NumPy stores them."""
     longest = max(map(len, values.reshape(-1).tolist()), default=0)
     if values.size * longest * 4 > _TEXTS_LIMIT:
         raise LogError(f"{path}: texts are too long for NPZ; choose parquet")

@@ -1,4 +1,4 @@
-"""Messages as text: a line each, for people or as JSON."""
+"""Export of messages as text: one line each, readable or JSON."""
 
 import json
 import math
@@ -15,16 +15,16 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS, seconds_text
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 
-_SHOWN = 4  # elements of an array
+_SHOWN = 4  # array elements
 _LENGTH = 120  # characters of a field
 _NOT_FINITE = re.compile("-?inf|nan")
-_MINUS_ZERO = re.compile(r"(?<![\w])-0(?![.\d])")  # many readers take it for an integer
+_MINUS_ZERO = re.compile(r"(?<![\w])-0(?![.\d])")  # many readers parse it as an integer
 
 
 def in_order(
     pieces: Iterable[TypedColumns], lines: Callable[[TypedColumns], list[str]]
 ) -> list[str]:
-    """Make a line of every message, in the order of their log times.
+    """Return one line per message, in log-time order.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ def in_order(
 
 
 def json_lines(piece: TypedColumns) -> list[str]:
-    """Make a JSON object of every message, in the form of `mcap cat --json`.
+    """Return one JSON object per message, in the form of `mcap cat --json`.
 
-    Times are seconds with nine decimals, bytes are in base64, and what is not finite is null.
+    Times are seconds with nine decimals, bytes are base64, and non-finite values are null.
     """
     columns = piece.columns
     texts = [
@@ -59,13 +59,10 @@ def json_lines(piece: TypedColumns) -> list[str]:
 
 
 def text_lines(piece: TypedColumns) -> list[str]:
-    """Make a short line of every message: time, topic, fields.
+    """Return a short line per message: time, topic, fields.
 
-    Returns
-    -------
-    list of str
-        One line for each message, in their order. `header.stamp` is left out where all stamps are
-        log times; times are UTC to the millisecond, and durations seconds.
+    Times are UTC to the millisecond, durations seconds; `header.stamp` is omitted where all
+    stamps equal the log times.
     """
     columns = piece.columns
     fields = dict(columns.fields)
@@ -81,26 +78,22 @@ def text_lines(piece: TypedColumns) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Put a text in quotes if it is empty, has spaces or quotes, or could steer a terminal."""
+    """Quote a text that is empty, has spaces or quotes, or could steer a terminal."""
     harmless = text.isprintable()
     plain = harmless and text and not set(text) & set(' "')
     return text if plain else json.dumps(text, ensure_ascii=not harmless)
 
 
 def json_texts(values: NDArray[Any], field: Field) -> list[str]:
-    """Make JSON of every value of a column.
+    """Return the JSON of every value of a column, one text per row.
+
+    Times are seconds with nine decimals, bytes are base64, and non-finite values are null.
 
     Parameters
     ----------
     values : np.ndarray [shape=(n, ...)]
-        As `Columns` has them: times as int64 nanoseconds; arrays as one row each, or as objects
-        where their lengths differ.
-
-    Returns
-    -------
-    list of str
-        One text for each row. Times are seconds with nine decimals, bytes are in base64, and what
-        is not finite is null.
+        Format of `Columns`: times as int64 nanoseconds; arrays as one row each, or as objects if
+        their lengths differ.
     """
     if field.size is None and field.type in {TIME, DURATION}:
         return _seconds(values)
@@ -117,7 +110,7 @@ def json_texts(values: NDArray[Any], field: Field) -> list[str]:
 
 
 def _json(value: Any, field: Field) -> str:
-    """Make JSON of one value: an array of any length, or a part of one."""
+    """Return the JSON of one value: an array of any length, or a part of one."""
     if isinstance(value, dict):
         parts = [_json(part, field.elements[path]) for path, part in value.items()]
         return _nested(value) % tuple(parts)
@@ -134,7 +127,7 @@ def _json(value: Any, field: Field) -> str:
 
 
 def _short_texts(values: NDArray[Any], field: Field) -> list[str]:
-    """Make a short text of every value of a column."""
+    """Return a short text for every value of a column."""
     if field.size is None and field.type == TIME:
         return _moments(values)
     if field.size is None and field.type == DURATION:
@@ -154,14 +147,14 @@ def _cut(text: str) -> str:
 
 
 def _each(text: Callable[[str], str], values: NDArray[Any]) -> list[str]:
-    """Make a text of each string; most are equal."""
+    """Return a text per string, converting each distinct string once."""
     strings = values.tolist()
     made = {value: text(value) for value in set(strings)}
     return [made[value] for value in strings]
 
 
 def _numbers(values: NDArray[Any], of_floats: str, separator: str) -> list[str]:
-    """Make texts of numbers, or of rows of numbers."""
+    """Return texts of numbers, or of rows of numbers."""
     if values.dtype == bool:
         values = np.where(values, "true", "false")
     each = {"f": of_floats, "U": "%s"}.get(values.dtype.kind, "%d")
@@ -176,13 +169,13 @@ def _seconds(values: Int64) -> list[str]:
 
 
 def _moments(values: Int64) -> list[str]:
-    """Write times as `millisecond_text` does, many at once."""
+    """Format times as `millisecond_text` does, in bulk."""
     texts: list[str] = np.datetime_as_string(values.astype("M8[ns]"), unit="ms").tolist()
     return [f"{text}Z" for text in texts]
 
 
 def _nested(paths: Iterable[str]) -> str:
-    """Make the pattern of a JSON object, of fields that may be within others."""
+    """Return the template of a JSON object with possibly nested fields."""
     tree: dict[str, Any] = {}
     for path in paths:
         *parents, name = path.split(".")

@@ -1,4 +1,4 @@
-"""Metrics of a home and of its days: coverage, durations, events, and counts with their ranges."""
+"""Metrics of a home and its days: coverage, durations, events, and counts with ranges."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,19 +42,19 @@ from hearthlog.schemas.arrays import Bool, Int64
 
 @dataclass(frozen=True)
 class HomeMinutes:
-    """The minutes in which at least one microphone heard.
+    """Minutes covered by at least one microphone.
 
     Attributes
     ----------
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
     sounding, television, gone_through : np.ndarray [shape=(n,)], bool
-        Whether anything sounds, and like a television, by the labels; whether a person has gone
-        through all of the minute.
+        Whether the labels have any sound, or a television-like sound; whether a person reviewed
+        the complete minute.
     labelled, corrected, certain : dict of str to np.ndarray [shape=(n,)], int64
-        By class but silence, the events that begin in each minute: labelled ones where no one has
-        gone through; all, with what a person says in the place of labels; those of them that begin
-        where a person has gone through.
+        By class except silence, the number of events that begin in each minute: labelled events
+        outside reviewed spans; all events after corrections; corrected events that begin in
+        reviewed spans.
     """
 
     starts: Int64
@@ -66,12 +66,12 @@ class HomeMinutes:
     certain: dict[str, Int64]
 
     def between(self, spans: Spans) -> "HomeMinutes":
-        """Return the minutes that begin in some spans of time."""
+        """Return the minutes that begin in some spans."""
         of = np.searchsorted(spans.starts, self.starts, side="right") - 1
         return self.rows((of >= 0) & (self.starts < spans.ends[of]))
 
     def count(self, name: str, rates: CheckedRates | None) -> Count:
-        """Count the events of a class; those of `SET_APART` only where no television sounds."""
+        """Count the events of a class; `SET_APART` classes only in minutes without a television."""
         own = self.rows(~self.television) if name in SET_APART else self
         if name not in own.labelled:
             return Count(rates=rates)
@@ -84,12 +84,12 @@ class HomeMinutes:
         )
 
     def counted(self, name: str, starts: Int64) -> Int64:
-        """Return those of the events of a class that `count` counts.
+        """Return the events of a class that `count` counts.
 
         Parameters
         ----------
         starts : np.ndarray [shape=(n,)], int64
-            When they began, within these minutes.
+            Event starts within these minutes.
         """
         if name not in SET_APART:
             return starts
@@ -97,24 +97,13 @@ class HomeMinutes:
         return starts[~np.isin(starts // MINUTE * MINUTE, television)]
 
     def beside_television(self, name: str) -> int:
-        """Count the labelled events of a class where something sounds like a television.
-
-        Parameters
-        ----------
-        name : str
-            Of the class; 0 for one that is not set apart.
-        """
+        """Count labelled events of a class in minutes with a television; 0 outside `SET_APART`."""
         if name not in SET_APART or name not in self.labelled:
             return 0
         return int(self.corrected[name][self.television].sum())
 
     def rows(self, rows: Bool) -> "HomeMinutes":
-        """Return some of the minutes.
-
-        Parameters
-        ----------
-        rows : np.ndarray [shape=(n,)], bool
-        """
+        """Select rows."""
         return HomeMinutes(
             self.starts[rows],
             self.sounding[rows],
@@ -129,14 +118,14 @@ class HomeMinutes:
 def home_minutes(
     labels: Labelling, gone_through: Sequence[Spans], coverage: Spans, events: Mapping[str, Int64]
 ) -> HomeMinutes:
-    """Count what begins in each minute that was heard, at least in part.
+    """Count the events that begin in each minute with any coverage.
 
     Parameters
     ----------
     coverage : Spans
-        When at least one of them heard.
+        Covered by at least one microphone.
     events : mapping of str to np.ndarray [shape=(n,)], int64
-        By class but silence, when events began, with what a person says in the place of labels.
+        By class except silence, event starts after corrections.
     """
     first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
     edges = np.arange(first, last + 1) * MINUTE
@@ -162,14 +151,14 @@ def home_minutes(
 
 
 def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, CheckedRates]:
-    """Return the rates of the classes of which enough minutes were checked."""
+    """Return the rates of the classes with enough checked minutes."""
     amounts = {
         name: int(counts.sum()) + 1
         for name, counts in minutes.labelled.items()
-        if class_name(name) != UNKNOWN  # which nothing is truly
+        if class_name(name) != UNKNOWN  # no sound is truly `unknown`
     }
     whole = sum(amounts.values())
-    fewest = 1 / max(len(amounts), 1)  # a class that labels hardly name may be missed all the more
+    fewest = 1 / max(len(amounts), 1)  # rarely labelled classes may be missed more often
     drawn = {
         name: checks.rates(name, max(amount / whole, fewest)) for name, amount in amounts.items()
     }
@@ -178,26 +167,26 @@ def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, 
 
 @dataclass(frozen=True)
 class HomeMetrics:
-    """What was heard in a home, by all its microphones together."""
+    """Sounds of a home, combined over all microphones."""
 
     classes: list[str]
-    coverage: Spans  # when at least one of them heard
-    listened: dict[str, Spans]  # by class: when at least one of them heard whose model knows it
-    sound: Spans  # when at least one of them heard something else than silence
-    spans: dict[str, Spans]  # by class: when at least one of them heard it
-    # by class, but silence: when events began; spans with no more than ten seconds between them are
-    # one event, and so are those of two microphones at one time
+    coverage: Spans  # covered by at least one microphone
+    listened: dict[str, Spans]  # by class: covered by a microphone whose model has the class
+    sound: Spans  # spans in which at least one microphone has a label other than silence
+    spans: dict[str, Spans]  # by class: union over the microphones
+    # by class except silence: event starts; spans at most ten seconds apart are one event, also
+    # across microphones
     events: dict[str, Int64]
     minutes: HomeMinutes
-    rates: dict[str, CheckedRates]  # by class, of the minutes that were checked
+    rates: dict[str, CheckedRates]  # by class, from the checked minutes
 
     def between(self, start: int, end: int) -> "HomeMetrics":
-        """Return what was heard in a span of time.
+        """Return the metrics of a time span.
 
         Parameters
         ----------
         start, end : int
-            In nanoseconds of UTC; an event belongs to the span that it begins in.
+            In nanoseconds of UTC; events belong to the span in which they begin.
         """
         return HomeMetrics(
             self.classes,
@@ -211,37 +200,32 @@ class HomeMetrics:
         )
 
     def events_in(self, name: str, span: Spans) -> Int64:
-        """Return when the events of a class began in a span of time.
+        """Return the event starts of a class in a time span, in nanoseconds of UTC.
 
         Parameters
         ----------
         name : str
-            Of the class; one without events, such as silence, has none.
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
+            Class name; classes without events, such as silence, return an empty array.
         """
         starts = self.events.get(name, NONE.starts)
         return starts[(starts >= span.starts[0]) & (starts < span.ends[0])]
 
 
 def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetrics:
-    """Put together what the microphones of a home heard.
+    """Combine the microphones of a home.
 
     Parameters
     ----------
     data : HomeData
-        With the segments and classes of at least one microphone.
+        With segments and classes of at least one microphone.
     checks : CheckedMinutes, optional
-        Minutes of the home that were drawn at random, and checked.
+        Randomly drawn, checked minutes of the home.
 
     Returns
     -------
     HomeMetrics
-        A span is silent where no microphone heard anything else; segments of a class that are at
-        most ten seconds apart, of whichever microphones, are one event.
+        A span is silent if every microphone labels silence; segments of one class at most ten
+        seconds apart, from any microphones, are one event.
     """
     labels = _together(data.segments.values())
     everything = joined(labels.starts, labels.ends)
@@ -256,7 +240,7 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
         spans[name] = joined(labels.starts[own], labels.ends[own])
         events[name] = events_of(labels, name).starts
     if SILENCE in spans:
-        spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone heard something
+        spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone has a sound
         del events[SILENCE]
     gone_through = [data.gone_through.get(source, NONE) for source in data.segments]
     labelled = _together(data.labelled.values())
@@ -266,12 +250,12 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
 
 
 def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
-    """Return what routines are learned from: the labels of all microphones."""
+    """Return the input of the routine: the labels of all microphones."""
     return HomeSegments(_together(data.segments.values()), metrics.listened)
 
 
 def _together(parts: Iterable[Labelling]) -> Labelling:
-    """Put labels of microphones in the order of time; they may overlap."""
+    """Join labels of microphones in time order; they may overlap."""
     parts = list(parts)
     starts, ends, labels = (
         np.concatenate([getattr(part, name) for part in parts])
@@ -285,9 +269,9 @@ def _spans(labels: Labelling) -> Spans:
     return joined(labels.starts, labels.ends)
 
 
-_RISING = 4  # of the clock: what is heard before is of the night
+_RISING = 4  # local hour; earlier sound belongs to the night
 HOUR = 60 * MINUTE
-MOST = 0.75  # of a time: what has to be heard for a 0 to be said, and for days to be compared
+MOST = 0.75  # minimum covered share for a reported 0, and for comparisons of days
 _Figure = TypeVar("_Figure", Count, Duration)
 _HALF = 0.5
 _BIN, _BUSY = 10 * MINUTE, MINUTE
@@ -295,88 +279,78 @@ _BIN, _BUSY = 10 * MINUTE, MINUTE
 
 @dataclass(frozen=True)
 class DayMetrics:
-    """The figures of one day, and of the night that ends on it."""
+    """Figures of one day, and of the night that ends on it."""
 
     day: date
     home: HomeMetrics
     zone: tzinfo
-    span: Spans  # a single span, as the night is
+    span: Spans  # a single span, like the night
     night: Spans
-    coverage: Spans  # what of the day was heard
+    coverage: Spans  # covered spans of the day
 
     @property
     def share(self) -> float:
-        """Share of the day that was heard, 0 to 1."""
+        """Covered share of the day, 0 to 1."""
         return self.coverage.length / self.span.length
 
     @property
     def night_hours(self) -> float:
-        """Hours of the night that were heard."""
+        """Covered hours of the night."""
         return common(self.home.coverage, self.night).length / HOUR
 
     def comparable(self, name: str = "") -> bool:
-        """Tell whether three quarters of the day, and of its night, were heard."""
+        """Return whether three quarters of the day, and of its night, are covered."""
         spans = [self.home.listened[name]] if name else [*self.home.listened.values()]
         wholes = self.span, self.night
         shares = [common(each, whole).length / whole.length for each in spans for whole in wholes]
         return min(shares) >= MOST
 
     def share_of(self, name: str) -> float:
-        """Return the share of the day in which a class would have been heard, 0 to 1.
+        """Return the share of the day covered for a class, 0 to 1.
 
         Parameters
         ----------
         name : str
-            Of the class; 0 for one that the home does not know.
+            Class name; 0 for a class that no model of the home has.
         """
         return _share(self.home.listened.get(name, NONE), self.span)
 
     def minutes(self, name: str) -> Duration | None:
-        """Return how long a class was heard; None if it is not known."""
+        """Return the duration of a class; None if unknown."""
         minutes = _length(common(self.home.spans.get(name, NONE), self.span))
         return _if_known(minutes, self.share_of(name))
 
     def events(self, name: str) -> Int64:
-        """Return when the events of a class began on this day.
+        """Return the event starts of a class on this day, in nanoseconds of UTC.
 
         Parameters
         ----------
         name : str
-            Of the class; one without events, such as silence, has none.
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
+            Class name; classes without events, such as silence, return an empty array.
         """
         return self.home.events_in(name, self.span)
 
     def night_events(self, name: str) -> Int64:
-        """Return when the events of a class began in the night that `night_count` counts.
+        """Return the event starts that `night_count` counts for a class, in nanoseconds of UTC.
 
         Parameters
         ----------
         name : str
-            Of the class; one without events, such as silence, has none.
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
+            Class name; classes without events, such as silence, return an empty array.
         """
         return self.home.minutes.counted(name, self.home.events_in(name, self.night))
 
     def count(self, name: str) -> Count | None:
-        """Return how often a class was heard on this day; None if it is not known."""
+        """Return the number of events of a class on this day; None if unknown."""
         return _if_known(self._count(name, self.span), self.share_of(name))
 
     def night_count(self, name: str) -> Count | None:
-        """Return how often a class was heard in the night; None if it is not known."""
+        """Return the number of events of a class in the night; None if unknown."""
         share = _share(self.home.listened.get(name, NONE), self.night)
         return _if_known(self._count(name, self.night), share)
 
     def beside_television(self, name: str) -> int:
-        """Return how many events of a class were not counted, because of a television."""
+        """Return the number of events of a class not counted because of a television."""
         return self.home.minutes.between(self.span).beside_television(name)
 
     def _count(self, name: str, span: Spans) -> Count:
@@ -384,19 +358,19 @@ class DayMetrics:
 
     @property
     def sound(self) -> Duration | None:
-        """How long there was any sound on this day; None if it is not known."""
+        """Duration of any sound on this day; None if unknown."""
         return _if_known(_length(common(self.home.sound, self.span)), self.share)
 
     @property
     def night_sound(self) -> Duration | None:
-        """How long there was any sound in the night; None if it is not known."""
+        """Duration of any sound in the night; None if unknown."""
         return _if_known(_length(common(self.home.sound, self.night)), self._share_of(self.night))
 
     @property
     def night_stretches(self) -> Count | None:
-        """Number of stretches of sound in the night, with ten quiet minutes between them.
+        """Number of stretches of sound in the night, separated by ten quiet minutes.
 
-        A stretch has at least half a minute of sound. None if it is not known.
+        A stretch has at least half a minute of sound. None if unknown.
         """
         count = exactly(stretches(self.home.sound, self.night))
         return _if_known(count, self._share_of(self.night))
@@ -409,23 +383,23 @@ class DayMetrics:
 
     @property
     def sound_by_hour(self) -> NDArray[np.float64]:
-        """Minutes with sound between each two successive edges of `hours`."""
+        """Minutes with sound between successive edges of `hours`."""
         return lengths(self.home.sound, self.hours) / MINUTE
 
     @property
     def longest_quiet(self) -> Spans:
-        """The longest quiet span from 07:00 to 22:00; empty if nothing was heard then."""
+        """The longest quiet span from 07:00 to 22:00; empty without coverage."""
         return longest_quiet(self.home.sound, self.home.coverage, self.day, self.zone)
 
     @property
     def quiet(self) -> Duration | None:
-        """Length of `longest_quiet`; None if less than half of the time it lies in was heard."""
+        """Length of `longest_quiet`; None if less than half of its search window is covered."""
         waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
         return _length(self.longest_quiet) if self._share_of(waking) >= _HALF else None
 
     @property
     def active(self) -> Int64:
-        """Starts of the ten-minute blocks with a minute of sound or more, in ns of UTC.
+        """Starts of the ten-minute blocks with at least a minute of sound, in ns of UTC.
 
         The first block of a day begins at 04:00.
         """
@@ -434,7 +408,7 @@ class DayMetrics:
 
     @property
     def first(self) -> Clock | None:
-        """Start of the first of the `active` blocks; None if it is not known, or there is none."""
+        """Start of the first of the `active` blocks; None if unknown, or without a block."""
         before = at_hour(self.day, _RISING, self.zone)
         return self._clock(self.active[:1], lambda time: (before, time))
 
@@ -448,7 +422,7 @@ class DayMetrics:
         return _share(self.home.coverage, span)
 
     def _clock(self, times: Int64, quiet: Callable[[int], tuple[int, int]]) -> Clock | None:
-        """Return a time, if most of the span was heard in which there was nothing."""
+        """Return the first time as a time of day; None if its quiet span is mostly not covered."""
         if not len(times):
             return None
         start, end = quiet(int(times[0]))
@@ -464,7 +438,7 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> DayMetrics:
     Parameters
     ----------
     day : date
-        By the clock of the home; its night is from 22:00 on the day before to 07:00.
+        Local date; its night is from 22:00 on the day before to 07:00.
     """
     start, end = day_span(day, zone)
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
@@ -478,7 +452,7 @@ def _share(heard: Spans, span: Spans) -> float:
 
 
 def _if_known(value: _Figure, share: float) -> _Figure | None:
-    """Return a figure, but for a 0 where too little was heard to know that there was nothing."""
+    """Return a figure; None without coverage, or for a 0 with too little coverage."""
     return value if share >= MOST or (share and value.middle) else None
 
 

@@ -1,4 +1,4 @@
-"""The page of a report."""
+"""HTML page of a report."""
 
 import base64
 import re
@@ -43,7 +43,7 @@ from hearthlog.schemas.errors import listed
 
 
 class Cell(NamedTuple):
-    """A cell of a table: a colour before its text, a change behind it; `whole` is one line."""
+    """Table cell: a colour before the text, a change after it; `whole` forbids line breaks."""
 
     text: str
     change: str = ""
@@ -52,14 +52,14 @@ class Cell(NamedTuple):
 
 
 class TableRow(NamedTuple):
-    """A row of a table, whose first cell is its head."""
+    """Table row with a head cell."""
 
     cells: Sequence[Cell]
     kind: str = ""
 
 
 class PageTable(NamedTuple):
-    """A table and its class in the style."""
+    """Table and its CSS class."""
 
     heads: Sequence[str]
     rows: Sequence[TableRow]
@@ -67,12 +67,12 @@ class PageTable(NamedTuple):
 
 
 def fill_page(picture: bytes, **parts: Any) -> str:
-    """Fill the template; all text is escaped, and the picture is in the page itself.
+    """Fill the template; all text is escaped, and the picture is embedded.
 
     Parameters
     ----------
     **parts
-        By the names that the template has for them; none may be lacking.
+        By the names of the template; all are required.
     """
     environment = jinja2.Environment(
         autoescape=True,
@@ -92,7 +92,7 @@ _PARTLY = 0.95
 
 
 class PageSection(NamedTuple):
-    """A section of the page: its table, and what is remarked on it."""
+    """Section of the page: a table and remarks."""
 
     section: FigureSection
     table: PageTable
@@ -100,13 +100,7 @@ class PageSection(NamedTuple):
 
 
 def day_page(account: Account, picture: bytes) -> str:
-    """Write the page of a day.
-
-    Parameters
-    ----------
-    account : Account
-        Of one day.
-    """
+    """Return the page of a day."""
     day = account.days[0]
     names = [name for name in account.classes if name != SILENCE]
     return _page(
@@ -121,13 +115,7 @@ def day_page(account: Account, picture: bytes) -> str:
 
 
 def week_page(account: Account, picture: bytes) -> str:
-    """Write the page of a week.
-
-    Parameters
-    ----------
-    account : Account
-        Of seven days.
-    """
+    """Return the page of a week."""
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{date_in_words(first)} to {date_in_words(last)}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
@@ -171,13 +159,13 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
 
 
 def _heard(days: Sequence[DayMetrics]) -> str:
-    """Say how many days were heard, and how many of them in part: `2 of them heard`."""
+    """Return how many days are covered, and how many of them in part: `2 of them heard`."""
     partly = sum(day.share < MOST for day in days)
     return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
 
 
 def _television(account: Account) -> str:
-    """Say what was labelled while a television sounded, and is not counted."""
+    """Return a remark on labels during television sound, which are not counted."""
     amounts = {
         name: sum(day.beside_television(name) for day in account.days) for name in account.classes
     }
@@ -186,7 +174,7 @@ def _television(account: Account) -> str:
 
 
 def _scenario(account: Account, name: str) -> PageTable:
-    """Tell minutes of each class of a scenario that was heard, a row a class, a column a day."""
+    """Return the minutes of each class of a scenario, a row per class, a column per day."""
     days = account.scenarios[name]
     classes = sorted({label for day in days for label in day})
     rows = [
@@ -206,12 +194,12 @@ def _scenario(account: Account, name: str) -> PageTable:
 
 
 def _scenario_text(minutes: float, day: DayMetrics) -> str:
-    """Say how long a class of a scenario was heard on a day."""
+    """Return the duration of a scenario's class on a day."""
     return Duration(minutes).text if minutes or day.share >= MOST else _NOTHING
 
 
 def _sounds(account: Account, day: DayMetrics) -> PageTable:
-    """Tell minutes and events of each class but those that were not heard at all."""
+    """Return minutes and events of each class with sound."""
     usually = ["Usually"] * account.comparable
     often = "How often" if account.checked else "How often, as labelled"
     how = ["How long, as labelled", *usually, often, *usually]
@@ -230,7 +218,7 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
 
 
 def _was_heard(account: Account, name: str) -> bool:
-    """Tell whether there is something to say of a class: now, or that it is usual."""
+    """Return whether a class has a value, now or in its usual range."""
     baseline = account.baseline(event_figure(name))
     values = [day.count(name) for day in account.days]
     missing = all(value is None for value in values)
@@ -240,7 +228,7 @@ def _was_heard(account: Account, name: str) -> bool:
 
 
 def _cells(account: Account, figure: ReportFigure, day: DayMetrics) -> list[Cell]:
-    """Return a figure, and what is usual if anything is compared."""
+    """Return a figure, and its usual range if there is a baseline."""
     cells = [Cell(_text(figure.value(day)), whole=True)]
     if account.comparable:
         cells.append(Cell(account.usually(figure), account.change(figure, day)))
@@ -273,7 +261,7 @@ def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
 
 
 def _coughing(day: DayMetrics) -> str:
-    """Say in which hours of the night there was coughing, as labelled."""
+    """Return the hours of the night with labelled coughing."""
     starts = day.night_events(COUGHING)
     if not len(starts) or not day.night_hours:
         return ""
@@ -284,7 +272,7 @@ def _coughing(day: DayMetrics) -> str:
 
 
 def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
-    """Tell figures of seven days, their total, and what is usual on a day."""
+    """Return the figures of seven days, their total, and the usual daily value."""
     rows = []
     for day in account.days:
         share = _share(figures, day)
@@ -304,12 +292,12 @@ def _row(*texts: str, kind: str = "") -> TableRow:
 
 
 def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
-    """Return for how much of a day all that these figures are about would have been heard."""
+    """Return the share of a day covered for all classes of these figures."""
     return min([day.share, *(day.share_of(f.name) for f in figures if f.name)])
 
 
 def _short(value: Value | None) -> str:
-    """Write a figure in little room, with a dash for `to`."""
+    """Return a figure in short form, with a dash for `to`."""
     return _NOTHING if value is None else _dense(value.text)
 
 
@@ -324,7 +312,7 @@ def _total(days: Sequence[DayMetrics], figure: ReportFigure) -> str:
 
 
 def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
-    """Add figures of days, of which some may not be known; None if a 0 cannot be known."""
+    """Add daily figures, some unknown; None if a total of 0 is uncertain."""
     counts = [value for value in values if isinstance(value, Count)]
     minutes = [value for value in values if isinstance(value, Duration)]
     known = counts or minutes
@@ -335,7 +323,7 @@ def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
 
 
 def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
-    """Tell what sound can say to an assessment."""
+    """Return the interRAI items that sound can inform."""
     rows = []
     for item in ASSESSED_ITEMS:
         audible = not item.needs or item.needs in account.classes
@@ -349,5 +337,5 @@ def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
 
 
 def _is_checked(value: Count | Duration) -> bool:
-    """Tell whether checked minutes say what the right number is."""
+    """Return whether checked minutes give a range for the correct number."""
     return isinstance(value, Count) and value.rates is not None

@@ -1,4 +1,4 @@
-"""Logs of a home for a report: reviewed segments, gaps, trouble, and minutes of scenarios."""
+"""Log data of a home for a report: reviewed segments, gaps, troubles, and scenario minutes."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ from hearthlog.schemas.messages.topics import (
     relabelling,
 )
 
-_LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
+_LATE = 12 * 3600 * NANOSECONDS  # segments are logged when they end, so a long silence arrives late
 _FIELDS = {"header.stamp", "duration", "label"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
 Source = tuple[str, str]  # node, microphone
@@ -49,22 +49,22 @@ Source = tuple[str, str]  # node, microphone
 
 @dataclass
 class HomeData:
-    """What the logs of a home say."""
+    """Data from the logs of a home."""
 
-    # by node and microphone: what the labelling has, and with what a reviewer says in its place
+    # by node and microphone: the labelling, without and with corrections
     labelled: dict[Source, Labelling] = field(default_factory=dict)
     segments: dict[Source, Labelling] = field(default_factory=dict)
-    gone_through: dict[Source, Spans] = field(default_factory=dict)  # by a reviewer
-    # by node and microphone: the classes that there may be
+    gone_through: dict[Source, Spans] = field(default_factory=dict)  # reviewed spans
+    # by node and microphone: possible classes
     classes: dict[Source, list[str]] = field(default_factory=dict)
-    # in the part of time that was to be looked at closely
+    # within the reported days
     gaps: list[Trouble] = field(default_factory=list)
     troubles: list[Trouble] = field(default_factory=list)
     nodes: list[str] = field(default_factory=list)
-    losses: list[str] = field(default_factory=list)  # what could not be read, and why
+    losses: list[str] = field(default_factory=list)  # read errors with reasons
 
     def lose(self, line: str) -> None:
-        """Note what could not be read, once."""
+        """Record a read error once."""
         if line not in self.losses:
             self.losses.append(line)
 
@@ -76,22 +76,22 @@ def read_home(
     close: tuple[int, int],
     progress: Progress = ignore_progress,
 ) -> HomeData:
-    """Read what the logs of a home say.
+    """Read the data of a report.
 
     Parameters
     ----------
     since : int
-        Log time from which on segments are read, in nanoseconds of UTC.
+        First log time of the segments, in nanoseconds of UTC.
     close : (int, int)
-        Start and end, in nanoseconds of UTC, of the days that are reported: of them gaps and
-        troubles are read too.
+        Start and end of the reported days, in nanoseconds of UTC; gaps and troubles are read only
+        for these days.
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Receives the share of the logs read, 0 to 1.
 
     Raises
     ------
     DataError
-        If there is no such labelling, or no label at all in these days.
+        If the labelling does not exist, or has no label in these days.
     LogError
         If segments overlap, begin before 1970, are of different types, or have too many labels.
     """
@@ -133,7 +133,7 @@ def _layer(logs: HomeLogs, labelling: str) -> str:
 
 
 def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, int]) -> set[str]:
-    """Read gaps and diagnostics of the days that are reported, and return the microphones."""
+    """Read gaps and diagnostics of the reported days; return the microphones."""
     microphones: set[str] = set()
     nodes: dict[str, None] = {}
     statuses: list[Status] = []
@@ -160,7 +160,7 @@ def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, 
 
 
 def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
-    """Read gaps that end after the days that are reported: they are in later logs."""
+    """Read gaps that end after the reported days, from later logs."""
     later = [entry for entry in logs.between(end) if entry.start >= end]
     for number, entry in enumerate(later):
         if number and entry.start > end + _LATE:
@@ -170,7 +170,7 @@ def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
             for columns in read_columns([entry.path], topics).values():
                 home.gaps += [gap for gap in gaps_of(entry.node, columns) if gap.start < end]
         except LogError:
-            continue  # it is not of these days
+            continue  # outside the reported days
 
 
 def _lose_unfinished(home: HomeData, entry: HomeLog, selection: LogSelection) -> None:
@@ -199,7 +199,7 @@ def _segments(
 
 
 def _labelling(home: HomeData, parts: Sequence[Columns]) -> Labelling:
-    """Join the segments of a microphone; each class has one name, whatever logs call it."""
+    """Join the segments of a microphone, with one name per class across logs."""
     segments = join(parts)
     labels = _as_classes(home, segments.topic, unified(labelling_of(segments)))
     classes = all_classes(segments.topic, (), labels.labels)
@@ -208,7 +208,7 @@ def _labelling(home: HomeData, parts: Sequence[Columns]) -> Labelling:
 
 
 def _as_classes(home: HomeData, topic: str, labels: Labelling) -> Labelling:
-    """Give labels that cannot be names of classes the nearest names that can."""
+    """Map labels that are not valid class names to the nearest valid names."""
     odd = sorted(label for label in set(labels.labels) if not CLASS_NAME.fullmatch(label))
     if not odd:
         return labels
@@ -223,7 +223,7 @@ def _as_classes(home: HomeData, topic: str, labels: Labelling) -> Labelling:
 def _reviews(
     home: HomeData, layers: Iterable[HomeLog], labelling: str
 ) -> tuple[dict[Source, list[Mark]], dict[Source, list[ReviewedSpan]]]:
-    """Read marks, and what was looked at of a labelling."""
+    """Read marks and reviewed spans of a labelling."""
     marks: dict[Source, list[Mark]] = {}
     reviewed: dict[Source, list[ReviewedSpan]] = {}
     for entry in layers:
@@ -240,7 +240,7 @@ def _reviews(
 
 
 def _check(home: HomeData, logs: HomeLogs, labelling: str, close: tuple[int, int]) -> None:
-    """Raise DataError unless something was labelled in the days that are reported."""
+    """Raise DataError unless the reported days have labels."""
     spans = [joined(labels.starts, labels.ends) for labels in home.segments.values()]
     if any(common(each, one(*close)).length for each in spans):
         return
@@ -255,16 +255,17 @@ def _check(home: HomeData, logs: HomeLogs, labelling: str, close: tuple[int, int
 
 
 def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) -> None:
-    """Find which classes there may be: those that logs name, and those that are labelled.
+    """Set the possible classes: the classes named by logs, and the labelled ones.
 
-    What is marked alone was not heard elsewhere for no model knows it, unless nothing is labelled.
+    Classes with marks only are excluded, since no model can label them elsewhere, unless nothing is
+    labelled.
     """
     names: dict[Source, dict[str, None]] = {source: {} for source in home.segments}
     for entry in entries:
         try:
             selection = select([entry.path])
         except LogError:
-            continue  # it has been named
+            continue  # already named
         for node, microphone in home.segments:
             topic = labelling_topic(microphone, labelling, "label")
             for channel, _ in selection.channels.get(topic, ()) if node == entry.node else ():
@@ -280,19 +281,19 @@ def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) ->
 _MINUTE = 60 * NANOSECONDS
 _MOST_CLASSES = 256
 
-# By the name of the scenario: of each day, the minutes of each class.
+# By scenario name: for each day, the minutes of each class.
 ScenarioMinutes = Mapping[str, Sequence[Mapping[str, float]]]
 
 
 def read_scenario_minutes(
     logs: HomeLogs, days: Sequence[tuple[int, int]], lose: Callable[[str], None]
 ) -> ScenarioMinutes:
-    """Read for how long scenarios heard each class, of all microphones together.
+    """Read the duration of each scenario class, over all microphones.
 
     Parameters
     ----------
     days : sequence of (int, int)
-        Starts and ends, in nanoseconds of UTC, in the order of time.
+        Starts and ends, in nanoseconds of UTC, in time order.
     """
     found: dict[str, list[Counter[str]]] = {}
     start, end = days[0][0], days[-1][1]

@@ -1,4 +1,4 @@
-"""A report: from the logs of a home to a page and the picture beside it."""
+"""Report of a home: from logs to a page and a picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ WEEK = 7
 
 
 class Period(NamedTuple):
-    """A number of days, 1 or 7, as the clock of the home has them."""
+    """One or seven local days."""
 
     first: date
     days: int
@@ -43,7 +43,7 @@ class Period(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenReport:
-    """A page that was written, and what could not be read for it."""
+    """A written page, and the read errors."""
 
     page: Path
     picture: Path
@@ -57,21 +57,21 @@ def make_report(
     labelling: str = LIVE,
     progress: Progress = ignore_progress,
 ) -> WrittenReport:
-    """Write the report of a day, or of a week.
+    """Write the report of a day or a week.
 
     Parameters
     ----------
     page : Path
-        Of the HTML file; the picture is beside it, with the suffix `.png`. Neither may exist.
+        The HTML file; the picture has the same path with suffix `.png`. Neither may exist.
     progress : callable, optional
-        Told the share of the logs that is read, 0 to 1.
+        Receives the share of the logs read, 0 to 1.
 
     Raises
     ------
     DataError
-        If there are no logs of these days, no labels in them, or no such labelling.
+        If these days have no logs or no labels, or the labelling does not exist.
     LogError
-        If segments cannot be, or a file cannot be written or exists already.
+        If segments are invalid, or a file exists or cannot be written.
     """
     picture = page.with_suffix(".png")
     if picture == page:
@@ -123,7 +123,7 @@ def make_report(
 
 
 def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
-    """Return the SHA-256 of the model that labelled the last of the days."""
+    """Return the SHA-256 of the model of the last log of the period."""
     records = latest_records(entry.path for entry in logs.between(*close))
     return next(records, {}).get("model_sha256", "")
 
@@ -135,7 +135,7 @@ def _scenarios(
 
 
 def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
-    """Measure for how many hours each microphone heard nothing."""
+    """Return the hours without coverage of each microphone."""
     whole = end - start
     hours: dict[str, float] = {}
     for (_, microphone), segments in data.segments.items():
@@ -145,7 +145,7 @@ def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
 
 
 def _within(troubles: Sequence[Trouble], span: tuple[int, int]) -> list[Trouble]:
-    """Cut what was not well to the days that are reported."""
+    """Clip troubles to the reported days."""
     start, end = span
     cut = [t._replace(start=max(t.start, start), end=min(t.end, end)) for t in troubles]
     return [trouble for trouble in cut if trouble.start <= trouble.end]

@@ -42,17 +42,17 @@ BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
 
 
 class ReportFigure(NamedTuple):
-    """One figure of a day."""
+    """A figure of a day."""
 
-    title: str  # in a table of one day
-    short: str  # as the head of a column
-    value: Callable[[DayMetrics], Value | None]  # finds it; None where it cannot be known
-    name: str = ""  # the class that it is about, if it is about one
-    sums: bool = True  # whether a total over days means something
+    title: str  # in the table of one day
+    short: str  # column head
+    value: Callable[[DayMetrics], Value | None]  # None if unknown
+    name: str = ""  # class name, for a figure of one class
+    sums: bool = True  # whether a total over days is meaningful
 
 
 class FigureSection(NamedTuple):
-    """Figures that belong together; `missing` says why there are none."""
+    """Related figures; `missing` explains an empty section."""
 
     title: str
     figures: Sequence[ReportFigure]
@@ -61,7 +61,7 @@ class FigureSection(NamedTuple):
 
 
 def sections(classes: Sequence[str]) -> list[FigureSection]:
-    """Return the tables, for the classes that the model of a home knows."""
+    """Return the tables for the classes of a home's model."""
     return [
         FigureSection(
             "Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)
@@ -72,13 +72,13 @@ def sections(classes: Sequence[str]) -> list[FigureSection]:
 
 
 def minutes_figure(name: str) -> ReportFigure:
-    """Return the figure that says for how long a class was heard."""
+    """Return the figure of a class's duration."""
     title = in_words(name)
     return ReportFigure(title, title, lambda day: day.minutes(name), name)
 
 
 def event_figure(name: str, title: str = "") -> ReportFigure:
-    """Return the figure that says how often a class was heard."""
+    """Return the figure of a class's event count."""
     title = title or in_words(name)
     return ReportFigure(title, title, lambda day: day.count(name), name)
 
@@ -149,27 +149,25 @@ _CHANGES = {
 
 @dataclass(frozen=True)
 class Account:
-    """What a page tells."""
+    """Data of a page."""
 
     nodes: Sequence[str]
     microphones: Sequence[str]
-    labelling: str  # `live`, or the name of a model
+    labelling: str  # `live`, or a model name
     zone: tzinfo
-    days: Sequence[DayMetrics]  # one, or seven
-    before: Sequence[
-        DayMetrics
-    ]  # the days before them that belong to what is asked about three days
-    earlier: Sequence[DayMetrics]  # those that they are compared with
-    judged: Mapping[date, DayAnomaly | None]  # of `days`: how unusual each was, if that is known
-    beside: Mapping[date, int]  # of `days`: how many days there are to say so by
-    unheard: Mapping[str, float]  # by microphone: hours in which it heard nothing
+    days: Sequence[DayMetrics]  # one or seven
+    before: Sequence[DayMetrics]  # preceding days for three-day items
+    earlier: Sequence[DayMetrics]  # baseline days
+    judged: Mapping[date, DayAnomaly | None]  # of `days`: anomaly of each, if known
+    beside: Mapping[date, int]  # of `days`: number of baseline days
+    unheard: Mapping[str, float]  # by microphone: hours without coverage
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
-    checks: CheckedMinutes  # minutes of these weeks that were drawn at random, and gone through
-    model: str  # SHA-256 of the model that labelled the days; empty if it is not known
-    scenarios: ScenarioMinutes  # of `days`; of live labels only
-    unread: int  # how many logs could not be read, or only in part
-    networks: Sequence[str]  # what changed of them in these weeks, a microphone in a line
+    checks: CheckedMinutes  # randomly drawn, reviewed minutes of these weeks
+    model: str  # SHA-256 of the model that labelled the days; empty if unknown
+    scenarios: ScenarioMinutes  # of `days`; live labels only
+    unread: int  # number of logs that could not be read completely
+    networks: Sequence[str]  # network changes in these weeks, one line per microphone
 
     @property
     def home(self) -> str:
@@ -178,27 +176,27 @@ class Account:
 
     @property
     def classes(self) -> list[str]:
-        """The classes that can be heard."""
+        """Classes that can occur."""
         return self.days[0].home.classes
 
     @property
     def checked(self) -> bool:
-        """Whether enough minutes were checked to say in which range counts lie."""
+        """Whether enough minutes were checked for ranges of counts."""
         return len(self.checks) >= FEWEST_CHECKED
 
     @property
     def checked_elsewhere(self) -> int:
-        """How many of the checked minutes another model labelled."""
+        """Number of checked minutes labelled by another model."""
         return sum(model != self.model for model in self.checks.models)
 
     def rightness(self, name: str) -> str:
-        """Say how right the labels of a class were in the checked minutes: `3 of 4, missed 1`.
+        """Return the accuracy of a class in the checked minutes: `3 of 4, missed 1`.
 
         Parameters
         ----------
         name : str
-            Of the class; of quiet, and of what is not sure, nothing is said: they are no sounds
-            that one can count right or missed.
+            Class name; silence and `unknown` return an empty text, since neither is a sound that
+            can be counted as correct or missed.
         """
         if name in {SILENCE, UNKNOWN}:
             return ""
@@ -210,17 +208,17 @@ class Account:
 
     @property
     def comparable(self) -> bool:
-        """Whether there are days to compare with."""
+        """Whether there are baseline days."""
         return len(self.earlier) >= FEWEST
 
     def baseline(self, figure: ReportFigure) -> tuple[UsualRange, Value] | None:
-        """Return what is usual, and a value that can write it; None if there are too few days.
+        """Return the usual range of a figure, and a value that formats it.
 
         Returns
         -------
         (UsualRange, Value) or None
-            Of the earlier days of which most was heard; None if fewer than seven of them know the
-            figure.
+            From the earlier days with sufficient coverage; None if fewer than seven of them have
+            the figure.
         """
         days = [day for day in self.earlier if day.comparable(figure.name)]
         values = [value for day in days if (value := figure.value(day)) is not None]
@@ -228,13 +226,7 @@ class Account:
         return None if baseline is None else (baseline, values[0])
 
     def usually(self, figure: ReportFigure) -> str:
-        """Say what is usual: `4 (3 to 6)`.
-
-        Returns
-        -------
-        str
-            Empty if there are too few days.
-        """
+        """Return the usual range: `4 (3 to 6)`; empty with too few days."""
         baseline = self.baseline(figure)
         return "" if baseline is None else baseline[1].spread(*baseline[0])
 
@@ -244,8 +236,8 @@ class Account:
         Returns
         -------
         str
-            A word or two, as `more often` or `later`; empty if the figure is as usual, or cannot be
-            compared.
+            A word or two, such as `more often` or `later`; empty if the figure is usual or cannot
+            be compared.
         """
         value, baseline = figure.value(day), self.baseline(figure)
         if value is None or baseline is None or not day.comparable(figure.name):
@@ -254,7 +246,7 @@ class Account:
 
     @property
     def too_few(self) -> str:
-        """Say that there is too little to compare with."""
+        """Return a note on too few baseline days."""
         number = len(self.earlier)
         there = {0: "no day", 1: "only 1 day"}.get(number, f"only {number} days")
         return (
@@ -268,13 +260,13 @@ ASSESSED_DAYS = 3
 
 
 class AssessedItem(NamedTuple):
-    """One question."""
+    """An item of the assessment."""
 
-    topic: str  # what the assessment asks about
-    heard: str  # what is counted
-    needs: str  # the class that must be known; empty if any sound will do
-    value: Callable[[DayMetrics], Count | Duration | None]  # counts it on one day
-    limits: str  # what sound cannot tell
+    topic: str  # subject of the item
+    heard: str  # counted sounds
+    needs: str  # required class; empty if any sound will do
+    value: Callable[[DayMetrics], Count | Duration | None]  # count on one day
+    limits: str  # limits of sound as evidence
 
 
 def _several(name: str) -> str:

@@ -1,4 +1,4 @@
-"""The gist of a report, and what was not heard, in sentences."""
+"""Summary of a report in sentences, with missing coverage and troubles."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
@@ -22,18 +22,12 @@ from hearthlog.analyzer.routine.day_anomaly import FEWEST
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
 from hearthlog.schemas.errors import listed
 
-_MOST = 6  # kinds of gaps, or of trouble
+_MOST = 6  # kinds of gaps or troubles
 _MINUTE = HOUR // 60
 
 
 def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
-    """Sum up a day in a few sentences, and compare it with earlier days.
-
-    Parameters
-    ----------
-    day : DayMetrics
-        One of its days.
-    """
+    """Summarise a day in a few sentences, compared with earlier days."""
     minutes = Duration(day.coverage.length / _MINUTE).text
     yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
     yield _changes(account, day)
@@ -44,13 +38,7 @@ def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
 
 
 def gist_of_week(account: Account) -> Iterator[str]:
-    """Sum up a week in a few sentences, and compare it with earlier days.
-
-    Parameters
-    ----------
-    account : Account
-        Of seven days.
-    """
+    """Summarise a week in a few sentences, compared with earlier days."""
     days = [day for day in account.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
     yield f"Heard: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
@@ -69,12 +57,12 @@ def gist_of_week(account: Account) -> Iterator[str]:
 
 
 def not_heard(account: Account) -> Iterator[str]:
-    """Say how much was not heard, and why.
+    """Yield sentences on missing coverage and its reasons.
 
     Yields
     ------
     str
-        A sentence or two, how much in all first; none where everything was heard.
+        A sentence or two, the total first; none with complete coverage.
     """
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
@@ -82,7 +70,7 @@ def not_heard(account: Account) -> Iterator[str]:
         text = Duration(missing / _MINUTE).text
         yield f"Not heard: {text} ({percent(missing / length)}). The report knows nothing of it."
     for microphone, hours in account.unheard.items():
-        if hours * HOUR > missing + _MINUTE:  # another one heard
+        if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
             yield f"The microphone {plain(microphone)} heard nothing for {text}."
     if (unsaid := _unexplained(account)) >= _MINUTE:
@@ -98,7 +86,7 @@ def not_heard(account: Account) -> Iterator[str]:
 
 
 def not_well(account: Account) -> Iterator[str]:
-    """Say which troubles the box reported, where gaps do not say it already.
+    """Yield the troubles reported by the recorder that gaps do not explain.
 
     Yields
     ------
@@ -115,13 +103,7 @@ def not_well(account: Account) -> Iterator[str]:
 
 
 def longest_quiet(day: DayMetrics) -> str:
-    """Say when the longest quiet stretch of the day was.
-
-    Returns
-    -------
-    str
-        Empty if it was under a minute.
-    """
+    """Return when the longest quiet stretch of the day was; empty if under a minute."""
     quiet = day.longest_quiet
     if day.quiet is None or day.quiet.minutes < 1:
         return ""
@@ -130,20 +112,14 @@ def longest_quiet(day: DayMetrics) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share: `12 %`.
-
-    Parameters
-    ----------
-    share : float
-        0 to 1.
-    """
+    """Format a share (0 to 1): `12 %`."""
     if 0 < share < 0.005:
         return "less than 1 %"
     return "more than 99 %" if 0.995 <= share < 1 else f"{100 * share:.0f} %"
 
 
 def plain(name: str) -> str:
-    """Write a name as people do, with spaces for `_`."""
+    """Return a name with spaces for `_`."""
     return name.replace("_", " ")
 
 
@@ -183,7 +159,7 @@ def _night(day: DayMetrics) -> str:
 
 
 def _unexplained(account: Account) -> int:
-    """Return how long nothing was heard without a gap that says why, in nanoseconds."""
+    """Return the missing coverage without a gap message, in nanoseconds."""
     starts = np.array([gap.start for gap in account.gaps], np.int64)
     ends = np.array([gap.end for gap in account.gaps], np.int64)
     explained = joined(starts, ends)
@@ -194,7 +170,7 @@ def _unexplained(account: Account) -> int:
 def _by_lasting(
     troubles: Iterable[Trouble], name: Callable[[Trouble], str]
 ) -> list[tuple[str, list[Trouble]]]:
-    """Put together what has one name; what lasted longest comes first."""
+    """Group troubles by name, the longest total first."""
     groups: dict[str, list[Trouble]] = {}
     for trouble in troubles:
         groups.setdefault(name(trouble), []).append(trouble)
@@ -206,7 +182,7 @@ def _lasting(troubles: Sequence[Trouble]) -> int:
 
 
 def _when(account: Account, troubles: Sequence[Trouble]) -> str:
-    """Say when and for how long: `12 min, once (03:10 to 03:22)`."""
+    """Return time and duration of troubles: `12 min, once (03:10 to 03:22)`."""
     how_often = "once" if len(troubles) == 1 else f"{len(troubles)} times"
     shown = []
     for trouble in sorted(troubles, key=lambda trouble: trouble.start)[:3]:

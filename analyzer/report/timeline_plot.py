@@ -1,4 +1,4 @@
-"""The timeline of a day or a week as a picture that prints in grey, too."""
+"""Timeline picture of a day or a week, printable in grey."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,14 +18,14 @@ from hearthlog.analyzer.report.wording import short_day
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Int64
 
-_DAY_BINS, _WEEK_BINS = 30, 6  # an hour
-_LEAST = 0.35  # of a lane's height, for what is short: a cough has to be seen
+_DAY_BINS, _WEEK_BINS = 30, 6  # per hour
+_LEAST = 0.35  # of a lane's height, so that short sounds such as a cough stay visible
 _INK, _PALE, _NIGHT = "#1d2733", "#8a94a0", "#e9ecf1"
-_DOTS = 150  # an inch
+_DOTS = 150  # per inch
 
 
 def save_day(path: Path, day: DayMetrics, earlier: Sequence[DayMetrics]) -> None:
-    """Draw a day: a lane for each class, and the minutes with sound in each hour."""
+    """Draw a day: a lane per class, and the minutes with sound in each hour."""
     names = _names(day)
     heights = [0.34 * len(names) + 0.1, 1.15]
     figure = Figure(figsize=(10, sum(heights) + 0.95), layout="constrained")
@@ -37,7 +37,7 @@ def save_day(path: Path, day: DayMetrics, earlier: Sequence[DayMetrics]) -> None
 
 
 def save_week(path: Path, days: Sequence[DayMetrics]) -> None:
-    """Draw a week: for each class seven lanes, the first day at the top."""
+    """Draw a week: seven lanes per class, the first day at the top."""
     names = _names(*days)
     figure = Figure(figsize=(10, 0.66 * len(names) + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -51,7 +51,7 @@ def _names(*days: DayMetrics) -> list[str]:
 
 
 def _lanes(axes: Any, names: Sequence[str], days: Sequence[DayMetrics], bins: int) -> None:
-    """Draw a block for each class, and in it a line for each day."""
+    """Draw a block per class, with a line per day."""
     count = len(days)
     for place, name in enumerate(names):
         face = tuple(part / 255 for part in colour_on_paper(name))
@@ -81,7 +81,7 @@ def _lanes(axes: Any, names: Sequence[str], days: Sequence[DayMetrics], bins: in
 
 
 def _hours(axes: Any, day: DayMetrics, earlier: Sequence[DayMetrics]) -> None:
-    """Draw the minutes with sound in each hour, and what is usual."""
+    """Draw the minutes with sound in each hour, and the usual range."""
     minutes = day.sound_by_hour
     places = np.arange(len(minutes))
     axes.bar(places, minutes, width=0.84, align="edge", color="#5b6b7c")
@@ -108,7 +108,7 @@ def _hours(axes: Any, day: DayMetrics, earlier: Sequence[DayMetrics]) -> None:
 
 
 def _usual_hours(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[UsualRange | None]:
-    """Return what is usual in each hour; nothing where the clock was changed."""
+    """Return the usual range of each hour; None where the clock was changed."""
     same = [each.sound_by_hour for each in earlier if len(each.hours) == len(day.hours)]
     columns: list[NDArray[np.float64]] = list(np.array(same).T) if same else []
     hours = [usual_range([Duration(float(number)) for number in column]) for column in columns]
@@ -116,7 +116,7 @@ def _usual_hours(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[UsualRa
 
 
 def _unheard(axes: Any, day: DayMetrics, coverage: Spans, band: tuple[float, float]) -> None:
-    """Hatch what was not heard, where that is long enough to be seen."""
+    """Hatch visible gaps in the coverage."""
     edges = _edges(day, _DAY_BINS)
     missing = without(day.span, coverage)
     empty = lengths(missing, edges) > np.diff(edges) / 2
@@ -137,7 +137,7 @@ def _hours_of(day: DayMetrics, times: Int64) -> NDArray[np.float64]:
 
 
 def _dress(axes: Any, day: DayMetrics) -> None:
-    """Mark hours and the night; on days of 23 or 25 hours by what the clock shows."""
+    """Mark hours and the night; days of 23 or 25 hours use local clock times."""
     hours = day.hours
     clock = [local_time(int(time), day.zone).hour for time in hours[:-1]]
     for place, hour in enumerate(clock):

@@ -14,12 +14,12 @@ _MIN = " min"
 
 
 class _Quantity(ABC):
-    """What is counted."""
+    """A quantity of a report."""
 
     @property
     @abstractmethod
     def middle(self) -> float:
-        """The number, as it is compared with that of other days."""
+        """The number used in comparisons between days."""
 
     @property
     def text(self) -> str:
@@ -29,15 +29,15 @@ class _Quantity(ABC):
     @staticmethod
     @abstractmethod
     def show(number: float) -> str:
-        """Write a number."""
+        """Format a number."""
 
     def spread(self, median: float, lowest: float, highest: float) -> str:
-        """Write what is usual: `4 (3 to 6)`; where both ends are minutes alone, `min` comes once.
+        """Format a usual range: `4 (3 to 6)`; if both ends are minutes alone, `min` appears once.
 
         Parameters
         ----------
         median, lowest, highest : float
-            Numbers, as `show` takes them.
+            In the unit of `show`.
         """
         low, high = self.show(lowest), self.show(highest)
         if low == high:
@@ -51,10 +51,10 @@ class _Quantity(ABC):
 class Count(_Quantity):
     """A number of events."""
 
-    labelled: int = 0  # where a person has corrected labels, as corrected
-    certain: int = 0  # of those, the ones in minutes that a person has gone through
-    unchecked: Strata = NO_MINUTES  # the other ones
-    rates: CheckedRates | None = None  # None where too few minutes were checked
+    labelled: int = 0  # events after corrections
+    certain: int = 0  # events within reviewed minutes
+    unchecked: Strata = NO_MINUTES  # events in minutes without review
+    rates: CheckedRates | None = None  # None if too few minutes were checked
 
     def __add__(self, other: "Count") -> "Count":
         return Count(
@@ -71,7 +71,7 @@ class Count(_Quantity):
 
     @property
     def range(self) -> tuple[int, int] | None:
-        """Where the right number lies nine times in ten; None if nobody has checked."""
+        """90 % interval of the correct number; None without checks."""
         if not any(self.unchecked):
             return self.certain, self.certain
         if self.rates is None:
@@ -81,7 +81,7 @@ class Count(_Quantity):
 
     @property
     def text(self) -> str:
-        """In words: `4 to 6 (7 labelled)`; the labelled number alone if nobody has checked."""
+        """In words: `4 to 6 (7 labelled)`; the labelled number alone without checks."""
         if self.range is None or self.range == (self.labelled, self.labelled):
             return f"{self.labelled}"
         low, high = self.range
@@ -89,18 +89,18 @@ class Count(_Quantity):
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a number of events, rounded."""
+        """Format a number of events, rounded."""
         return f"{whole(number)}"
 
 
 def exactly(number: int) -> Count:
-    """Return a count that is certain."""
+    """Return a certain count."""
     return Count(number, number)
 
 
 @dataclass(frozen=True)
 class Duration(_Quantity):
-    """A length of time."""
+    """A duration."""
 
     minutes: float = 0.0
 
@@ -114,13 +114,7 @@ class Duration(_Quantity):
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a length of time: `2 h 05 min`.
-
-        Parameters
-        ----------
-        number : float
-            In minutes.
-        """
+        """Format a duration in minutes: `2 h 05 min`."""
         hours, minutes = divmod(whole(number), 60)
         if hours:
             return f"{hours} h {minutes:02} min"
@@ -129,24 +123,18 @@ class Duration(_Quantity):
 
 @dataclass(frozen=True)
 class Clock(_Quantity):
-    """A time of day, in minutes from midnight on."""
+    """A time of day, in minutes since midnight."""
 
     minutes: float
 
     @property
     def middle(self) -> float:
-        """Minutes from midnight on."""
+        """Minutes since midnight."""
         return self.minutes
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a time of day: `07:05`.
-
-        Parameters
-        ----------
-        number : float
-            Minutes from midnight on.
-        """
+        """Format a time of day, given in minutes since midnight: `07:05`."""
         hours, minutes = divmod(int(number), 60)
         return f"{hours:02}:{minutes:02}"
 
@@ -164,7 +152,7 @@ FEWEST = 7
 
 
 class UsualRange(NamedTuple):
-    """Median, lowest and highest of some days."""
+    """Median, lowest and highest value of some days."""
 
     median: float
     lowest: float
@@ -172,17 +160,17 @@ class UsualRange(NamedTuple):
 
 
 def usual_range(values: Sequence[Value | None]) -> UsualRange | None:
-    """Return what is usual; None if there are too few days.
+    """Return the usual range of a figure.
 
     Parameters
     ----------
     values : sequence of (Count, Duration, Clock or None)
-        The same figure on each day; None where it is not known.
+        The same figure on each day; None if unknown.
 
     Returns
     -------
     UsualRange or None
-        Of the `middle` of each value; None if fewer than seven days have one.
+        Of the `middle` of the values; None if fewer than seven days have one.
     """
     numbers = [value.middle for value in values if value is not None]
     if len(numbers) < FEWEST:
@@ -191,12 +179,12 @@ def usual_range(values: Sequence[Value | None]) -> UsualRange | None:
 
 
 def compared(value: Value, baseline: UsualRange) -> int:
-    """Compare a figure, as labelled, with what is usual.
+    """Compare a figure, as labelled, with its usual range.
 
     Returns
     -------
     int
-        1: more than on any of those days, or later; -1: less, or earlier; 0: as usual.
+        1: above the highest day, or later; -1: below the lowest, or earlier; 0: usual.
     """
     if whole(value.middle) > whole(baseline.highest):
         return 1

@@ -1,4 +1,4 @@
-"""Days, times and classes in words, and how unusual a day was."""
+"""Wording of days, times, classes and anomalies."""
 
 from dataclasses import replace
 from datetime import date, tzinfo
@@ -29,56 +29,50 @@ _MONTHS = (
 
 
 def several_in_words(label: str) -> str:
-    """Name the events of a class as people who count them would."""
+    """Return the plural of a class's events."""
     row = find_class(label)
     return (row.several if row else "") or in_words(label)
 
 
 def day_in_words(day: date) -> str:
-    """Write a day: `Sunday, 1 March 2026`."""
+    """Format a day: `Sunday, 1 March 2026`."""
     return f"{_WEEKDAYS[day.weekday()]}, {date_in_words(day)}"
 
 
 def date_in_words(day: date) -> str:
-    """Write a date: `1 March 2026`."""
+    """Format a date: `1 March 2026`."""
     return f"{day.day} {_MONTHS[day.month - 1]} {day.year}"
 
 
 def short_day(day: date) -> str:
-    """Write a day: `Sun 1 Mar`."""
+    """Format a day: `Sun 1 Mar`."""
     return f"{_WEEKDAYS[day.weekday()][:3]} {day.day} {_MONTHS[day.month - 1][:3]}"
 
 
 def clock_text(nanoseconds: int, zone: tzinfo) -> str:
-    """Write the time of day: `07:05`.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        Of UTC.
-    """
+    """Format the local time of day of a time in nanoseconds of UTC: `07:05`."""
     return f"{local_time(nanoseconds, zone):%H:%M}"
 
 
 def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
-    """List times of day; where they are many, the first and how many more.
+    """List times of day; long lists are cut, with the number of the rest.
 
     Parameters
     ----------
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC, in any order.
     most : int, optional
-        Number of times that are listed, at most.
+        Maximum number of listed times.
     """
     shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
     more = len(starts) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more else "")
 
 
-WEEK = 7.0  # days: what comes more often is as usual
+WEEK = 7.0  # days: a shorter return period counts as usual
 _MONTH = 30.0
 _SHOWN = 4
-_SINGLE = 3.0  # widths: what is so far from usual is told though the day as a whole is as usual
+_SINGLE = 3.0  # widths: a single figure this far from usual is reported even on a usual day
 _DAY = 1440.0  # minutes
 _HEARD = 0.05  # minutes
 _BUSY = {FIRST: "first busy half hour from", LAST: "last busy half hour until"}
@@ -86,7 +80,7 @@ _NAMES = {STRETCHES: "times with sound", SOUND: "sound", QUIET: "longest quiet s
 
 
 def judgement_text(judged: DayAnomaly) -> str:
-    """Say how unusual a day was, and what was unlike other days."""
+    """Return how unusual a day was, and its differences from other days."""
     compared = f"{judged.days} earlier days"
     if judged.once_in < WEEK:
         single = [each for each in judged.differences if abs(each.deviation) >= _SINGLE]
@@ -99,7 +93,7 @@ def judgement_text(judged: DayAnomaly) -> str:
 
 
 def too_few_text(days: int) -> str:
-    """Say that there are too few days to judge one by."""
+    """Return a note on too few days for a judgement."""
     return (
         f"How unusual the day was cannot be told yet: that needs {FEWEST} days of the four weeks "
         f"before it, heard for the most part, and there are {days}."
@@ -107,14 +101,14 @@ def too_few_text(days: int) -> str:
 
 
 def rarity_text(judged: DayAnomaly) -> str:
-    """Say how often a day is expected that is as unlike others: `one such day in 40`."""
+    """Return the return period of such a day: `one such day in 40`."""
     if judged.once_in >= LONGEST:
         return "less than one such day in a year"
     return f"one such day in {whole(judged.once_in)}"
 
 
 def differences_text(judged: DayAnomaly) -> str:
-    """Say what was unlike other days, what differs most first."""
+    """List the differences from other days, largest first."""
     more = len(judged.differences) - _SHOWN
     texts = [difference_text(each) for each in judged.differences[:_SHOWN]]
     text = "; ".join(texts) + (f"; and {more} more" if more > 0 else "")
@@ -122,7 +116,7 @@ def differences_text(judged: DayAnomaly) -> str:
 
 
 def difference_text(difference: FigureDifference) -> str:
-    """Say what a figure was, and what it is on eight of ten days."""
+    """Return a figure, and its range on eight of ten days."""
     figure, value = difference.figure, difference.value
     name = _name(figure)
     if figure.kind == CLOCK:
@@ -143,7 +137,7 @@ def _sentence(judged: DayAnomaly) -> str:
 
 
 def _clock(minutes: float) -> str:
-    return Clock.show(minutes % _DAY)  # it may be past midnight
+    return Clock.show(minutes % _DAY)  # may be past midnight
 
 
 def _range(low: str, high: str) -> str:

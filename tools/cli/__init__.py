@@ -1,1 +1,1 @@
-"""The command `hearthlog`, one module a verb."""
+"""The `hearthlog` command line, one module per group of subcommands."""

@@ -1,4 +1,4 @@
-"""`hearthlog annotate` and `enrol`: label files of other programs, and sounds to train on."""
+"""`hearthlog annotate` and `enrol`: import of label files, and recordings to train on."""
 
 import sys
 import time
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 _SCENARIO = "Scenario that the marks are of, by its name; else they are of the sounds of the home."
-_SHOWN = 10  # names, kinds of labels
+_SHOWN = 10  # names or kinds of labels per message
 
 annotate = typer.Typer(
     no_args_is_help=True,
@@ -200,7 +200,7 @@ def export_labels(
 
 
 def _log_and_labels(first: Path, second: Path | None) -> tuple[Path, Path]:
-    """Tell apart the logs and the labels: of one argument, it is the labels."""
+    """Return the logs and the labels; a single argument is the labels."""
     return (Path(logs_folder()), first) if second is None else (first, second)
 
 
@@ -230,7 +230,7 @@ def _check_microphone(
 
 
 def _columns(given: Sequence[str]) -> dict[str, str]:
-    """Read the options --column."""
+    """Parse the options --column."""
     from hearthlog.analyzer.marks.formats.tables import COLUMNS
 
     pairs = [text.partition("=")[::2] for text in given]
@@ -241,7 +241,7 @@ def _columns(given: Sequence[str]) -> dict[str, str]:
 
 
 def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
-    """Ask whether labels are taken as the names that are spelt like them."""
+    """Ask for confirmation of labels matched to similarly spelt names."""
     from hearthlog.analyzer.errors import DataError
     from hearthlog.models.classes import find_class
 
@@ -267,7 +267,7 @@ def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
 
 
 def _losses(left_out: "SkippedLabels") -> Iterator[str]:
-    """Say how many labels of each kind were left out, and which was the first."""
+    """Yield a line per kind of skipped label: the count, and the first one."""
     kinds = list(left_out.kinds())
     for count, first in kinds[:_SHOWN]:
         yield f"{number(count, first.kind)} left out{'' if count == 1 else ', the first'}: {first}"
@@ -345,7 +345,7 @@ def enrol(
 def _enrol_files(
     home: Path, label: str, files: list[Path], seconds: float | None, refused: list[str]
 ) -> "list[Enrolled]":
-    """Enrol several files; say why some are not enrolled, unless none is."""
+    """Enrol several files; report the files that fail, or raise if all fail."""
     from hearthlog.analyzer.marks.enrol import enrol_file
 
     done: list[Enrolled] = []

@@ -70,7 +70,7 @@ def bridge(
     modules = needed_modules(own)
     if not (own.page or own.ping or any(modules.values())):
         lacking = [name for name, is_there in modules.items() if not is_there]
-        require(*lacking)  # what else there is goes on without them
+        require(*lacking)  # the other outputs run without them
     stop = Event()
     for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(each, lambda *_: stop.set())
@@ -135,7 +135,7 @@ def replay(
     home = find_home_logs(logs or [settings.output])
     _check_node(home, settings.node)
     if timezone is None and "timezone" in settings.model_fields_set:
-        timezone = settings.timezone  # by which the bridge goes
+        timezone = settings.timezone  # the bridge's own time zone
     zone = home_zone(timezone, home.records())
     first, last = _span(home, settings.node, first, last)
     losses = list(home.losses)
@@ -167,7 +167,7 @@ def _check_node(home: "HomeLogs", node: str) -> None:
 
 
 def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> tuple[int, int]:
-    """Return the span that is asked for, within what the logs have."""
+    """Return the requested span, clipped to the logs."""
     from hearthlog.analyzer.bridge.alerts.activity import span_of
 
     begin, until = span_of(home, node)
@@ -201,7 +201,7 @@ def _print(
             rule.name,
             rule.rule,
             str(len(own)),
-            f"{len(own) / weeks:.1f}" if weeks >= 1 / 7 else "",  # of minutes it would say nothing
+            f"{len(own) / weeks:.1f}" if weeks >= 1 / 7 else "",  # meaningless for minutes
             str(_unknown(own)),
         )
         for rule in rules

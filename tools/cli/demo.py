@@ -1,4 +1,4 @@
-"""`hearthlog demo`: the whole way from sound to a timeline, on a day of a simulated home."""
+"""`hearthlog demo`: from sound to a timeline, on a day of a simulated home."""
 
 import shutil
 import sys
@@ -89,7 +89,7 @@ def demo(
 
 
 def _composed_of(truth: "Truth") -> str:
-    """Say of how many recordings a day is composed, and how many of its sounds are made up."""
+    """Return the number of recordings in a day, and of synthetic sounds."""
     clips = [event.plan.clip for event in truth.events]
     recordings = {clip.name for clip in clips if clip.path is not None}
     made_up = [clip.label for clip in clips if clip.path is None]
@@ -100,9 +100,9 @@ def _composed_of(truth: "Truth") -> str:
 def _agreement(
     logs: Path, start: int, truth: "list[LabelledSpan]", model: "Model"
 ) -> tuple[float, float]:
-    """Return the share of labels that are true in the middle of their frame, of all and of known.
+    """Return the share of correct labels at frame centres, of all frames and of known sounds.
 
-    The second share is of the sounds that the model knows, without silence.
+    The second share covers the sounds of the model's classes, without silence.
     """
     import numpy as np
 
@@ -121,7 +121,7 @@ def _agreement(
 
 
 def _command(name: str) -> str:
-    """Name a command as the user can type it: it may be in an environment that is not active."""
+    """Return a command as the user can type it: its environment may be inactive."""
     if shutil.which(name):
         return name
     path = Path(sys.executable).with_name(name)

@@ -1,4 +1,4 @@
-"""`hearthlog discover` and `hearthlog voices`: groups of sounds and voices that recur in a home."""
+"""`hearthlog discover` and `hearthlog voices`: recurring sound groups and voices of a home."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from hearthlog.schemas.arrays import Int64
 
 
-_LABELS = 2  # that are shown of a group
+_LABELS = 2  # shown per group
 
 
 def discover(
@@ -116,7 +116,7 @@ def _default_file(logs: Sequence[Path]) -> Path:
 
 
 def _names(given: Sequence[str]) -> dict[int, str]:
-    """Read the options --name."""
+    """Parse the options --name."""
     from hearthlog.models.classes import CLASS_NAME, SILENCE
     from hearthlog.schemas.messages.topics import spelt
 
@@ -136,7 +136,7 @@ def _names(given: Sequence[str]) -> dict[int, str]:
 def _group(
     home: "HomeLogs", file: Path, looked: "Looked", least: int, zone: "tzinfo"
 ) -> tuple["GroupsSummary", list[str]]:
-    """Group what is heard, and keep the groups and their summary."""
+    """Group the sounds, and save the groups and their summary."""
     from hearthlog.analyzer.discover.groups import load_groups, save_groups
     from hearthlog.analyzer.discover.sounds import discover as find_groups
     from hearthlog.analyzer.discover.sounds import read_sounds, unembedded_note
@@ -177,7 +177,7 @@ def _name(
     looked: "Looked",
     reviewer: str,
 ) -> tuple["GroupsSummary", list[str]]:
-    """Take names of known groups back, and give others; what is heard is not grouped anew."""
+    """Remove and assign names of existing groups, without new grouping."""
     from hearthlog.analyzer.discover.groups import load_groups
     from hearthlog.analyzer.discover.naming import name_groups, reason_of, unmark_group
     from hearthlog.analyzer.discover.summary import load_summary, summary_path
@@ -200,7 +200,7 @@ def _name(
 
 
 def _known(groups: "Groups | None", numbers: Iterable[int]) -> "Groups":
-    """Return the groups, if there are those of some numbers."""
+    """Return the groups; raise if one of the numbers does not exist."""
     from hearthlog.analyzer.errors import DataError
 
     for each in numbers:
@@ -213,7 +213,7 @@ def _known(groups: "Groups | None", numbers: Iterable[int]) -> "Groups":
 def _renamed(
     groups: "Groups", summary: "GroupsSummary", names: Mapping[int, str], file: Path
 ) -> tuple["Groups", "GroupsSummary"]:
-    """Give groups other names, and keep them; an empty name takes one away."""
+    """Rename groups and save them; an empty name removes a name."""
     from hearthlog.analyzer.discover.groups import save_groups
     from hearthlog.analyzer.discover.summary import save_summary, summary_path
 
@@ -353,7 +353,7 @@ def _voices_file(logs: Sequence[Path]) -> Path:
 
 
 def _voice_names(given: Sequence[str]) -> dict[int, str]:
-    """Read the options --name."""
+    """Parse the options --name."""
     from hearthlog.models.classes import CLASS_NAME, find_class
     from hearthlog.schemas.messages.topics import spelt
 
@@ -399,7 +399,7 @@ def _enrol(
 
 
 def _write_turns(output: Path, speech: "HomeSpeech", voices: "HomeVoices", of: "Int64") -> None:
-    """Write who speaks when."""
+    """Write the table of voice turns."""
     import csv
 
     from hearthlog.analyzer.discover.home_voices import spoken_spans
@@ -482,9 +482,9 @@ def _voices_as_json(
 
 
 def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
-    """Add the sounds of the groups in a file to a timeline.
+    """Add the sounds of a groups file to a timeline.
 
-    Raise `DataError` if there is no such file.
+    Raise `DataError` if the file does not exist.
     """
     from hearthlog.analyzer.discover.groups import load_groups
     from hearthlog.analyzer.discover.sounds import group_spans
@@ -505,9 +505,9 @@ def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
 
 
 def add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
-    """Add the turns of the voices in a file to a timeline.
+    """Add the turns of a voices file to a timeline.
 
-    Raise `DataError` if there is no such file.
+    Raise `DataError` if the file does not exist.
     """
     from hearthlog.analyzer.discover.home_voices import find_voices, load_voices, spoken_spans
     from hearthlog.analyzer.discover.speech import read_speech

@@ -1,4 +1,4 @@
-"""`hearthlog doctor` and `hearthlog recover`: damage in logs, and logs made of what is left."""
+"""`hearthlog doctor` and `hearthlog recover`: checks of logs, and recovery of damaged logs."""
 
 import json
 from pathlib import Path
@@ -78,14 +78,14 @@ def doctor(
 
 
 def _network_changes(paths: list[Path]) -> list[str]:
-    """Say when a home began, changed or lost a network, which is no fault of a log."""
+    """Return when a home gained, changed or lost a network, which is no fault of a log."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs, network_changes
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.schemas.errors import LogError
 
     try:
         home = find_home_logs(paths)
-    except LogError:  # which the checks have told
+    except LogError:  # already reported by the checks
         return []
     return network_changes(home.between(), home_zone(None, home.records()))
 

@@ -1,4 +1,4 @@
-"""`hearthlog evaluate`: scores of a model, of labels, of a method, and on scenes."""
+"""`hearthlog evaluate`: scores of a model, labels, a method, and scenes."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -140,7 +140,7 @@ def scenes(
 
 
 def learned_lines(learned: int, sources: int) -> list[str]:
-    """Say in a line of how many sources a model has learned, if of any."""
+    """Return a line with the number of sources that a model was trained on, if any."""
     if not learned:
         return []
     count = f"{learned:,} of the {number(sources, 'source')}"
@@ -150,7 +150,7 @@ def learned_lines(learned: int, sources: int) -> list[str]:
 def read_model_and_clips(
     model: Path, data: Path, scenario: str | None
 ) -> "tuple[Model, list[LabelledClip], Scenario, list[SkippedClip]]":
-    """Read a model, its scenario unless another one is named, and clips; some are of no use."""
+    """Read a model, its scenario unless another one is named, and clips, with the skipped ones."""
     from hearthlog.analyzer.training.manifest import load_scenario, scenario_of
     from hearthlog.models.modelfile.modelfile import load_model
 
@@ -160,12 +160,12 @@ def read_model_and_clips(
     return loaded, labelled_clips([data], classes.labels, left_out), classes, left_out
 
 
-_MOVED = {  # options of one verb that is several now
+_MOVED = {  # options of one subcommand that was split
     "--folds": "method",
     "--model": "model",
     "--reference": "log",
 }
-_LAB = {  # verbs and options that are modules of `hearthlog.tools.lab` now
+_LAB = {  # subcommands and options that moved to modules of `hearthlog.tools.lab`
     "paper": "paper",
     "robustness": "robustness",
     "search": "grid_search",
@@ -176,10 +176,10 @@ _LAB = {  # verbs and options that are modules of `hearthlog.tools.lab` now
 
 
 class _Group(TyperGroup):
-    """Points users of moved verbs and options to what has them now."""
+    """Points users of removed subcommands and options to their replacement."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the words behind `evaluate`."""
+        """Parse the arguments after `evaluate`."""
         options = {word.partition("=")[0] for word in args}
         module = next((_LAB[word] for word in (*args[:1], *options) if word in _LAB), None)
         if module and args[0] not in self.commands and not ctx.resilient_parsing:
@@ -368,7 +368,7 @@ def evaluate_method(
 def learning(
     name: str | None, data: Path, scenario: str, scheduler: str | None
 ) -> "Iterator[tuple[Method, Dataset, Progress]]":
-    """Cut the clips into segments; what learns from them in the block runs on the cluster."""
+    """Cut the clips into segments; the block trains on the cluster."""
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.manifest import load_scenario
     from hearthlog.analyzer.training.train import clip_embedder
@@ -395,7 +395,7 @@ def learning(
 
 
 def end_with_left_out(left_out: "Sequence[SkippedClip]") -> None:
-    """Tell which clips were left out, and end with exit status 3 if any was."""
+    """Report skipped clips; end with exit status 3 if there are any."""
     from hearthlog.analyzer.training.manifest import left_out_lines
 
     end_with_warnings(left_out_lines(left_out))
@@ -409,7 +409,7 @@ def _calibration(result: "CrossValidation | ModelEvaluation") -> dict[str, Any]:
 
 
 def _unknown_text(seconds_of: Any) -> str:
-    """Name the labels that only the reference has, those of the longest time first."""
+    """List the labels that occur only in the reference, longest time first."""
     most = sorted(seconds_of.items(), key=lambda item: -item[1])[:10]
     names = ", ".join(f"{shortened(name, NAME_WIDTH)} ({seconds:.1f} s)" for name, seconds in most)
     more = f" and {len(seconds_of) - len(most)} more" if len(seconds_of) > len(most) else ""

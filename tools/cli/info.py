@@ -1,4 +1,4 @@
-"""`hearthlog info` and `hearthlog catalog`: what is in logs, and in a folder of homes."""
+"""`hearthlog info` and `hearthlog catalog`: contents of logs, and of a folder of homes."""
 
 import json
 from collections import Counter
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from hearthlog.tools.cli.info_summary import Accuracy
 
 
-_LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
+_LEVELS = ("ok", "warning", "error", "stale")  # levels of diagnostic_msgs/DiagnosticStatus
 
 
 def info(
@@ -83,7 +83,7 @@ def info(
 def _model_lines(
     summary: "LogSummary", path: Path, scenarios: "Sequence[RecordedScenario]"
 ) -> Iterator[str]:
-    """Name the models that label beside the recorder's."""
+    """Yield the names of the models that label in addition to the recorder's."""
     if (candidate := _candidate(summary, path)) is not None:
         yield candidate
     for one in scenarios:
@@ -91,13 +91,13 @@ def _model_lines(
 
 
 def _candidate(summary: "LogSummary", path: Path) -> str | None:
-    """Name the model that labels beside the recorder's; None if none did."""
+    """Return a line on the candidate model; None without one."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.schemas.messages.topics import CANDIDATE
 
     if not any(name.endswith(f"/{CANDIDATE}/label") for name in summary.topics):
         return None
-    later: set[str] = set()  # recorders that had no candidate any more
+    later: set[str] = set()  # recorders without a candidate since
     for record in find_home_logs([path]).records():
         node = record.get("node", "")
         if name := record.get("candidate"):
@@ -109,7 +109,7 @@ def _candidate(summary: "LogSummary", path: Path) -> str | None:
 
 
 def _scenarios(summary: "LogSummary", path: Path) -> "list[RecordedScenario]":
-    """Return the scenarios that have labels, each with the last model that labelled for it."""
+    """Return the scenarios with labels, each with its last model."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.schemas.logs.metadata import recorded_scenarios
     from hearthlog.schemas.messages.topics import SCENARIO
@@ -124,7 +124,7 @@ def _scenarios(summary: "LogSummary", path: Path) -> "list[RecordedScenario]":
 
 
 def _accuracy(summary: "LogSummary", path: Path) -> "Accuracy | None":
-    """Read how right the labels of a recorder are; None if there are none."""
+    """Read the accuracy of a recorder's labels; None without labels."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.tools.cli.info_summary import Accuracy
 
@@ -132,7 +132,7 @@ def _accuracy(summary: "LogSummary", path: Path) -> "Accuracy | None":
         return None
     try:
         accuracy = Accuracy(find_home_logs([path]))
-    except LogError:  # of no home
+    except LogError:  # the log belongs to no home
         return None
     for loss in accuracy.losses:
         tell(loss)
@@ -231,7 +231,7 @@ def _print(summary: "LogSummary") -> None:
 
 
 def _lines(summary: "LogSummary") -> Iterator[str]:
-    """Describe the files, by what they contain and by what their metadata says."""
+    """Describe the files by contents and metadata."""
     chunks = f", {number(summary.chunks, 'chunk')}" if summary.chunks else ""
     ratio = summary.compression_ratio
     packed = f", compressed {ratio:.2f} to 1" if ratio else ""
@@ -289,7 +289,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}"
 
 
-_HOMES_SHOWN = 40  # that is a page
+_HOMES_SHOWN = 40  # one page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
 _COUNTS = "logs", "layers", "unfinished", "damaged"
 _FIGURES = "MB", "hours", "gaps", "gap minutes", "from", "to"
@@ -411,7 +411,7 @@ def _home_row(name: str, homes: Sequence["HomeTotals"]) -> Sequence[str]:
 
 
 def _label_sums(labels: Sequence["LabelAmount"]) -> Iterator[Sequence[str]]:
-    """Add up the labels of all homes, those of one kind and model together."""
+    """Add up the labels of all homes by kind and model."""
     sums: dict[tuple[str, str, str], tuple[float, int]] = {}
     for one in labels:
         kind = f"{one.kind}, scenario {one.scenario}" if one.scenario else one.kind

@@ -1,4 +1,4 @@
-"""Summaries of logs in words: what they hold, how right their labels are, and what to do next."""
+"""Text summaries of logs: contents, label accuracy, and the next step."""
 
 import shlex
 from collections import Counter
@@ -26,9 +26,9 @@ from hearthlog.tools.cli.terminal import JUDGED_BY, number
 
 
 def gist(summary: LogSummary) -> Iterator[str]:
-    """Say in words what was heard, how much of it is in doubt, and what was not heard."""
+    """Yield sentences on what was recorded, how much is in doubt, and what is missing."""
     for microphone, seconds in summary.segment_seconds.items():
-        if "/" in microphone:  # of a layer
+        if "/" in microphone:  # a layer's topic
             continue
         segments = summary.segments.get(microphone, Counter())
         unsure = summary.unsure.get(microphone, Counter())
@@ -52,7 +52,7 @@ def gist(summary: LogSummary) -> Iterator[str]:
 
 
 def next_step(summary: LogSummary, path: Path) -> str | None:
-    """Say what to do for better labels; None if these are no logs of a recorder."""
+    """Return the next step towards better labels; None if these are not a recorder's logs."""
     if not summary.streams:
         return None
     place, latest = shlex.quote(str(path)), summary.streams[-1]
@@ -75,7 +75,7 @@ def next_step(summary: LogSummary, path: Path) -> str | None:
 
 
 def _has_learned(layers: Sequence[Path]) -> bool:
-    """Tell whether a model of the home was made after the last mark."""
+    """Return whether a home model was trained after the last mark."""
     marks = [path.stat().st_mtime for path in layers if log_name(path).layer == REVIEW_LAYER]
     models = [path.stat().st_mtime for path in models_folder().glob("home-*.safetensors")]
     return max(models, default=0.0) > max(marks, default=0.0)
@@ -85,7 +85,7 @@ _EVER = 1 << 61
 
 
 class Accuracy:
-    """What reviews of a home say of the recorder's labels."""
+    """Accuracy of the recorder's labels from reviews of a home."""
 
     def __init__(self, logs: HomeLogs) -> None:
         self.losses: list[str] = []
@@ -95,7 +95,7 @@ class Accuracy:
         self.right, self.looked_at = count_unchanged(reviewed)
 
     def lines(self) -> Iterator[str]:
-        """Say what was checked, and how much of it was right."""
+        """Yield what was checked, and how much of it was correct."""
         checked = number(len(self.minutes), "minute")
         if not len(self.minutes):
             yield "not checked here: how many of these labels are right in this home is not known"
@@ -124,7 +124,7 @@ class Accuracy:
             )
 
     def as_json(self) -> dict[str, object]:
-        """Return the same for a program."""
+        """Return the accuracy as a JSON object."""
         return {
             "minutes": len(self.minutes),
             "classes": {
@@ -144,7 +144,7 @@ class Accuracy:
 
     def _classes(self) -> Iterator[str]:
         for name, check in self._checks():
-            if name == UNKNOWN:  # which nothing is truly
+            if name == UNKNOWN:  # no sound is truly `unknown`
                 continue
             parts = []
             if check.precision is not None:

@@ -1,4 +1,4 @@
-"""The command `hearthlog`: its verbs, and how errors reach the user."""
+"""Entry point of `hearthlog`: subcommands and error handling."""
 
 import gc
 import os
@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from hearthlog.schemas.blas import kernel_environment
 
-# Before numpy is imported: the products here are small, and idle BLAS threads burn a core.
+# Before the import of numpy: products here are small, and idle BLAS threads burn a core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.update(kernel_environment())
 
@@ -27,7 +27,7 @@ from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.schemas.files import denied_text, is_denied
 from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, tell
 
-# As the help shows them; each is a function, or an app of its own, in the module of its name.
+# In help order; each is a function, or an app of its own, in the module of its name.
 PANELS = {
     "Every day": ("record", "devices", "info", "watch", "report", "pause", "resume", "demo"),
     "A model of the home": (
@@ -38,7 +38,7 @@ PANELS = {
     "Research": ("replay", "diff", "manifest", "evaluate"),
 }
 VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
-_MODULES = {  # of verbs that share one
+_MODULES = {  # subcommands that share a module
     **dict.fromkeys(("alerts",), "bridge"),
     **dict.fromkeys(("catalog",), "info"),
     **dict.fromkeys(("cat", "cut", "merge"), "export"),
@@ -53,8 +53,8 @@ _MODULES = {  # of verbs that share one
 }
 _TYPES = {"str": "TEXT", "int": "NUMBER", "float": "NUMBER"}
 _TYPES |= dict.fromkeys(("Path", "path", "file", "directory"), "PATH")
-_NAMED = 10  # of many files with the same fault
-_WORDS = (  # for those of the library that reads options
+_NAMED = 10  # files named per fault
+_WORDS = (  # replacements for messages of the option parser
     (re.compile(r"Input should be greater than or equal to "), "it must be at least "),
     (re.compile(r"Input should be less than or equal to "), "it must be at most "),
     (re.compile(r"Input should be a valid integer, .*"), "it must be a whole number"),
@@ -65,7 +65,7 @@ _debug = {"on": False}
 
 
 def make_app(verbs: Iterable[str] = VERBS) -> typer.Typer:
-    """Make the app of some verbs; only their modules are imported."""
+    """Return the app with some subcommands; only their modules are imported."""
     app = typer.Typer(
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -87,12 +87,12 @@ def make_app(verbs: Iterable[str] = VERBS) -> typer.Typer:
 
 
 def _without_line_breaks(function: Any) -> str:
-    """Return a docstring with each paragraph in one line, which the help breaks to the window."""
+    """Join the lines of each paragraph of a docstring; the help wraps them to the window."""
     return "\n\n".join(" ".join(part.split()) for part in (getdoc(function) or "").split("\n\n"))
 
 
 def _option_type(option: TyperOption, ctx: Any) -> str | None:
-    """Name what an option takes as people do, where typer names the type of Python."""
+    """Return a readable type for an option, where typer shows the Python type."""
     if option.is_flag:
         return None
     if option.metavar is not None:
@@ -125,18 +125,18 @@ def _options(
     ] = False,
 ) -> None:
     """Listen to a home: sound to features and labels, in logs that anyone can open."""
-    del version  # shown by now
+    del version  # already shown
     _debug["on"] = debug
 
 
 def main() -> None:
-    """Run the command line; with a warning of ours, what is done is done with exit status 3."""
-    gc.set_threshold(10_000, 20, 20)  # modules are no garbage: the default costs a tenth of a start
-    if sys.stdin is None:  # who started it has closed it
+    """Run the command line; a warning turns exit status 0 into 3."""
+    gc.set_threshold(10_000, 20, 20)  # modules are no garbage: the default costs 10 % of the start
+    if sys.stdin is None:  # closed by the parent process
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: PTH123, SIM115
     verbs = _wanted_verbs()
-    if "install_service" not in verbs:  # units are for everybody to read
-        os.umask(0o077)  # what comes from a home is private
+    if "install_service" not in verbs:  # units are world-readable
+        os.umask(0o077)  # data of a home is private
     with _ended_by_signals(), checked_output(), _warnings_shown() as warned:
         app = make_app(verbs)
         status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
@@ -146,9 +146,9 @@ def main() -> None:
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block as an error does, so that temporary files are removed.
+    """Make SIGTERM and SIGHUP raise an error in the block, so that temporary files are removed.
 
-    A verb that does otherwise sets handlers of its own.
+    Subcommands with other needs set handlers of their own.
     """
 
     def end(number: int, _: object) -> None:
@@ -167,7 +167,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _wanted_verbs() -> Iterable[str]:
-    """Return the verb of the command line; all where it has none, as for help and completion."""
+    """Return the subcommand of the command line; all without one, as for help and completion."""
     for word in sys.argv[1:]:
         if word.replace("-", "_") in VERBS:
             return [word.replace("-", "_")]
@@ -177,17 +177,17 @@ def _wanted_verbs() -> Iterable[str]:
 
 
 def _status_of(step: Callable[[], Any]) -> str | int | None:
-    """Return the exit status of a step; an error is one line, and exit status 1 or 2."""
+    """Return the exit status of a step; an error prints one line, and gives exit status 1 or 2."""
     try:
         return step()
     except SystemExit as end:
         return end.code
     except typer.TyperException as error:
-        if error.format_message():  # else it has shown the help
+        if error.format_message():  # otherwise the help was shown
             tell(_usage_text(error))
         return error.exit_code
     except OutputClosedError:
-        return 0  # `| head` has seen enough
+        return 0  # the reader has closed the pipe, as in `| head`
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
@@ -219,7 +219,7 @@ def _message(error: Exception) -> str:
 
 @contextmanager
 def _warnings_shown() -> Iterator[dict[str, set[str]]]:
-    """Print our warnings, and collect for each text the files, or others, that it is about."""
+    """Print hearthlog's warnings, and collect the files (or other subjects) of each text."""
     warned: dict[str, set[str]] = {}
     others = warnings.showwarning
 

@@ -65,7 +65,7 @@ def fetch(
 
 
 def _put(network: "EmbeddingNetwork") -> Path:
-    """Download a network, unless it is there; return where it is."""
+    """Download a network unless present; return its path."""
     from hearthlog.models.embedding.networks import folder_for_new, read_network_file
     from hearthlog.models.errors import ModelError
     from hearthlog.tools.cli.terminal import share_done
@@ -102,7 +102,7 @@ def _put_from(network: "EmbeddingNetwork", source: Path) -> Path:
 
 
 def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
-    """Try a network as a recorder will; return what is wrong with it."""
+    """Test a network as a recorder would use it; return the problems."""
     from hearthlog.analyzer.extras import missing
     from hearthlog.models.embedding.networks import missing_modules
     from hearthlog.models.errors import ModelError
@@ -149,7 +149,7 @@ _HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "siz
 
 
 class _ClassShare(NamedTuple):
-    """How much of the sound each of two models gives to a class."""
+    """Share of sound that each of two models assigns to a class."""
 
     name: str
     a: float
@@ -319,7 +319,7 @@ def rollback(folder: _Folder = None) -> None:
 
 
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
-    """End with a line if a model was judged to do harm; judge it first if it was not."""
+    """Raise ModelError if a model was judged harmful; judge a model without a verdict first."""
     from hearthlog.analyzer.gate.promotion_check import judge, judged_against
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
@@ -349,9 +349,9 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
 
 
 def _starter_here(folder: Path, name: str) -> str:
-    """Return the starter that a name means here, unless another model of the folder has the name.
+    """Return the starter that a name stands for here, unless a model of the folder has this name.
 
-    One that was promoted before there was a network lies in the folder, too.
+    A starter promoted before a network was installed is in the folder, too.
     """
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import is_starter, load
@@ -367,7 +367,7 @@ def _starter_here(folder: Path, name: str) -> str:
 
 
 def _check_beside_champion(folder: Path, name: str) -> None:
-    """End with a line if a candidate cannot label what the champion does, if there is one."""
+    """Raise ModelError if a candidate's feature set differs from that of an existing champion."""
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import CHAMPION, load
 
@@ -434,7 +434,7 @@ def _named(folder: Path, name: str) -> "Model":
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.modelfile.registry import load
 
-    if Path(name).name != name and Path(name).exists():  # a file of another folder
+    if Path(name).name != name and Path(name).exists():  # a file in another folder
         return load_model(Path(name))
     return load(folder, name)
 
@@ -444,7 +444,7 @@ def _after(before: str | None) -> str:
 
 
 def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
-    """Return the share of the segments that each model gives to each class."""
+    """Return the share of segments that each model assigns to each class."""
     sides = (comparison.a, comparison.b)
     both = [[sum(column) for column in zip(*one.scores.confusion, strict=True)] for one in sides]
     total = max(comparison.a.scores.segments, 1)
@@ -455,7 +455,7 @@ def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
 
 
 def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
-    """Return how many minutes of a mean day each model gives to each class, where that is seen."""
+    """Return the minutes per average day of each model and class, from recent logs."""
     from hearthlog.analyzer.gate.comparison import gather_evidence
     from hearthlog.analyzer.gate.paired_labels import time_words
     from hearthlog.analyzer.gate.recent_time import recent_logs
@@ -491,7 +491,7 @@ def _print_comparison(comparison: "Comparison", shares: list["_ClassShare"]) -> 
 def _print_shares(
     a: str, b: str, shares: list["_ClassShare"], comparison: "Comparison | None"
 ) -> None:
-    """Print a row for each class that either model says or that occurs."""
+    """Print a row for each class that occurs or that either model outputs."""
     sides = () if comparison is None else (comparison.a, comparison.b)
     f1 = [{name: one.f1 for name, one in side.scores.per_class.items()} for side in sides]
     names = dict.fromkeys([*(name for one in f1 for name in one), *(one.name for one in shares)])
@@ -528,7 +528,7 @@ def _verdict(comparison: "Comparison") -> str:
 
 
 def _network(model: "Model") -> str:
-    """Name the network whose embeddings a model takes; empty for none."""
+    """Return the name of a model's embedding network; empty for none."""
     mix = model.description.embedding
     return "" if mix is None else mix.network
 

@@ -1,4 +1,4 @@
-"""Options and arguments that several verbs have, and how they are read."""
+"""Options and arguments shared by several subcommands, and their parsing."""
 
 import getpass
 from contextlib import suppress
@@ -26,7 +26,7 @@ METHODS = (
 
 
 def log_location(text: str) -> Path:
-    """Read the name of a log or a folder, which may be the URL of a store."""
+    """Parse the path of a log or folder, or a store URL."""
     if "://" not in text:
         return Path(text)
     from hearthlog.analyzer.logs.locations import location
@@ -38,7 +38,7 @@ LOG_HELP = "A log, or a folder of logs, or a URL such as s3://bucket/home."
 
 
 def logs_folder() -> str:
-    """Return the folder that a recorder writes to: `logs`, unless the environment names another."""
+    """Return the recorder's folder: `logs`, unless the environment names another."""
     from hearthlog.recorder.config import load_settings
 
     return str(load_settings(None, {}, {}).output)
@@ -48,7 +48,7 @@ def _logs_folders() -> list[str]:
     return [logs_folder()]
 
 
-# Whether they may be read is found out where they are, and said better than by typer.
+# Readability is checked on access, with better messages than typer's.
 Log = Annotated[
     Path,
     typer.Argument(
@@ -160,14 +160,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 def manifest_path(path: Path) -> Path:
-    """Return the manifest that a path is, or that the folder holds."""
+    """Return the manifest at a path, or in the folder at the path."""
     return path / "manifest.csv" if path.is_dir() else path
 
 
 def labelled_clips(
     data: "Sequence[Path]", labels: "Collection[str]", left_out: "list[SkippedClip]"
 ) -> "list[LabelledClip]":
-    """Read manifests, or the folders of them; take what is of no use in them apart."""
+    """Read manifests, or folders with one; collect unusable entries in `left_out`."""
     from hearthlog.analyzer.training.manifest import read_manifest
 
     paths = map(manifest_path, data)
@@ -175,7 +175,7 @@ def labelled_clips(
 
 
 def models_folder(given: Path | None = None) -> Path:
-    """Return the folder of models: the given one, that of the configured model, or `models`."""
+    """Return the model folder: the given one, the folder of the configured model, or `models`."""
     from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
     from hearthlog.models.starter import STARTERS
     from hearthlog.recorder.config import NO_MODEL, load_settings
@@ -190,7 +190,7 @@ def models_folder(given: Path | None = None) -> Path:
 
 
 def starter_here(model: Path) -> Path:
-    """Return the model that a name means here: of a starter, that for the network that is there."""
+    """Return the model for a name; a starter is resolved by the installed network."""
     from hearthlog.models.modelfile.modelfile import starter_for
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.labelling.embedder_probe import likely_network
@@ -199,10 +199,10 @@ def starter_here(model: Path) -> Path:
 
 
 def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
-    """Return the model that a name means for logs: of a starter, that which takes what one has.
+    """Return the model for a name; a starter is resolved by the embeddings in the logs.
 
-    It is one for all, so that what is labelled has one name: without embeddings it is about as
-    right as the other starter.
+    All logs get one model, so that the labelling has one name: without embeddings it is about as
+    accurate as the other starter.
     """
     from hearthlog.analyzer.logs.recorder_info import first_embedding_source
     from hearthlog.models.classifiers.classifier import Classifier
@@ -216,7 +216,7 @@ def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
         return model
     classifier = Classifier(load_model(other))
     for path in logs:
-        with suppress(LogError):  # which is told where they are read
+        with suppress(LogError):  # reported where the logs are read
             for log in reversed(find_logs(path)):
                 with suppress(LogError):
                     if classifier.takes_embeddings(first_embedding_source(log)):
@@ -238,7 +238,7 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
 
 def parse_time(text: str, option: str) -> int:
-    """Read a time, in nanoseconds of UTC; it is wrong use if the text is not a time."""
+    """Parse a time, in nanoseconds of UTC; invalid text ends with wrong use."""
     from hearthlog.schemas.frames import read_time
 
     try:
@@ -248,7 +248,7 @@ def parse_time(text: str, option: str) -> int:
 
 
 def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | None]:
-    """Read the options --start and --end, in nanoseconds of UTC."""
+    """Parse the options --start and --end, in nanoseconds of UTC."""
     first = None if start is None else min(max(parse_time(start, "--start"), 0), _LAST)
     last = None if end is None else min(max(parse_time(end, "--end"), 0), _LAST)
     if first is not None and last is not None and first >= last:
@@ -257,7 +257,7 @@ def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | No
 
 
 def scenario_files(given: list[str] | None) -> dict[str, Path]:
-    """Read values of the option `--scenario`: the model files by the names of the scenarios."""
+    """Parse values of `--scenario`: model files by scenario name."""
     files: dict[str, Path] = {}
     for text in given or ():
         name, equals, file = text.partition("=")
@@ -270,7 +270,7 @@ def scenario_files(given: list[str] | None) -> dict[str, Path]:
 
 
 def chosen_method(name: str | None, **parameters: float | None) -> "Method":
-    """Return a way to learn, with other parameters where they are given; by default the best."""
+    """Return a training method with the given parameters; by default the best method."""
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.training.train import method_named
 
@@ -286,7 +286,7 @@ def chosen_method(name: str | None, **parameters: float | None) -> "Method":
 
 
 def _best_method() -> "Method":
-    """Return the default way to learn; a home whose recorder wants no network needs none."""
+    """Return the default training method; needs no network if the recorder disables networks."""
     from hearthlog.analyzer.training.train import DEFAULT, default_method
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
@@ -297,7 +297,7 @@ def _best_method() -> "Method":
 
 
 def reviewer_name(option: str | None) -> str:
-    """Name the reviewer; empty if nobody is named, and the login has no name."""
+    """Return the reviewer's name; empty without an option and a login name."""
     from hearthlog.analyzer.marks.marks import PERSON_NAME
 
     if option is not None:

@@ -1,4 +1,4 @@
-"""The promotion of a model in lines: changes in a home, the verdict on it, and its trial."""
+"""Text of a model's promotion: changes in a home, verdict, and trial."""
 
 import shlex
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hearthlog.models.modelfile.registry import Judgement
 
 
-_SHOWN = 8  # changes
+_SHOWN = 8  # changes listed
 
 
 def print_changes(changes: "LabelChanges", before: str, after: str) -> None:
@@ -39,7 +39,7 @@ _WHOLE_DAY = 0.95 * 24 * 60  # minutes
 
 
 def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
-    """Print what would change, how to hear that, and on what it is seen."""
+    """Print what would change, how to listen to the changes, and the evidence."""
     evidence = verdict.evidence
     if evidence is None:
         return
@@ -63,7 +63,7 @@ def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
 
 
 def refusal(judgement: "Judgement", name: str) -> str:
-    """Say in a line why a model may not label, and how to insist."""
+    """Return a line on why a model may not label, and how to override."""
     return (
         f"{name} refused: {'; '.join(judgement.reasons)}; "
         f"`hearthlog models promote {name} --anyway` lets it label all the same"
@@ -95,7 +95,7 @@ def _print_right(what: str, right: "PairedAccuracy", verdict: "Verdict") -> None
 
 
 def trial_as_json(trial: Trial) -> dict[str, Any]:
-    """Return a trial for a program."""
+    """Return a trial as a JSON object."""
     changes = trial.changes
     return {
         "champion": trial.champion,
@@ -117,7 +117,7 @@ def trial_as_json(trial: Trial) -> dict[str, Any]:
 
 
 def print_trial(trial: Trial) -> None:
-    """Print how two models that label at the same time differ, and which is more often right."""
+    """Print how two models on trial differ, and which is correct more often."""
     print(
         printable(
             f"{trial.candidate}, a candidate, beside {trial.champion}: "

@@ -1,4 +1,4 @@
-"""`hearthlog record`: a microphone, or audio files in its place, to a log."""
+"""`hearthlog record`: a log from a microphone or audio files."""
 
 import os
 import signal
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.errors import Progress
 
-_HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # from others, by `readable_by`
+_HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # umask by `readable_by`
 
 
 def record(
@@ -163,7 +163,7 @@ def record(
     if files:
         if len(settings.microphone) > 1:
             wrong_use("files take the place of one microphone; the configuration has several")
-        lives = realtime and sys.stderr.isatty()  # as a microphone; else a bar says how far it is
+        lives = realtime and sys.stderr.isatty()  # live line for real time, else a progress bar
         with ExitStack() as shown:
             progress = ignore_progress if lives else shown.enter_context(share_done("recording"))
             source, doubts, refused = _open_files(
@@ -182,14 +182,14 @@ def record(
         recording = _listen(settings, stop, reload_requests)
         if reload_requests.restart:
             tell("the configuration was changed; starting again with it")
-            os.execv(sys.executable, sys.orig_argv)  # noqa: S606  as this process was started
+            os.execv(sys.executable, sys.orig_argv)  # noqa: S606  with the original arguments
     _say(recording, losses)
 
 
 def _listen(
     settings: "Settings", stop: Flag, reload_requests: "ReloadRequests"
 ) -> "RecordingSummary":
-    """Record microphones, and show on a terminal what they hear."""
+    """Record microphones, with a live status line on a terminal."""
     from hearthlog.recorder.recording import record_microphones
 
     if not sys.stderr.isatty():
@@ -200,7 +200,7 @@ def _listen(
 
 @contextmanager
 def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
-    """Show in a line what is heard, from the state that is yielded."""
+    """Show a live line, from the state that is yielded."""
     from hearthlog.recorder.recording_session import RecorderState
     from hearthlog.tools.cli.status_line import living_line
 
@@ -211,7 +211,7 @@ def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
 
 
 def with_model(settings: "Settings") -> "Settings":
-    """Choose the model where none is configured."""
+    """Return settings with a model where none is configured."""
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
 
     model = DEFAULT_MODEL if settings.model is None else settings.model
@@ -221,7 +221,7 @@ def with_model(settings: "Settings") -> "Settings":
 
 
 def _tell_of_network(settings: "Settings") -> None:
-    """Say what a network would gain, and how to get it, where nobody has decided on one."""
+    """Print the benefit of a network and how to get one, unless the configuration decides."""
     from hearthlog.analyzer.extras import remedy
     from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
@@ -240,7 +240,7 @@ def _tell_of_network(settings: "Settings") -> None:
 
 
 def _say(recording: "RecordingSummary", losses: list[str]) -> None:
-    """Print what was recorded, and end with status 3 if something was lost or refused."""
+    """Print the recording's summary; end with status 3 after losses or refusals."""
     for log in recording.logs:
         print(log)
     damaged = [old for old in recording.recovered if old.damage]
@@ -259,11 +259,11 @@ def _say(recording: "RecordingSummary", losses: list[str]) -> None:
 def _look_at_hangup(
     stop: Flag, load: "Callable[[], Settings]", configured: "Settings"
 ) -> "ReloadRequests":
-    """Look at models and configuration when SIGHUP comes; stop if the terminal has gone with it."""
+    """Reload models and configuration on SIGHUP; stop if the terminal was closed."""
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
 
     reload_requests = ReloadRequests()
-    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as nohup wants it
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # set by nohup
     at_terminal = sys.stderr.isatty() and not ignored
 
     def look_at_configuration() -> None:
@@ -298,7 +298,7 @@ def _open_files(
     realtime: bool,
     progress: "Progress",
 ) -> tuple["FileSource", list[str], list[str]]:
-    """Open audio files in the order of time; return doubts about it, and what was left out."""
+    """Open audio files in time order; return doubts about the order, and skipped files."""
     from hearthlog.recorder.pause_schedule import time_zone
     from hearthlog.recorder.sources.audio_files import FileSource, find_audio
     from hearthlog.recorder.sources.file_times import arrange, check_pattern, doubts, file_time

@@ -1,4 +1,4 @@
-"""Verbs of the recorder: `devices`, `config`, `pause`, `resume`, `retain` and `install-service`."""
+"""Recorder subcommands: `devices`, `config`, `pause`, `resume`, `retain` and `install-service`."""
 
 import getpass
 import json
@@ -129,7 +129,7 @@ def _value_lines(
 
 
 def _toml(value: Any) -> str:
-    """Write a value down as TOML; empty for None, which TOML does not have."""
+    """Format a value as TOML; empty for None, which TOML lacks."""
     if isinstance(value, dict):
         return f"{{{', '.join(f'{key} = {_toml(each)}' for key, each in value.items())}}}"
     return "" if value is None else json.dumps(value, ensure_ascii=False)

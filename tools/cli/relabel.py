@@ -1,4 +1,4 @@
-"""`hearthlog relabel` and `diff`: labels of another model, and how two labellings differ."""
+"""`hearthlog relabel` and `diff`: labels of another model, and differences of two labellings."""
 
 import json
 import os
@@ -74,12 +74,12 @@ def relabel(
 
     count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler, _TASKS) as pool:
-        # Here, since it takes as long as the workers take to be ready.
+        # Imported here: it takes as long as the workers take to start.
         from hearthlog.analyzer.relabel.relabel import relabel as run
         from hearthlog.models.modelfile.modelfile import load_model
 
         model = starter_of(model, logs)
-        where = model.resolve() if model.is_file() else model  # else the name of a starter
+        where = model.resolve() if model.is_file() else model  # otherwise a starter name
         loaded = load_model(model)
         with share_done("labelling logs", announce=True) as report:
             result = run(logs, loaded, where, pool, report)
@@ -211,7 +211,7 @@ def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _
     difference = compare_labellings(*sides)
     figures = {"microphone": microphone, **asdict(difference)}
     figures["disagreements"] = len(difference.disagreements.starts)
-    spans = partial(disagreements, difference, microphone)  # there may be a hundred thousand
+    spans = partial(disagreements, difference, microphone)  # may be a hundred thousand
     return _Result(figures, spans, partial(print_difference, difference, shown))
 
 

@@ -1,4 +1,4 @@
-"""`hearthlog replay`: recorded logs once more through the pipeline."""
+"""`hearthlog replay`: recorded logs through the pipeline again."""
 
 import json
 import math
@@ -126,9 +126,10 @@ def replay(
 
 
 class _Models:
-    """The model that was given, or those that logs were recorded with.
+    """The given model, or the models of the logs.
 
-    After `report`, `are_recorded` and `are_lacking` say whether all, and whether one is not there.
+    After `report`, `are_recorded` tells whether all models are the recorded ones, and `are_lacking`
+    whether one is missing.
     """
 
     def __init__(self, given: Path | None, folders: Sequence[Path]) -> None:
@@ -141,7 +142,7 @@ class _Models:
         self.are_lacking = False
 
     def __call__(self, info: "RecorderInfo") -> "Model | None":
-        """Return the model for what a recorder wrote."""
+        """Return the model for a recorder's info."""
         from hearthlog.analyzer.replay.replay import find_model
 
         if self._given is not None:
@@ -152,7 +153,7 @@ class _Models:
         return self._models[key]
 
     def report(self, infos: Sequence["RecorderInfo"]) -> None:
-        """Say where the model is not the recorded one."""
+        """Report models that differ from the recorded ones."""
         for info in {(o.model, o.model_sha256): o for o in infos}.values():
             model = self(info)
             digest = "" if model is None else model.sha256
@@ -189,7 +190,7 @@ def _parse_rate(text: str) -> float | None:
 
 
 def _check_output(output: Path | None, source: Path) -> None:
-    """Refuse an output that exists, or that would get among what is replayed."""
+    """Refuse an existing output, or one among the replayed logs."""
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.new_files import check_new
 
@@ -245,7 +246,7 @@ def _figures(result: "Replay", took: float) -> list[str]:
 
 
 def _agreement(same: int, identical: int, recorded: int) -> str:
-    """Say how much of what was recorded came out again."""
+    """Return how much of the recorded data was reproduced."""
     if not recorded:
         return "none were recorded"
     bits = "; bit for bit" if identical == recorded else ""

@@ -72,7 +72,7 @@ def report(
 
 
 def _first_day(day: str | None, week: str | None) -> date:
-    """Read a day, or find the Monday of a week."""
+    """Parse a day, or return the Monday of a week."""
     option, text = ("--day", day) if week is None else ("--week", week)
     try:
         start = date.fromisoformat(text or "")
@@ -85,7 +85,7 @@ def _first_day(day: str | None, week: str | None) -> date:
 
 
 def _name(home_logs: "HomeLogs", first: date, count: int) -> str:
-    """Name a page after the home and the day."""
+    """Return a page name from the home and the day."""
     node = next((entry.node for entry in home_logs.entries if entry.node), "home")
     when = f"{first}" if count == 1 else f"{first:%G-W%V}"
     return f"{node}_{when}.html"

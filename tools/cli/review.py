@@ -1,4 +1,4 @@
-"""`hearthlog review`: logs on one time axis, and marks made where they are seen."""
+"""`hearthlog review`: logs on one time axis, with marking."""
 
 import shlex
 import signal
@@ -141,7 +141,7 @@ def review(
         print_recording(save)
     else:
         for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, _end)  # or the viewer would stay, and listen
+            signal.signal(number, _end)  # otherwise the viewer would keep running, and listening
         with _open(web=web, port=port) as viewer:
             timeline = read()
             _show(viewer, timeline, logs, chosen)
@@ -160,10 +160,10 @@ def _require_viewer(queue: str | None) -> None:
 
 
 class ReviewCommand(TyperCommand):
-    """The command, whose option --queue may be without a value."""
+    """The `review` command; its option --queue may have no value."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Parse arguments, with the ranking named where none is."""
+        """Parse arguments; a missing ranking gets the default."""
         from hearthlog.analyzer.review.ranking import USEFUL
 
         if _QUEUE in args:
@@ -182,7 +182,7 @@ def _end(number: int, _frame: object) -> None:
 
 
 def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
-    """Read the option --day: from midnight to midnight, at home."""
+    """Parse the option --day: local midnight to midnight."""
     from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.logs.local_time import day_span
 
@@ -196,7 +196,7 @@ def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None,
 
 
 def _open(*, web: bool, port: int | None) -> "Viewer":
-    """Start the viewer before logs are read: it takes its time as well."""
+    """Start the viewer before logs are read, since its start takes time, too."""
     if web:
         from hearthlog.analyzer.review.viewer.web import open_page
 
@@ -207,7 +207,7 @@ def _open(*, web: bool, port: int | None) -> "Viewer":
 
 
 class _Choice(NamedTuple):
-    """What is to be corrected, by whom, and in which order."""
+    """What to correct, the reviewer, and the order."""
 
     labels: str
     microphone: str | None
@@ -218,7 +218,7 @@ class _Choice(NamedTuple):
 
 
 def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
-    """Show a timeline until the reviewer is done."""
+    """Show a timeline until the reviewer ends."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.review.lanes import class_precision
@@ -234,7 +234,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     items, marking = _work(timeline, logs, choice, microphone)
     heard = timeline.microphones[microphone]
     if marking.scenario:
-        heard.reviewed_scenarios.setdefault(marking.scenario, no_spans())  # or it has no lane
+        heard.reviewed_scenarios.setdefault(marking.scenario, no_spans())  # else it has no lane
 
     def say(text: str) -> None:
         print(printable(text), flush=True)
@@ -289,7 +289,7 @@ def _say_next(logs: list[Path], scenario: str) -> None:
 
 
 def _say_how_right(logs: list[Path]) -> None:
-    """Print what the minutes that were drawn at random tell by now."""
+    """Print the accuracy from the randomly drawn minutes so far."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.tools.cli.info_summary import Accuracy
 
@@ -302,7 +302,7 @@ def _say_how_right(logs: list[Path]) -> None:
 def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
 ) -> "tuple[list[ReviewItem], Marking]":
-    """Find what is to be gone through, and what is corrected."""
+    """Return the review items and the marking of a labelling."""
     from hearthlog.analyzer.logs.labelling import find_labellings
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import corrected_name
@@ -332,7 +332,7 @@ def _work(
 
 
 def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | None) -> None:
-    """Write the spans of a queue, and what sound of them was kept, for who has no viewer."""
+    """Write the spans of a queue and their kept audio, for use without a viewer."""
     from hearthlog.analyzer.logs.labelling import find_labellings
     from hearthlog.analyzer.logs.layers import find_coverage, zone_of
     from hearthlog.analyzer.marks.formats.formats import AUDACITY
@@ -435,7 +435,7 @@ def _tell_fewer(count: int, choice: _Choice) -> None:
 
 
 def _microphone(timeline: "Timeline", name: str | None) -> str:
-    """Return the microphone whose marks are made; of several the first."""
+    """Return the microphone to mark; the first by default."""
     names = ", ".join(timeline.microphones)
     if name is not None and name not in timeline.microphones:
         wrong_use(f"--microphone {name}: there is {names}")

@@ -1,4 +1,4 @@
-"""One line of a terminal that says what a recorder hears, and is written anew while it does."""
+"""Live status line of a recorder on a terminal."""
 
 import os
 import sys
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
     from hearthlog.recorder.recording_session import RecorderState
 
 
-_SECONDS = 0.5  # between two lines
-_LAST_FRAMES = 10  # half a second, over which probabilities are averaged
+_SECONDS = 0.5  # between two updates
+_LAST_FRAMES = 10  # half a second; probabilities are averaged over it
 _LOWEST = -120.0  # dB of full scale
-_CLOSING_SECONDS = 1.0  # for a terminal that takes nothing
-_WAITING = 200  # lines for such a terminal
+_CLOSING_SECONDS = 1.0  # wait for a blocked terminal
+_WAITING = 200  # lines queued for a blocked terminal
 _WIDTH = 80
 
 
 @contextmanager
 def living_line(state: "RecorderState", settings: "Settings") -> Iterator[None]:
-    """Show on standard error, which is a terminal, what a recorder hears while the block runs.
+    """Show a status line on standard error, a terminal, while the block runs.
 
-    A thread writes, so that a terminal that takes nothing (Ctrl-S) never holds up the recorder,
-    whose own lines go the same way.
+    A thread writes, so that a blocked terminal (Ctrl-S) never delays the recorder, whose own lines
+    take the same way.
     """
     lines: deque[str] = deque(maxlen=_WAITING)
     closed = Flag()
@@ -57,7 +57,7 @@ def living_line(state: "RecorderState", settings: "Settings") -> Iterator[None]:
 
 
 def _wake_terminal(thread: Thread) -> None:
-    """Let a stopped terminal go on; what takes nothing even so is left, or nothing would end."""
+    """Resume a stopped terminal; give up if it stays blocked, or the process would not end."""
     with suppress(termios.error):
         termios.tcflow(sys.stderr.fileno(), termios.TCOON)
     thread.join(_CLOSING_SECONDS)
@@ -70,7 +70,7 @@ def _wake_terminal(thread: Thread) -> None:
 
 
 def _write(state: "RecorderState", lines: deque[str], zone: tzinfo, closed: Flag) -> None:
-    shown = 0  # columns that the line takes
+    shown = 0  # columns of the shown line
     with suppress(OSError):  # the terminal is gone
         while True:
             ends = closed.wait(_SECONDS)
@@ -88,7 +88,7 @@ def _write(state: "RecorderState", lines: deque[str], zone: tzinfo, closed: Flag
 
 
 def line_of(state: "RecorderState", now: datetime) -> str:
-    """Say in a line what is heard, how surely and how loud, and how much sound was kept."""
+    """Return a line with sounds, confidence, level, and amount of kept audio."""
     names = [*state.sound, *(name for name in list(state.trouble) if name not in state.sound)]
     parts = [_microphone(state, name, named=len(names) > 1) for name in names] or ["starting"]
     if state.keeps:
@@ -125,7 +125,7 @@ def _cropped(line: str) -> str:
 
 
 def _put(text: str) -> None:
-    """Write past the buffer of Python, whose lock a thread that waits would keep to the end."""
+    """Write past Python's buffer, whose lock a waiting thread would hold to the end."""
     data = text.encode(sys.stderr.encoding or "utf-8", "replace")
     while data:
         data = data[os.write(sys.stderr.fileno(), data) :]

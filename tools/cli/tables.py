@@ -1,4 +1,4 @@
-"""Scores, differences of two labellings, and spans to review as tables."""
+"""Tables of scores, labelling differences, and spans to review."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ _EVENTS = ("1-s F1", "event F1")
 
 
 def print_scores(scores: "Scores", detections: "Detections | None" = None, hours: int = 24) -> None:
-    """Print how good each class is, and which are taken for which; alarms are of some hours."""
+    """Print scores by class and confusions; false alarms are per number of hours."""
     rows = [
         (
             shortened(name, NAME_WIDTH),
@@ -41,7 +41,7 @@ def print_scores(scores: "Scores", detections: "Detections | None" = None, hours
 
 
 def _events(detections: "Detections | None", name: str | None, hours: int) -> tuple[str, ...]:
-    """Write the scores by events of a class, or of all."""
+    """Format the event scores of a class, or of all."""
     if detections is None:
         return ()
     both = detections.segment_based, detections.event_based
@@ -58,14 +58,14 @@ def print_counts(classes: Sequence[str], confusion: Sequence[Sequence[int]]) -> 
 
 
 def print_reliability(bins: "Sequence[Bin]", error: float) -> None:
-    """Print how sure the model is, and how often it is right then."""
+    """Print confidence against accuracy."""
     print(f"\nexpected calibration error {error:.3f}")
     rows = [(f"{one.confidence:.2f}", f"{one.accuracy:.2f}", str(one.count)) for one in bins]
     print_table(("sure", "right", "segments"), rows, words=0)
 
 
 def print_scenes(scenes: "Sequence[SceneScores]") -> None:
-    """Print how good the labels of each scene are, and their means and ranges."""
+    """Print the scores of each scene, and their means and ranges."""
     figures = [(one.macro_f1, one.event_f1, one.false_alarms_per_hour) for one in scenes]
     rows = [(f"seed {one.seed}", *_scene(row)) for one, row in zip(scenes, figures, strict=True)]
     if len(scenes) > 1:
@@ -82,7 +82,7 @@ def _scene(figures: Sequence[float]) -> tuple[str, str, str]:
 
 
 def print_coughs(coughs: "SingleCoughs") -> None:
-    """Print what became of single coughs."""
+    """Print the results for single coughs."""
     seconds = coughs.median_seconds
     length = "" if seconds is None else f", median label {seconds:.2f} s"
     print(
@@ -92,19 +92,19 @@ def print_coughs(coughs: "SingleCoughs") -> None:
 
 
 def print_skipped(skipped: Mapping[str, int], what: str = "recordings") -> None:
-    """Print how many recordings were left out, and why."""
+    """Print the number of skipped recordings by reason."""
     if skipped:
         print(f"\n{what} left out")
         print_table((), [(str(count), reason) for reason, count in skipped.items()], words=2)
 
 
 def share(value: float | None) -> str:
-    """Write a share, or - where there is none."""
+    """Format a share; - for None."""
     return "-" if value is None else f"{value:.3f}"
 
 
 def between(interval: "Interval | None") -> str:
-    """Write an interval, or - where there is none."""
+    """Format an interval; - for None."""
     return "-" if interval is None else f"{interval[0]:.3f}-{interval[1]:.3f}"
 
 
@@ -112,7 +112,7 @@ _AMOUNTS = "minutes a", "minutes b", "both", "events a", "events b", "agreement"
 
 
 def print_difference(difference: "LabellingDifference", spans: int) -> None:
-    """Print agreement, amounts and confusion, and where the longest disagreements are."""
+    """Print agreement, amounts, confusion, and the longest disagreements."""
     a, b, days = difference.a, difference.b, list(difference.days)
     span = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
     print(f"a: {a}, {difference.minutes_a:.1f} minutes")
@@ -186,5 +186,5 @@ def print_queue(queue: "ReviewQueue") -> None:
 
 
 def _span(start: int, end: int) -> tuple[str, str]:
-    """Write when a span starts, and how many seconds it lasts."""
+    """Format the start of a span, and its length in seconds."""
     return str(moment(start)), f"{(end - start) / NANOSECONDS:7.2f}"

@@ -1,4 +1,4 @@
-"""The terminal: lines, tables, progress, keys, and pages that open in a browser."""
+"""Terminal output: lines, tables, progress, keys, and pages opened in a browser."""
 
 import io
 import json
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
 
 
 JUDGED_BY = "leave it recording, for ten minutes that it has not learned from judge it"
-_SHOWN = 10  # of a list
-_MOST_TOLD = 100  # that are remembered
+_SHOWN = 10  # list items
+_MOST_TOLD = 100  # recent texts kept
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines whose texts may come from any file."""
+    """Print lines with texts from untrusted files."""
     for line in lines:
         print(printable(line))
 
 
 def print_json(result: dict[str, Any]) -> None:
-    """Print a result for a program."""
+    """Print a result as JSON."""
     print(json.dumps(result, allow_nan=False))
 
 
 def tell(text: str) -> None:
-    """Write a line that is no result to standard error."""
+    """Write a line to standard error, for anything but results."""
     print(f"hearthlog: {printable(text)}", file=sys.stderr)
 
 
 class TellOnce:
-    """Tells what may come again and again, each text once."""
+    """Writes repeated messages once per text."""
 
     def __init__(self) -> None:
         self._told: deque[str] = deque(maxlen=_MOST_TOLD)
 
     def __call__(self, what: object) -> None:
-        """Tell it, unless it was told of late."""
+        """Write a message unless written recently."""
         if str(what) not in self._told:
             self._told.append(str(what))
             tell(str(what))
@@ -68,13 +68,13 @@ def wrong_use(message: str) -> NoReturn:
 
 
 def unfinished_lines(paths: Sequence[Path]) -> list[str]:
-    """Say in a line which logs were not completed, if any."""
+    """Return a line that lists incomplete logs, if any."""
     names = ", ".join(map(str, paths))
     return [f"unfinished, read up to the last whole chunk: {names}"] if names else []
 
 
 def end_with_warnings(lines: Sequence[str]) -> None:
-    """Tell each line; end with exit status 3 if there is one."""
+    """Write each line to standard error; end with exit status 3 if there are any."""
     for line in lines:
         tell(line)
     if lines:
@@ -82,27 +82,27 @@ def end_with_warnings(lines: Sequence[str]) -> None:
 
 
 def number(count: int, what: str) -> str:
-    """Say how many there are of something."""
+    """Format a count with its noun."""
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def moment(stamp: int | None) -> str | None:
-    """Write a time (ns of UTC) down to the millisecond; None stays None."""
+    """Format a time (ns of UTC) to the millisecond; None stays None."""
     return None if stamp is None else millisecond_text(stamp)
 
 
 def first_of(what: str, lines: Sequence[str], hint: str = " (--json lists all)") -> Iterator[str]:
-    """Yield the first lines of a list, and how many more there are."""
+    """Yield the first lines of a list, and the number of the rest."""
     for line in lines[:_SHOWN]:
         yield f"{what}: {line}"
     if len(lines) > _SHOWN:
         yield f"{what}: and {len(lines) - _SHOWN} more{hint}"
 
 
-NAME_WIDTH = 18  # of a class in a table of figures
+NAME_WIDTH = 18  # class column of a table of figures
 _PLAIN_WIDTH = 160
 _GAP = 2
-_MANY = 1000  # rows, of which Rich would make a table for minutes
+_MANY = 1000  # rows; a Rich table of more takes minutes
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
@@ -113,8 +113,8 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     head : sequence of str
         Empty for a table without heads.
     words : int
-        Number of columns, from the left, that are words. The others are figures: aligned to the
-        right, and wrapped only after the words.
+        Number of text columns, from the left. The others are figures: aligned to the right, and
+        wrapped only after the text columns.
     """
     from rich.console import Console
     from rich.table import Table
@@ -143,7 +143,7 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
 
 
 def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
-    """Print rows of text in columns as wide as they need."""
+    """Print rows of text in columns of the required width."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row[:words], widths, strict=False)]
@@ -153,7 +153,7 @@ def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
 
 
 def print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
-    """Print a confusion matrix, if it is not too wide."""
+    """Print a confusion matrix, unless it is too wide."""
     widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
     if NAME_WIDTH + sum(widths) > _width():
         print("confusion: too many classes for a table; --json has it")
@@ -168,18 +168,18 @@ def _width() -> int:
 
 
 class OutputClosedError(Exception):
-    """Nobody reads standard output any more."""
+    """The reader of standard output is gone."""
 
 
 @contextmanager
 def checked_output() -> Iterator[None]:
-    """Let what is printed in the block raise one of our errors where it cannot be written.
+    """Turn output failures in the block into hearthlog errors.
 
-    Printing and flushing `sys.stdout` raise OutputClosedError if its reader is gone, and
-    HearthlogError if it cannot be written; what is printed afterwards is thrown away.
+    Printing and flushing `sys.stdout` raise OutputClosedError if the reader is gone, and
+    HearthlogError if writing fails; later output is discarded.
     """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by who started us
+        if getattr(sys, name) is None:  # closed by the parent process
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     plain = sys.stdout
     binary = io.BufferedWriter(_Output(plain.fileno(), "wb", closefd=False))
@@ -193,7 +193,7 @@ def checked_output() -> Iterator[None]:
 
 
 class _Output(io.FileIO):
-    """A file whose errors are ours."""
+    """A file that raises hearthlog errors."""
 
     def write(self, data: Any, /) -> int:
         try:
@@ -208,13 +208,13 @@ class _Output(io.FileIO):
             ) from error
 
     def _throw_away(self) -> None:
-        """Let what is still to be written go nowhere, or Python would try again when it ends."""
+        """Discard the pending output, since Python would write it again at exit."""
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, self.fileno())
         os.close(nothing)
 
 
-_SPEED_SECONDS = 1800.0  # over which speed is measured, for the time left: steps may be long
+_SPEED_SECONDS = 1800.0  # averaging time of the speed for the time left: steps may be long
 _LINE_SECONDS = 60.0  # between two lines
 
 
@@ -222,8 +222,8 @@ _LINE_SECONDS = 60.0  # between two lines
 def share_done(what: str, *, announce: bool = False) -> Iterator[Progress]:
     """Show the share, 0 to 1, that the block reports, and the time left.
 
-    Where standard error is no terminal, `announce` prints what begins, and what takes longer than
-    a minute prints a line a minute.
+    If standard error is no terminal, `announce` prints the task at its start, and a task of more
+    than a minute prints a line a minute.
     """
     if not sys.stderr.isatty():
         if announce:
@@ -254,9 +254,10 @@ def _lines(what: str) -> Progress:
 
 @contextmanager
 def read_keys(keys: "SimpleQueue[str]") -> Iterator[threading.Event]:
-    """Put keys into a queue as they are pressed; the end of the input is `q`, and sets the event.
+    """Put pressed keys into a queue; the end of the input is `q`, and sets the event.
 
-    Not that of /dev/null: what is started from a desktop has no other input, and has a window.
+    The end of /dev/null is ignored: programs started from a desktop have no other input, and have
+    a window.
     """
     ended = threading.Event()
     if not sys.stdin.isatty():
@@ -290,7 +291,7 @@ def _read_lines(keys: "SimpleQueue[str]", ended: threading.Event) -> None:
 
 
 def print_recording(path: Path) -> None:
-    """Print the name of a Rerun recording, and how to look at it."""
+    """Print the name of a Rerun recording, and how to open it."""
     from hearthlog.analyzer.review.viewer.process import hidden_options
 
     print(path)
@@ -299,13 +300,13 @@ def print_recording(path: Path) -> None:
 
 
 def show_page(address: str) -> None:
-    """Say where a page is, and open it where there is a display; without an address nothing."""
+    """Print the address of a page, and open it if there is a display; no address prints nothing."""
     if not address:
         return
     from hearthlog.analyzer.review.viewer.process import has_display
 
     tell(f"open {address}")
-    if has_display():  # else a browser of the terminal would take it from us
+    if has_display():  # otherwise a text browser would take over the terminal
         import webbrowser
 
         webbrowser.open(address)

@@ -1,4 +1,4 @@
-"""`hearthlog manifest` and `hearthlog train`: collections of labelled sound, and models of them."""
+"""`hearthlog manifest` and `hearthlog train`: collections of labelled clips, and training."""
 
 import json
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
 _SCENARIO = f"{SCENARIO} With --home alone a scenario of the recorder, by its name."
-_SPEAKERS = "speakers"  # the scenario of who speaks
+_SPEAKERS = "speakers"  # the speaker scenario
 
 
 def train(
@@ -132,7 +132,7 @@ def train(
         from hearthlog.analyzer.workers.workers import fits_on
 
         if speakers and method is None:
-            method = DEFAULT.name  # who speaks is told by the features
+            method = DEFAULT.name  # speakers are separated by features alone
         chosen = replace(chosen_method(method, cost=cost, gamma=gamma), seed=seed)
         with fits_on(scheduler):
             words = scenario, home or [], chosen, smoothing
@@ -188,7 +188,7 @@ def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
     try:
         with share_done("listening to what it would change", announce=True) as report:
             return judge(output.parent, model, home, report)
-    except ModelError as error:  # the model is made all the same
+    except ModelError as error:  # the model was written regardless
         tell(str(error))
         return None
 
@@ -206,7 +206,7 @@ def _print_next(verdict: "Verdict", output: Path) -> None:
 
 
 def _next_model(name: str) -> Path:
-    """Name the next model of the home or of a scenario, in the folder of models, which is made."""
+    """Return a new model path for the home or a scenario; creates the folder of models."""
     from hearthlog.schemas.new_files import private_folder
 
     folder = models_folder()
@@ -217,7 +217,7 @@ def _next_model(name: str) -> Path:
 
 
 def _model_of(home: list[Path], scenario: str) -> Path:
-    """Find the model that labelled the latest log, and name it."""
+    """Return the model that labelled the latest log, and print its name."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.models.modelfile.registry import find_model
 
@@ -331,7 +331,7 @@ def _learned_voices(
     smoothing: str,
     left_out: "list[SkippedClip]",
 ) -> tuple["Model", "Dataset"]:
-    """Learn who of those that are enrolled speaks."""
+    """Train a model of the enrolled speakers."""
     from hearthlog.analyzer.discover.home_voices import check_voices
     from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
     from hearthlog.analyzer.training.speakers import (
@@ -401,7 +401,7 @@ def _warn_of_few(segments: "Dataset") -> None:
 def _print(model: "Model", segments: "Dataset") -> None:
     data, amounts = model.description.training_data, ("sources", "seconds", "segments")
     adapted = bool(data.base_sha256)
-    if not adapted:  # else the figures are those of another model, which has said them
+    if not adapted:  # an adapted model has the base model's figures, which were printed
         print_figures(model)
     if data.home:
         home = "also learned from the home"
@@ -417,7 +417,7 @@ def _print(model: "Model", segments: "Dataset") -> None:
 
 
 def print_figures(model: "Model") -> None:
-    """Print what a model was learned from, and how good it is on sources it has not heard."""
+    """Print the training data of a model, and its scores on unseen sources."""
     from hearthlog.models.classes import UNKNOWN
     from hearthlog.models.classifiers.classifier import classifier_kind
 
@@ -426,7 +426,7 @@ def print_figures(model: "Model") -> None:
     rows = []
     for name in description.classes:
         amount, result = data.classes[name], metrics.classes[name]
-        if not amount.segments:  # learned from another model alone
+        if not amount.segments:  # taken from another model only
             continue
         figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
         rows.append((name, *_amounts(amount), *figures))
@@ -530,7 +530,7 @@ def _print_manifest(made: "ManifestSummary") -> None:
 
 
 def _counts(what: str, counts: "Counter[str]", unnamed: str = "") -> list[str]:
-    """List what is most frequent in a line, if there is anything."""
+    """Return a line with the most frequent names; empty list if there are none."""
     named = [f"{name or unnamed} {count:,}" for name, count in counts.most_common(_SHOWN)]
     more = [f"and {len(counts) - _SHOWN:,} more"] if len(counts) > _SHOWN else []
     return [f"{what}: {', '.join(named + more)}"] if named else []

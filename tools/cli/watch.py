@@ -30,7 +30,7 @@ def show_in_foxglove(
     span: tuple[int | None, int | None],
     stop: Event,
 ) -> bool:
-    """Serve viewers, live or what is of a span of time; tell whether some could not be read."""
+    """Serve viewers, live or a time span; return whether some logs could not be read."""
     from hearthlog.analyzer.foxglove.publisher import (
         Playback,
         Publisher,
@@ -64,17 +64,17 @@ def show_in_foxglove(
 
 @contextmanager
 def _address_said(admission: "Admission", port: int) -> Iterator[None]:
-    """Say where viewers connect; in a journal the name of a file that has the token for now."""
+    """Print where viewers connect; in a journal, a temporary file with the token instead."""
     from hearthlog.recorder.host import writes_to_journal
 
     host = f"[{admission.bind}]" if ":" in admission.bind else admission.bind
     place = f"{host}:{port}"
     address = f"ws://{place}/?token={admission.token}"
     with ExitStack() as until_the_end:
-        if writes_to_journal():  # which others may read
+        if writes_to_journal():  # readable by others
             folder = until_the_end.enter_context(TemporaryDirectory(prefix="hearthlog-"))
             file = Path(folder) / "foxglove-address"
-            file.write_text(f"{address}\n")  # the folder is this account's alone
+            file.write_text(f"{address}\n")  # only this account can read the folder
             address = f"ws://{place}/; its whole address, which opens it, is in {file}"
         tell(f"open in Foxglove or Lichtblick: {address}")
         _say_who_reaches(admission, place)
@@ -207,7 +207,7 @@ def _show_in_rerun(
     web: bool,
     serve: bool,
 ) -> bool:
-    """Draw what is written until it is enough; tell whether something could not be read."""
+    """Draw new data until stopped; return whether something could not be read."""
     from hearthlog.analyzer.logs.local_time import home_zone
 
     home_zone(timezone)
@@ -272,7 +272,7 @@ def _wait_until_closed(viewer: "Viewer", stop: Event) -> None:
 def _follow(
     logs: Path, start: int, timezone: str | None, server: "LiveServer", stop: Event
 ) -> bool:
-    """Draw what is written until it is enough; tell whether something could not be read."""
+    """Draw new data until stopped; return whether something could not be read."""
     from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.review.live_timeline import LiveTimeline
     from hearthlog.schemas.errors import LogError
