@@ -1,1 +1,1 @@
-"""What decides: classifier inference, segments and the model file, on numpy alone."""
+"""Classifier inference, segments and the model file, on numpy alone."""

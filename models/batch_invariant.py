@@ -1,4 +1,4 @@
-"""Matrix products whose rows do not depend on each other."""
+"""Matrix products whose rows are independent of each other."""
 
 from typing import Any
 
@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 from hearthlog.schemas.arrays import Float64
 
 _ROWS = 16
-_LINE = 64  # bytes of a cache
+_LINE = 64  # bytes of a cache line
 
 
 def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
     """Multiply `rows @ weights` so that a row's result does not depend on the other rows.
 
-    A BLAS chooses its kernel and its threads by the size of the whole product, and each sums in
-    another order. Stacks of one small, fixed shape leave it no choice.
+    A BLAS chooses kernel and threads by the size of the product, and each choice sums in another
+    order. Stacks of one small, fixed shape prevent that.
 
     Parameters
     ----------
     rows : np.ndarray [shape=(n, k)], float64
     weights : np.ndarray [shape=(k, m)], float64
-        At most a few thousand values, else the BLAS may still divide a stack among threads.
+        At most a few thousand values, else the BLAS may still split a stack among threads.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
 
 
 def aligned(weights: NDArray[Any]) -> NDArray[Any]:
-    """Copy weights to the start of a cache line: products with them take a third less time.
+    """Copy weights to the start of a cache line, which makes products a third faster.
 
     Parameters
     ----------

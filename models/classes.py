@@ -11,9 +11,9 @@ SILENCE, SPEECH, MUSIC, PHONE_RING = topics.SILENCE, "speech", "music", "phone_r
 COUGHING, CRYING, YELLING, LAUGHING = "coughing", "crying", "yelling", "laughing"
 FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
 OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
-OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no scenario that is built in
-OTHER, UNKNOWN = "other", topics.UNKNOWN  # for models and people; never learned
-OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # what it has no name for
+OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no built-in scenario
+OTHER, UNKNOWN = "other", topics.UNKNOWN  # for models and people; never trained
+OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # classes without a name in the scenario
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
@@ -25,9 +25,10 @@ class SoundClass(NamedTuple):
     colour : (int, int, int)
         Red, green and blue, 0 to 255.
     several : str
-        What people call its events where they count them; empty where they do not.
+        Plural name of its events for counts; empty if events are not counted.
     aliases : tuple of str
-        Names of the same class elsewhere, in the spelling of `find_class`; subclasses are none.
+        Names of the same class in other datasets, in the spelling of `find_class`; without
+        subclasses.
     """
 
     name: str
@@ -38,12 +39,10 @@ class SoundClass(NamedTuple):
     aliases: tuple[str, ...] = ()
 
 
-# Aliases are the names of AudioSet, and of FSD50K, which has "and" for their commas.
-#
-# The colours, but that of `other`, were optimised together: any two differ by at least 19 (CIE
-# 1976, in L*a*b*) for eyes that see all colours and for protanopia, deuteranopia and tritanopia
-# (as Machado et al., 2009, simulate them), and by 3 in lightness, which is what is left on a grey
-# print.
+# Aliases are the names of AudioSet, and of FSD50K, which has "and" for their commas. The colours,
+# except that of `other`, were optimised together: any two differ by at least 19 (CIE 1976, in
+# L*a*b*) in normal vision and in protanopia, deuteranopia and tritanopia (simulated as by Machado
+# et al., 2009), and by 3 in lightness, which remains on a grey print.
 # fmt: off
 CLASSES = (
     SoundClass(SILENCE,          (112, 120, 130),   2.5, "Quiet"),
@@ -76,13 +75,13 @@ _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 
 
 def find_class(label: str) -> SoundClass | None:
-    """Return the class that a label means.
+    """Return the class of a label.
 
     Parameters
     ----------
     label : str
-        Name or alias of a class. Capitals, and spaces, commas and hyphens for `_`, make no
-        difference: `Crying, sobbing` is `crying_sobbing`.
+        Name or alias of a class. Case is ignored, and spaces, commas and hyphens equal `_`:
+        `Crying, sobbing` is `crying_sobbing`.
 
     Returns
     -------
@@ -93,32 +92,32 @@ def find_class(label: str) -> SoundClass | None:
 
 
 def in_words(label: str) -> str:
-    """Name a class as people would.
+    """Return the display name of a class.
 
     Parameters
     ----------
     label : str
-        A name of the class, in any spelling; that of an unknown class is written without `_`.
+        A name of the class, in any spelling; the name of an unknown class is written without `_`.
     """
     row = find_class(label)
     return label.replace("_", " ").capitalize() if row is None else row.words
 
 
 def class_name(label: str) -> str:
-    """Return the name of the class that a label means; the label itself if there is none."""
+    """Return the class name of a label; the label itself if there is none."""
     row = find_class(label)
     return label if row is None else row.name
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:
-    """Return the names that a label means: the label itself in any spelling, or all of its class.
+    """Return the names that match a label: the label itself in any spelling, or all of its class.
 
-    Two names of one class in a collection are different things there, so a third name means both.
+    Two names of one class in a dataset are distinct there, so a third name matches both.
 
     Returns
     -------
     list of str
-        In the order of `names`; empty if the label means none of them.
+        In the order of `names`; empty if none matches.
     """
     if label in names:
         return [label]
@@ -128,12 +127,12 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
 
 
 def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
-    """Translate labels to the names that they mean.
+    """Translate labels to matching names.
 
     Returns
     -------
     dict of str to str
-        The name of each label; the label itself if it means none of the names or several.
+        The name of each label; the label itself if none or several of the names match.
     """
     meant = {label: meant_by(label, names) for label in labels}
     return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}

@@ -4,4 +4,4 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 class ModelError(HearthlogError):
-    """A model file is missing, damaged, or made for something else."""
+    """A model file is missing, damaged, or incompatible."""

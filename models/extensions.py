@@ -7,7 +7,7 @@ from typing import Generic, Protocol, TypeVar
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.errors import HearthlogError
 
-_OF_EXAMPLES = {  # in `examples` of a clone of hearthlog, by distribution
+_OF_EXAMPLES = {  # extensions in `examples` of a clone of hearthlog, by distribution
     "hearthlog-classifiers": (
         *("layers", "neighbours", "one-class", "trees"),
         *("boosting", "extra-trees", "forest", "logistic", "perceptron"),
@@ -18,7 +18,7 @@ _OF_EXAMPLES = {  # in `examples` of a clone of hearthlog, by distribution
 
 
 class Named(Protocol):
-    """Anything with a name."""
+    """An object with a name."""
 
     @property
     def name(self) -> str:
@@ -29,15 +29,15 @@ T = TypeVar("T", bound=Named)
 
 
 class Extensions(Generic[T]):
-    """Objects of one kind, by name: our own, and those of other distributions' entry points.
+    """Objects of one kind, by name: built-in objects, and entry points of other distributions.
 
-    Entry points are only looked up for names that are not ours, so that a recorder with a model
-    of ours imports nothing else.
+    Entry points are only looked up for names that are not built in, so a recorder with a built-in
+    model imports nothing else.
 
     Parameters
     ----------
     missing : type of HearthlogError
-        Raised if there is none of a name.
+        Raised if there is no object of a name.
     """
 
     def __init__(
@@ -56,16 +56,16 @@ class Extensions(Generic[T]):
         self._loaded = dict(self._ours)
 
     def names(self) -> list[str]:
-        """Return all names: ours first, then the others in alphabetical order."""
+        """Return all names: built-in names first, then the others in alphabetical order."""
         theirs = {point.name for point in entry_points(group=self._group)}
         return [*self._ours, *sorted(theirs - self._ours.keys())]
 
     def has(self, name: str) -> bool:
-        """Tell whether there is one of this name, without importing it."""
+        """Return whether there is an object of this name, without importing it."""
         return name in self._loaded or bool(entry_points(group=self._group, name=name))
 
     def distribution(self, name: str) -> str:
-        """Return the distribution that brings one of others, and its version; empty for ours."""
+        """Return the distribution and version of an extension; empty for built-in objects."""
         points = () if name in self._ours else entry_points(group=self._group, name=name)
         names = [f"{p.dist.name} {p.dist.version}" for p in points if p.dist is not None]
         return names[0] if names else ""
@@ -76,9 +76,9 @@ class Extensions(Generic[T]):
         Raises
         ------
         HearthlogError
-            Of the type `missing`, if there is none of this name.
+            Of the type `missing`, if there is no object of this name.
         ModelError
-            If its entry point cannot be imported, or is no object of this kind and name.
+            If its entry point cannot be imported, or is not an object of this kind and name.
         """
         if name not in self._loaded:
             for point in entry_points(group=self._group, name=name):
@@ -100,7 +100,7 @@ class Extensions(Generic[T]):
 
 
 def _brought_by(name: str) -> str:
-    """Say which distribution of ours brings a name, if one does."""
+    """Name our example distribution that provides a name, if there is one."""
     for distribution, names in _OF_EXAMPLES.items():
         if name in names:
             return f"distribution {distribution}, in examples of a clone of hearthlog, brings it; "

@@ -1,4 +1,4 @@
-"""A file from an address: bounded, resumed, and checked before it has its name."""
+"""File download: bounded, resumable, and verified before the file gets its name."""
 
 import fcntl
 import hashlib
@@ -30,8 +30,8 @@ from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, Progress, ignore_progress, printable
 from hearthlog.schemas.new_files import sync_folder
 
-_TIMEOUT_SECONDS = 20.0  # without a byte
-_WAIT_SECONDS = (1.0, 2.0, 4.0)  # between tries that brought nothing
+_TIMEOUT_SECONDS = 20.0  # without receiving a byte
+_WAIT_SECONDS = (1.0, 2.0, 4.0)  # between attempts without progress
 _MOST_TRIES = 50
 _LEAST_SPEED = 256  # bytes a second
 _BLOCK = 1 << 16
@@ -43,43 +43,43 @@ _RANGE = re.compile(r"bytes ([0-9]{1,18})-[0-9]+/([0-9]+|\*)")
 
 
 class DownloadError(HearthlogError):
-    """A file cannot be had from its address, or is another one."""
+    """A file cannot be downloaded, or is not the expected file."""
 
 
 class _TransientError(Exception):
-    """Something that may pass."""
+    """A failure that may pass."""
 
 
 class _StartOverError(Exception):
-    """What is there of the file is of no use."""
+    """The partial file is unusable."""
 
 
 def download(
     url: str, path: Path, size: int, sha256: str, progress: Progress = ignore_progress
 ) -> None:
-    """Download a file, and give it its name once it is known to be the right one.
+    """Download a file, and give the file its name after verification.
 
-    What was downloaded before it was interrupted lies beside it, for this account alone to read,
-    and is gone on with.
+    The data of an interrupted download stays next to the path, readable by this account alone, and
+    is resumed.
 
     Parameters
     ----------
     path : Path
-        Where it is put, readable by all; what is there is replaced.
+        Destination, readable by all; an existing file is replaced.
     size : int
-        Of the file, in bytes; no more is read.
+        Size of the file in bytes; no more is read.
 
     Raises
     ------
     DownloadError
-        If it cannot be had, is another file, or cannot be written.
+        If the file cannot be downloaded, is not the expected file, or cannot be written.
     """
     _check_address(url)
     with _writing(path), _part(path, sha256) as part:
         resumed = _length(part)
         _receive_all(url, part, size, progress)
         found = _digest(part)
-        if found != sha256 and resumed:  # what was there may have been of another version
+        if found != sha256 and resumed:  # the earlier part may belong to another version
             _empty(part)
             _receive_all(url, part, size, progress)
             found = _digest(part)
@@ -93,7 +93,7 @@ def download(
 
 
 def put(data: bytes, path: Path) -> None:
-    """Write a file that all may read, whole or not at all; what is there is replaced.
+    """Write a file readable by all, atomically; an existing file is replaced.
 
     Raise `DownloadError` if it cannot be written.
     """
@@ -106,12 +106,12 @@ def put(data: bytes, path: Path) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Make the folder of a file, which all may enter; say in a line what cannot be written."""
+    """Create the folder of a file, accessible to all; convert write errors to one line."""
     try:
         for folder in reversed([path.parent, *path.parent.parents]):
             if not folder.exists():
                 folder.mkdir(exist_ok=True)
-                folder.chmod(_FOLDER)  # whatever the umask of a private verb is
+                folder.chmod(_FOLDER)  # regardless of the umask of a private verb
         yield
     except OSError as error:
         raise DownloadError(f"{path}: cannot be written ({error.strerror or error})") from error
@@ -119,7 +119,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _part(path: Path, sha256: str) -> Iterator[BufferedRandom]:
-    """Open the unfinished file beside a path, which no other command may be writing."""
+    """Open the partial file next to a path, with a lock against other commands."""
     place = _part_path(path, sha256)
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     with os.fdopen(os.open(place, flags, 0o600), "r+b") as part:
@@ -128,7 +128,7 @@ def _part(path: Path, sha256: str) -> Iterator[BufferedRandom]:
             is_ours = os.path.samestat(os.fstat(part.fileno()), place.lstat())
         except (BlockingIOError, FileNotFoundError):
             is_ours = False
-        if not is_ours:  # or it was, until just now
+        if not is_ours:  # or another command wrote it until just now
             raise DownloadError(f"{path}: another command is fetching it; wait for it")
         try:
             yield part
@@ -166,7 +166,7 @@ def _empty(part: BufferedRandom) -> None:
 
 
 def _receive_all(url: str, part: BufferedRandom, size: int, progress: Progress) -> None:
-    """Receive what is missing, with as many tries as bring something, and a few that do not."""
+    """Receive the missing data; retry while attempts make progress, and a few times without."""
     idle, problem = 0, ""
     for _ in range(_MOST_TRIES):
         have = _length(part)
@@ -194,7 +194,7 @@ def _receive_all(url: str, part: BufferedRandom, size: int, progress: Progress) 
 
 
 def _receive(url: str, part: BufferedRandom, size: int, progress: Progress) -> None:
-    """Receive the rest of a file, or as much as comes."""
+    """Receive the rest of a file, or as much as arrives."""
     have = _length(part)
     with _opened(url, have) as response:
         have = _start(response, have, url)
@@ -252,7 +252,7 @@ def _opened(url: str, have: int) -> Any:
 
 
 def _start(response: Any, have: int, url: str) -> int:
-    """Return at which byte of the file an answer begins, where that can be gone on with."""
+    """Return the byte position at which a response begins, if it can continue the partial file."""
     if response.status == HTTPStatus.OK:
         return 0
     found = _RANGE.fullmatch(response.headers.get("Content-Range", ""))
@@ -277,7 +277,7 @@ def _words(error: object) -> str:
 
 
 def _check_address(url: str, *, of_here: bool = True) -> None:
-    """Refuse what is not https, nor http of this machine where that is expected."""
+    """Refuse addresses other than https, or http of this machine where expected."""
     parts = urlsplit(url)
     is_here = of_here and parts.scheme == "http" and parts.hostname in _LOOPBACK
     if parts.scheme != "https" and not is_here:
@@ -285,10 +285,10 @@ def _check_address(url: str, *, of_here: bool = True) -> None:
 
 
 class _Redirects(HTTPRedirectHandler):
-    """Follows an address to others that are as safe."""
+    """Follows redirects to equally safe addresses."""
 
     def redirect_request(self, *arguments: Any) -> Request | None:
-        """Make the request for another address."""
+        """Make the request for the redirect's address."""
         request, answer, address = arguments[0], arguments[1], arguments[-1]
         try:
             _check_address(address, of_here=request.type == "http")
@@ -299,7 +299,7 @@ class _Redirects(HTTPRedirectHandler):
 
 
 def _opener() -> OpenerDirector:
-    """Make what opens addresses: of HTTP alone, through the proxies of the environment."""
+    """Make the opener: HTTP only, through the proxies of the environment."""
     opener = OpenerDirector()
     kinds = (ProxyHandler, HTTPHandler, HTTPSHandler, HTTPDefaultErrorHandler, HTTPErrorProcessor)
     for kind in (*kinds, _Redirects):

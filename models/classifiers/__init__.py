@@ -1,1 +1,1 @@
-"""Classifiers: what a model says of itself, and kinds of models."""
+"""Classifiers: the model, its description, and the kinds of classifier."""

@@ -20,16 +20,16 @@ from hearthlog.schemas.messages.topics import EmbeddingSource
 
 
 class LabelTiming(NamedTuple):
-    """Which frames a label takes, and which it speaks of.
+    """The frames that a label needs, and the frame that it labels.
 
     Attributes
     ----------
     label_frame : int
-        Frame of the window, from 0 on, which the label speaks of.
+        Index in the window, from 0, of the labelled frame.
     needs_floor : bool
-        Whether the floor of the room must be known at every frame of the window.
+        Whether the room floor is required at every frame of the window.
     ahead : int
-        Frames behind the window that must be known, too: those of embeddings that begin in it.
+        Further frames required after the window, for embeddings that begin in it.
     """
 
     window_frames: int
@@ -39,12 +39,12 @@ class LabelTiming(NamedTuple):
 
     @property
     def delay(self) -> int:
-        """Frames from the one that a label speaks of to the one with which it is known."""
+        """Number of frames from the labelled frame to the frame that completes the label."""
         return self.window_frames - 1 - self.label_frame + self.ahead
 
     def first_window_end(self, start: int) -> int:
-        """Return the frame with which the first label of a sound is known."""
-        if self.needs_floor:  # it is known with the last frame of the first whole block
+        """Return the frame that completes the first label of a sound."""
+        if self.needs_floor:  # known at the end of the first complete block
             start += -start % BLOCK_FRAMES + BLOCK_FRAMES - 1
         return start + self.window_frames - 1 + self.ahead
 
@@ -52,9 +52,9 @@ class LabelTiming(NamedTuple):
 def label_timing(description: Description) -> LabelTiming:
     """Return the timing of a model's labels.
 
-    Raise `ModelError` if its feature set is not installed.
+    Raise `ModelError` if the feature set is not installed.
     """
-    if description.kind == BY_NAMES:  # of each frame, by the windows around it
+    if description.kind == BY_NAMES:  # per frame, from the windows around the frame
         parameters = NamesParameters.model_validate(description.parameters)
         return LabelTiming(1, 0, needs_floor=False, ahead=parameters.ahead)
     inputs = feature_set(description.feature_set).inputs[description.inputs]
@@ -74,47 +74,45 @@ CLASSIFIERS = Extensions(
 
 
 def classifier_kind(name: str) -> ClassifierKind:
-    """Return a kind of classifier by its name.
+    """Return a kind of classifier by name.
 
-    Raise `ModelError` if there is none of this name, or it cannot be imported.
+    Raise `ModelError` if there is no such kind, or it cannot be imported.
     """
     return CLASSIFIERS.get(name)
 
 
 _ROWS_AT_ONCE = 256
 _TINY = 1e-38
-_STEPS = 1 << 16  # of a probability; what is finer is noise, of the processor too
+_STEPS = 1 << 16  # steps of a probability; finer digits are noise, partly of the processor
 
 
 class Classifier:
     """Inference of one model.
 
-    A row's probabilities do not depend on the rows computed together with it, nor on threads.
+    The probabilities of a row do not depend on the rows of the same batch, nor on threads.
 
     Parameters
     ----------
     model : Model
-        As `load_model` or a training gives it.
+        From `load_model` or a training.
 
     Attributes
     ----------
     classes : tuple of str
-        Names behind the columns of the probabilities.
-    feature_set : FeatureSet
+        Names of the columns of the probabilities.
     inputs : Inputs
-        Inputs of the feature set that `classify` takes.
-    timing : LabelTiming
+        Inputs of the feature set for `classify`.
     gate : float
-        A window is silence where no band is so many dB above the floor; 0 for no gate.
-    smoothing : Smoothing
+        In dB: a window is silence unless some band is this much above the floor; 0 for no gate.
     transitions : np.ndarray [shape=(C, C)], float64
-        Those of the model.
+        Transition probabilities of the model.
     calibrated_elsewhere : bool
-        Whether probabilities hold in homes of which nothing was learned.
+        Whether the calibration used datasets outside the training data, so that it holds in new
+        homes.
     embedding_heads : EmbeddingHeads or None
-        Of a model that takes the embeddings of a network.
+        None if the model uses no network embeddings.
     names : NamesParameters or None
-        Of a model that labels by the names of a network alone.
+        Only for a model that labels by the names of a network alone.
 
     Raises
     ------
@@ -149,22 +147,17 @@ class Classifier:
         self.names: NamesParameters | None = names_parameters(model) if by_names else None
 
     def direction_weights(self, microphone: str) -> Float64 | None:
-        """Return what the directions of an array say, as `DirectionEvidence` takes it.
-
-        Parameters
-        ----------
-        microphone : str
-            Its name.
+        """Return the direction weights of a microphone array, for `DirectionEvidence`.
 
         Returns
         -------
         np.ndarray [shape=(C, S)], float64, or None
-            None where the model takes no directions of this microphone.
+            None if the model has no weights for this microphone.
         """
         return self._direction_weights.get(microphone)
 
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
-        """Return whether the model was learned on embeddings of the same network and projection."""
+        """Return whether the model was trained on embeddings of the same network and projection."""
         if source is None:
             return False
         if self.names is not None:
@@ -172,12 +165,12 @@ class Classifier:
         return self._mix is not None and source.space == self._mix.space
 
     def lacking_embeddings(self, source: EmbeddingSource | None) -> str:
-        """Say which embeddings the model was learned on and does not get; empty if it gets them.
+        """Describe the embeddings that the model needs but lacks; empty if it lacks none.
 
         Parameters
         ----------
         source : EmbeddingSource or None
-            Of the embeddings that there are.
+            Source of the available embeddings.
         """
         taken = self._mix or self.names
         if taken is None or self.takes_embeddings(source):
@@ -198,23 +191,23 @@ class Classifier:
     def mix(
         self, probabilities: Float32, by_heads: Float64, evidence: Float64 | None = None
     ) -> tuple[Float32, Float32]:
-        """Let embeddings say which class a sound is of; whether it is silence, features say.
+        """Mix features and embeddings: features decide on silence, both on the class of a sound.
 
         Parameters
         ----------
         probabilities : np.ndarray [shape=(n, C)], float32
-            As `classify` gives them without evidence.
+            From `classify` without evidence.
         by_heads : np.ndarray [shape=(n, C)], float64
-            What the heads say, as of `EmbeddingHeads.log_probabilities`; NaN where there is no
-            embedding. Where there is no evidence either, the probabilities stay.
+            From `EmbeddingHeads.log_probabilities`; NaN where there is no embedding. Rows without
+            embedding and evidence keep their probabilities.
         evidence : np.ndarray [shape=(n, C)], float64, optional
-            Of something else, as `classify` takes it.
+            Further evidence, as in `classify`.
 
         Returns
         -------
         probabilities : np.ndarray [shape=(n, C)], float32
         novelty : np.ndarray [shape=(n,)], float32
-            As of `classify`.
+            As from `classify`.
         """
         heard = np.isfinite(by_heads.sum(axis=1))
         changed = heard if evidence is None else heard | evidence.any(axis=1)
@@ -239,7 +232,7 @@ class Classifier:
         Returns
         -------
         np.ndarray [shape=(n, C)], float32
-            In the order of the model's classes, as of `classify`.
+            In the order of the model's classes, as from `classify`.
         """
         return self.classify(inputs)[0]
 
@@ -256,18 +249,18 @@ class Classifier:
         inputs : np.ndarray [shape=(n, width)], float32
             Finite.
         evidence : np.ndarray [shape=(n, C)], float64, optional
-            Of something else: what is added to the logarithms of the probabilities.
+            Further evidence, added to the logarithms of the probabilities.
         by_heads : np.ndarray [shape=(n, C)], float64, optional
-            As `mix` takes it.
+            As in `mix`.
 
         Returns
         -------
         probabilities : np.ndarray [shape=(n, C)], float32
             In the order of the model's classes, in steps of 2**-16; every row sums to 1 within
-            half a step for each class. Those of older models are not rounded.
+            half a step per class. Older models' probabilities are not rounded.
         novelty : np.ndarray [shape=(n,)], float32
-            Probability that it is none of the classes but `unknown` that is likeliest, 0 to 1;
-            of older models what the kind of classifier gives, or NaN.
+            Probability that the sound is not of the likeliest class other than `unknown`, 0 to 1;
+            for older models the value of the kind of classifier, or NaN.
         """
         if by_heads is not None:
             return self.mix(self.classify(inputs)[0], by_heads, evidence)
@@ -281,19 +274,19 @@ class Classifier:
             if evidence is not None:
                 decision += evidence[rows]
             result[rows] = _shares(decision)
-        if self._doubts:  # models of hearthlog 0.1 label as they did, to the last bit
+        if self._doubts:  # models of hearthlog 0.1 keep their labels bit for bit
             return self._in_steps(result)
         return result, novelty
 
     def _in_steps(self, probabilities: Float32) -> tuple[Float32, Float32]:
-        """Round probabilities, and return them with the novelty."""
+        """Round probabilities and return them with the novelty."""
         np.rint(_STEPS * probabilities, out=probabilities)
         probabilities /= _STEPS
         return probabilities, 1.0 - probabilities[:, self._known].max(axis=1, initial=0.0)
 
 
 def _shares(decision: Float64) -> Float64:
-    """Return the probabilities behind decision values, which it takes for its own."""
+    """Return the probabilities of decision values; overwrites its argument."""
     decision -= decision.max(axis=1, keepdims=True)
     np.exp(decision, out=decision)
     shares: Float64 = decision / decision.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""A kind of classifier: the arrays it consists of, their checks, and how it decides."""
+"""A kind of classifier: its arrays, their validation, and inference."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ class Machine(Protocol):
     """Inference of one model."""
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decision values and novelty of some hundreds of windows at most.
+        """Compute decision values and novelty of up to a few hundred windows.
 
-        A row's result must not depend on the rows that are computed together with it, nor on
-        threads; see `hearthlog.models.batch_invariant`.
+        A row's result must not depend on other rows of the batch, nor on threads; see
+        `hearthlog.models.batch_invariant`.
 
         Parameters
         ----------
@@ -28,21 +28,21 @@ class Machine(Protocol):
         Returns
         -------
         decisions : np.ndarray [shape=(n, C)], float64
-            Times the inverse temperature, they are the logarithms of probabilities plus a constant.
+            Multiplied by the inverse temperature: logarithms of probabilities plus a constant.
             The caller may change them.
         novelty : np.ndarray [shape=(n,)], float64
-            From 0 to 1, where 1 is unlike anything learned; NaN if there is none.
+            From 0 to 1, where 1 is unlike all training data; NaN if the kind computes none.
         """
 
 
 class NoParameters(BaseModel):
-    """Parameters of a kind that has none: all is in its arrays."""
+    """Parameters of a kind that has only arrays."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
 
 class ClassifierKind(ABC):
-    """The arrays of the models of one kind, their checks, and inference.
+    """The arrays of the models of one kind, their validation, and inference.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class ClassifierKind(ABC):
     parameters : type of BaseModel
         The field `parameters` of a description.
     arrays, optional : mapping of str to np.dtype
-        Arrays that a model must have, and may have. No value is larger than 1e9.
+        Required and optional arrays of a model. No value may be larger than 1e9.
     """
 
     name: str
@@ -63,35 +63,35 @@ class ClassifierKind(ABC):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that the arrays of a model must have.
+        """Return the required shapes of a model's arrays.
 
         Parameters
         ----------
         classes, width : int
-            Number of classes, and of inputs.
+            Number of classes and of inputs.
         arrays : mapping of str to np.ndarray
-            Those of the model, by name; they may be of any type and shape.
+            Arrays of the model by name, of any type and shape.
 
         Returns
         -------
         dict of str to tuple of int
-            By name of the array; other arrays of this kind must be absent.
+            By array name; the model must not have other arrays of this kind.
         """
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays of a model; None if nothing is.
+        """Return an error in a model's arrays; None if there is none.
 
         Parameters
         ----------
         classes : int
             Number of classes.
         arrays : mapping of str to np.ndarray
-            By name; of the right types and shapes, and finite.
+            By name; finite, with valid types and shapes.
 
         Returns
         -------
         str or None
-            The rest of a sentence that begins with the file.
+            The rest of a sentence that begins with the file name.
         """
         del classes, arrays
         return None

@@ -1,4 +1,4 @@
-"""Evidence besides features: directions of an array, and embeddings of a network."""
+"""Evidence in addition to features: directions of an array, and embeddings of a network."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,22 +18,22 @@ from hearthlog.models.embedding.projection import (
 )
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int32, Int64
 
-BLOCK_FRAMES = 4  # for which there is one direction: 0.2 s
-SECTORS = 36  # of the circle, that a model tells apart
-MEMORY_BLOCKS = 5  # of which the last ones speak of a window: a second
-MOST_EVIDENCE = 5.0  # that a direction is of a class, a logarithm
+BLOCK_FRAMES = 4  # frames per direction: 0.2 s
+SECTORS = 36  # sectors of the circle in a model
+MEMORY_BLOCKS = 5  # number of last blocks used for a window: a second
+MOST_EVIDENCE = 5.0  # limit of the log-likelihood ratio of a class given a direction
 
 
 @dataclass(frozen=True, eq=False)
 class Directions(FrameSpans):
-    """Directions of the blocks of one stream of frames in which something could be located.
+    """Directions of the blocks of one stream of frames in which a sound was located.
 
     Attributes
     ----------
     azimuths : np.ndarray [shape=(m,)], float32
         In radians, -pi to pi, counter-clockwise from x.
     confidences : np.ndarray [shape=(m,)], float32
-        By how much the microphones agree on this direction more than on any, 0 to 1.
+        Agreement of the microphones on this direction relative to any direction, 0 to 1.
     """
 
     LENGTH = BLOCK_FRAMES
@@ -48,7 +48,7 @@ NOWHERE = Directions(
 
 
 def sectors_of(azimuths: Float32) -> Indices:
-    """Return the sectors of the circle that directions are in; the middle of the first is ahead.
+    """Return the sectors of directions; the middle of the first sector is ahead.
 
     Parameters
     ----------
@@ -65,16 +65,15 @@ def sectors_of(azimuths: Float32) -> Indices:
 
 
 class DirectionEvidence:
-    """What directions say of the windows of one stream of frames.
+    """Evidence of directions for the windows of one stream of frames.
 
-    To a window belong the blocks that are complete with its last frame, of the last second. What
-    each says is averaged, weighted by its confidence, since the blocks of one sound are no
-    independent witnesses.
+    A window uses the blocks of the last second that are complete at its last frame. Their evidence
+    is averaged, weighted by confidence, because the blocks of one sound are not independent.
 
     Parameters
     ----------
     weights : np.ndarray [shape=(C, S)], float64
-        Logarithms of how much likelier each class is with each sector.
+        Log-likelihood ratio of each class in each sector.
     """
 
     def __init__(self, weights: Float64) -> None:
@@ -82,12 +81,12 @@ class DirectionEvidence:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self._recent = NOWHERE
         self._full_from: int | None = None
 
     def is_full(self, frame: int) -> bool:
-        """Tell whether directions before the first frame leave no trace from a frame on."""
+        """Return whether evidence from a frame on needs no directions before the first frame."""
         return self._full_from is not None and frame >= self._full_from
 
     def push(self, directions: Directions, first: int, count: int, windows: int) -> Float64:
@@ -96,14 +95,14 @@ class DirectionEvidence:
         Returns
         -------
         np.ndarray [shape=(windows, C)], float64
-            What is added to the logarithms of the probabilities; 0 where nothing was located. The
-            same frames give the same bits in pieces of any size.
+            Added to the logarithms of the probabilities; 0 where no sound was located. The same
+            frames give the same bits in blocks of any size.
         """
         if self._full_from is None:
             self._full_from = first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)
         known = self._recent.followed_by(directions)
         end = first + count
-        # The last block that is complete with the last frame of each window.
+        # The last block that is complete at the last frame of each window.
         newest = np.arange(end - windows + 1, end + 1) // BLOCK_FRAMES - 1
         evidence = self._of_blocks(known, newest)
         oldest = (end // BLOCK_FRAMES - MEMORY_BLOCKS) * BLOCK_FRAMES
@@ -111,7 +110,7 @@ class DirectionEvidence:
         return evidence
 
     def _of_blocks(self, known: Directions, newest: Int64) -> Float64:
-        """Return what is said by the last second of blocks up to each of some."""
+        """Return the evidence of the last second of blocks before each block number."""
         if not len(newest):
             return np.zeros((0, self._weights.shape[1]))
         count = int(newest[-1] - newest[0]) + 1
@@ -129,19 +128,19 @@ class DirectionEvidence:
 
 
 class Auxiliary(NamedTuple):
-    """Directions of an array and embeddings of a network, of one stream of frames."""
+    """Directions of an array and embeddings of a network for one stream of frames."""
 
     directions: Directions = NOWHERE
     embeddings: Embeddings = NO_EMBEDDINGS
 
     def known_at(self, first: int, count: int) -> "Auxiliary":
-        """Return those that become known with some successive frames."""
+        """Return the entries that become available with some successive frames."""
         return Auxiliary(
             self.directions.known_at(first, count), self.embeddings.known_at(first, count)
         )
 
     def followed_by(self, later: "Auxiliary") -> "Auxiliary":
-        """Join these with those that follow."""
+        """Concatenate these entries and later entries."""
         return Auxiliary(
             self.directions.followed_by(later.directions),
             self.embeddings.followed_by(later.embeddings),
@@ -155,14 +154,14 @@ _MIDDLE = WINDOW_FRAMES // 2
 
 
 class EmbeddingEvidence:
-    """Brings the evidence of windows, a value for each class, to frames.
+    """Interpolates the evidence of windows, one value per class, to frames.
 
-    A frame lies between the middles of two windows, of which one or both may be missing.
+    A frame lies between the middles of two windows; one or both may be missing.
 
     Parameters
     ----------
     of_windows : callable
-        Turns embeddings, shape (m, W), into values, shape (m, C).
+        Maps embeddings, shape (m, W), to values, shape (m, C).
     """
 
     def __init__(self, of_windows: Callable[[Int8], Float64], classes: int) -> None:
@@ -171,8 +170,8 @@ class EmbeddingEvidence:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
-        self._windows = np.empty(0, np.int64)  # numbers of the windows, in the order of time
+        """Reset the state; the next frame does not follow the previous frame."""
+        self._windows = np.empty(0, np.int64)  # numbers of the windows, in order of time
         self._values = np.empty((0, self._classes))
         self._first: int | None = None
 
@@ -187,12 +186,12 @@ class EmbeddingEvidence:
         self._values = np.concatenate([self._values, values])
 
     def is_full(self, frame: int) -> bool:
-        """Tell whether embeddings before the first frame leave no trace from a frame on."""
+        """Return whether evidence from a frame on needs no embeddings before the first frame."""
         begin = frame - frame % HOP_FRAMES - _MIDDLE
         return self._first is not None and begin >= self._first
 
     def at(self, first: int, count: int) -> Float64:
-        """Interpolate the evidence to successive frames, and forget that of earlier ones.
+        """Interpolate the evidence to successive frames, and discard evidence of earlier frames.
 
         Returns
         -------
@@ -207,12 +206,12 @@ class EmbeddingEvidence:
         return evidence
 
     def highest_at(self, first: int, count: int) -> Float64:
-        """Return the higher evidence of the two windows, as `at` returns the interpolated one."""
+        """Return the higher evidence of the two windows, where `at` interpolates."""
         highest: Float64 = np.fmax(*self._around(first, count))
         return highest
 
     def _around(self, first: int, count: int) -> tuple[Float64, Float64]:
-        """Return the values of the windows before and after frames, and forget earlier windows."""
+        """Return the values of the windows before and after frames, and discard earlier windows."""
         before = (np.arange(first, first + count) - _MIDDLE) // HOP_FRAMES
         earlier, later = self._of_windows(before), self._of_windows(before + 1)
         keep = np.searchsorted(self._windows, (first + count - _MIDDLE) // HOP_FRAMES)
@@ -220,7 +219,7 @@ class EmbeddingEvidence:
         return earlier, later
 
     def _of_windows(self, numbers: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64:
-        """Return the log-probabilities of windows; NaN where there is none."""
+        """Return the log-probabilities of windows; NaN for missing windows."""
         values = np.full((len(numbers), self._classes), np.nan)
         if len(self._windows):
             places = np.minimum(np.searchsorted(self._windows, numbers), len(self._windows) - 1)
@@ -229,24 +228,24 @@ class EmbeddingEvidence:
         return values
 
 
-# Of weights and biases. A sum of 1024 products of 32 with 8 bits has fewer than 53 bits, so it is
-# exact in a float64: the same in any order, and from any BLAS.
+# Unit of weights and biases. A sum of 1024 products of 32 with 8 bits has fewer than 53 bits, so it
+# is exact in a float64: independent of order and of the BLAS.
 UNIT = 2.0**-22
-LEAST = 1e-4  # probability of a head or a classifier for a class: none has a veto
-UNTAUGHT = -(2**31)  # bias of a class of which a head has learned nothing
-_OF_UNTAUGHT = -0.9  # what it says of such a class: as much as of the right one on average, a log
-_STEP = 2.0**-20  # of logarithms: what is finer depends on the processor
+LEAST = 1e-4  # minimum probability of a class in a head or classifier: none has a veto
+UNTAUGHT = -(2**31)  # bias of a class that a head was not trained on
+_OF_UNTAUGHT = -0.9  # log-probability of such a class: the average of a head for the correct class
+_STEP = 2.0**-20  # of logarithms: finer digits depend on the processor
 _ROWS_AT_ONCE = 4096
 
 
 class EmbeddingHeads:
-    """The heads of one model: linear ones, and names, which are mixed with a classifier.
+    """The heads of one model, linear heads and names, which are mixed with a classifier.
 
-    A network that was trained on millions of clips knows sounds of homes that no model has heard,
-    but not when they begin. So the classifier of the features says what is silence, and all of them
-    together which sound it is.
+    A network trained on millions of clips recognises household sounds unknown to the model, but not
+    their start. So the feature classifier decides on silence, and all of them together decide on
+    the class of a sound.
 
-    A window's result does not depend on the windows computed together with it, nor on threads.
+    A window's result does not depend on other windows of the batch, nor on threads.
 
     Parameters
     ----------
@@ -270,18 +269,18 @@ class EmbeddingHeads:
         self._names = [_Names(head, names) for head in mix.names]
 
     def log_probabilities(self, values: Int8) -> Float64:
-        """Return what the heads say of windows.
+        """Return the weighted log-probabilities of windows by the heads.
 
         Parameters
         ----------
         values : np.ndarray [shape=(m, W)], int8
-            As they are logged.
+            As logged.
 
         Returns
         -------
         np.ndarray [shape=(m, C)], float64
-            Sums of the logarithms of the heads' probabilities, times their weights in the mix, and
-            of what a home adds; 0 for silence, of which the heads say nothing.
+            Sums of the logarithms of the heads' probabilities, times their weights in the mix, plus
+            the head of a home; 0 for silence, which the heads do not cover.
         """
         result = np.zeros((len(values), self._classes))
         for start in range(0, len(values), _ROWS_AT_ONCE):
@@ -306,7 +305,7 @@ class EmbeddingHeads:
 
 
 class _Names:
-    """What the names of a network say of some classes."""
+    """The scores of some classes from the names of a network."""
 
     def __init__(self, head: NamesHead, classes: Sequence[str]) -> None:
         self.weight, self._slope = head.weight, head.slope
@@ -327,18 +326,18 @@ class _Names:
 
 
 def sounds_of(classes: Sequence[str]) -> Indices:
-    """Return the numbers of the classes that are no silence."""
+    """Return the indices of the classes other than silence."""
     sounds = [number for number, name in enumerate(classes) if name != SILENCE]
     return np.array(sounds, np.intp)
 
 
 def floored(decisions: Float64) -> Float64:
-    """Return the logarithms of probabilities, of which none is below about `LEAST`.
+    """Return the logarithms of probabilities, limited to about `LEAST` from below.
 
     Parameters
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
-        -inf is allowed, but not for a whole row.
+        -inf is allowed, but not for a complete row.
     """
     grown = np.exp(decisions - decisions.max(axis=1, keepdims=True))
     logarithms: Float64 = np.log(grown / grown.sum(axis=1, keepdims=True) + LEAST)
@@ -348,16 +347,16 @@ def floored(decisions: Float64) -> Float64:
 def mixed(
     decisions: Float64, by_heads: Float64, mix: EmbeddingMix, classes: Sequence[str]
 ) -> Float64:
-    """Mix what a classifier and heads say.
+    """Mix the outputs of a classifier and of heads.
 
-    Silence has the probability that the classifier gives it; the classes of sound share the rest.
+    Silence keeps the classifier's probability; the other classes share the rest.
 
     Parameters
     ----------
     decisions : np.ndarray [shape=(n, C)], float64
-        Logarithms of the probabilities of a classifier, plus any constant for each row.
+        Logarithms of the classifier's probabilities, plus any constant per row.
     by_heads : np.ndarray [shape=(n, C)], float64
-        As `EmbeddingHeads.log_probabilities` gives them.
+        From `EmbeddingHeads.log_probabilities`.
 
     Returns
     -------

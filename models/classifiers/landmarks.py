@@ -1,7 +1,7 @@
-"""Kernel logistic regression on landmarks: a linear head on a map of the inputs.
+"""Kernel logistic regression on landmarks: a linear head on a kernel map of the inputs.
 
-The map is that of Williams and Seeger, "Using the Nyström method to speed up kernel machines",
-2001: kernels of a window to some hundreds of points that were chosen among those learned from.
+The map is from Williams and Seeger, "Using the Nyström method to speed up kernel machines", 2001:
+kernels of a window with some hundreds of points chosen from the training data.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from hearthlog.models.classifiers.rbf_distances import RoundedDistances
 from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
-_LANDMARKS_AT_ONCE = 256  # a product this small no BLAS divides among threads
+_LANDMARKS_AT_ONCE = 256  # no BLAS splits a product of this size among threads
 
 
 class LandmarkParameters(BaseModel):
@@ -41,16 +41,16 @@ class LandmarksKind(ClassifierKind):
     scaler_mean, scaler_scale : [shape=(width,)], float64
         Mean and standard deviation of the inputs.
     landmarks : [shape=(m, width)], float32
-        Inputs, not scaled, class after class.
+        Unscaled inputs, sorted by class.
     landmark_counts : [shape=(C,)], int64
-        Number of landmarks of each class; 0 for one that a home has taught.
+        Number of landmarks of each class; 0 for a class added by a home.
     home_landmarks : [shape=(h, width)], float32, optional
-        Those of a home that the model was adapted to, behind the others.
+        Landmarks of the home that the model was adapted to, after the others.
     weights : [shape=(m + h, C)], float64
         Of the kernels.
     bias : [shape=(C,)], float64
     base_weights : [shape=(m, B)], float64, optional
-        Weights before the model was ever adapted to a home, of the B classes that it had.
+        Weights before any adaptation to a home, of the B classes at that time.
     base_bias : [shape=(B,)], float64, optional
     """
 
@@ -72,7 +72,7 @@ class LandmarksKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return shapes, as of `ClassifierKind.shapes`."""
+        """Return the required shapes, as `ClassifierKind.shapes`."""
         count, home, before = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
             for name in ("landmarks", "home_landmarks", "base_bias")
@@ -91,7 +91,7 @@ class LandmarksKind(ClassifierKind):
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
+        """Return an error in the arrays, as `ClassifierKind.problem`."""
         counts, total = arrays["landmark_counts"], len(arrays["landmarks"])
         if (counts < 0).any() or counts.sum() != total or not total:
             return f"landmark_counts do not add up to the {total} landmarks"
@@ -106,7 +106,7 @@ class LandmarksKind(ClassifierKind):
         return LandmarksMachine(model.arrays, parameters)
 
     def summary(self, model: Model) -> str:
-        """Return the number of landmarks, in words."""
+        """Return the number of landmarks in words."""
         return f"{len(all_landmarks(model.arrays))} landmarks"
 
 
@@ -135,7 +135,7 @@ class LandmarksMachine:
             self._blocks.append((block, aligned(weights[rows])))
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Return logarithms of probabilities, up to a constant and a temperature; NaN as novelty.
+        """Return logarithms of probabilities up to a constant and a temperature; NaN as novelty.
 
         Parameters
         ----------

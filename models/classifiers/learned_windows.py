@@ -1,4 +1,4 @@
-"""The windows that a model was learned from, which it keeps to be learned over for a home."""
+"""The training windows kept in a model for retraining in a home."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +19,7 @@ def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[i
     Parameters
     ----------
     arrays : mapping of str to np.ndarray
-        Those of the model, by name; they may be of any type and shape.
+        Arrays of the model by name, of any type and shape.
     """
     inputs = arrays.get("learned_inputs", np.empty(0))
     if not inputs.ndim or not len(inputs):
@@ -28,12 +28,12 @@ def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[i
 
 
 def target_problem(classes: int, arrays: Mapping[str, Array], *names: str) -> str | None:
-    """Return what is wrong with arrays of classes; None if nothing is, or they are absent.
+    """Return an error in the class arrays; None if they are valid or absent.
 
     Parameters
     ----------
     arrays : mapping of str to np.ndarray
-        By name; of the right types and shapes, and finite.
+        By name; finite, with valid types and shapes.
     """
     for name in names:
         target = arrays.get(name, np.empty(0, np.int64))

@@ -1,4 +1,4 @@
-"""A model: its description, checked when it is read, and its arrays."""
+"""A model: its description, validated when read, and its arrays."""
 
 import json
 import re
@@ -25,18 +25,18 @@ from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 
-TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
+TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # limit of all other strings in a description
 MOST_SPANS = 1000  # forty kilobytes
-MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
-MOST_FEATURES = 5000  # those of a network have 4097 at most
+MOST_CLASSES = 32  # with more, the BLAS would split the products of the pairs among threads
+MOST_FEATURES = 5000  # networks have at most 4097
 FORMAT: Final = 5
-FORMAT_OF_DIRECTIONS: Final = 6  # which a version that cannot use them refuses
-FORMAT_OF_EMBEDDINGS: Final = 7  # as well
+FORMAT_OF_DIRECTIONS: Final = 6  # versions without directions refuse this format
+FORMAT_OF_EMBEDDINGS: Final = 7  # likewise, for embeddings
 MOST_HEADS = 8
-MOST_VALUES = 1024  # of a window of sound, as a network hears it
-MOST_ARRAYS = 16  # of microphones, in a home
+MOST_VALUES = 1024  # values per window of embeddings
+MOST_ARRAYS = 16  # microphone arrays in a home
 MOST_WEIGHT: Final = 10.0
-SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
+SIMULATED = "hearthlog simulated home"  # dataset name of the sounds of `hearthlog.tools.home`
 _OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
 
 _ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
@@ -63,7 +63,7 @@ class Amount(_Record):
 
 
 class PublicCollection(_Record):
-    """A public collection that audio came from; attribution is due wherever the model goes."""
+    """A public dataset used for training; the model must carry its attribution."""
 
     name: _Text
     licence: _Text
@@ -71,15 +71,15 @@ class PublicCollection(_Record):
 
 
 class TrainingData(_Record):
-    """The training data; the digest is that of its segments, not of files.
+    """The training data; the digest covers segments, not files.
 
     Attributes
     ----------
     home_spans : list of [start, end]
-        Time of the home whose sound was learned from, in nanoseconds of UTC, in order; by whatever
-        microphone, and with what is less than a minute between.
+        Time spans of the home's sound used for training, in nanoseconds of UTC, in order; over all
+        microphones, with gaps of less than a minute closed.
     base_sha256 : str
-        SHA-256 of the model file that was adapted, or empty.
+        SHA-256 of the model file before adaptation, or empty.
     """
 
     sha256: _Digest
@@ -93,13 +93,13 @@ class TrainingData(_Record):
 
     @property
     def simulated(self) -> bool:
-        """Whether all of it was simulated: the model has never learned from a real sound."""
+        """Whether all training data was simulated."""
         names = {item.name for item in self.collections}
         return names == {SIMULATED} and not any(amount.segments for amount in self.home.values())
 
 
 class ClassMetrics(_Record):
-    """Scores of one class, cross-validated."""
+    """Cross-validated scores of one class."""
 
     precision: _Share
     recall: _Share
@@ -107,10 +107,10 @@ class ClassMetrics(_Record):
 
 
 class Metrics(_Record):
-    """Scores, cross-validated by source group; true classes are rows of the confusion matrix.
+    """Scores, cross-validated by source group; rows of the confusion matrix are true classes.
 
-    Macro F1 is the mean over the classes but `unknown`, whose segments count where they are taken
-    for another.
+    Macro F1 is the mean over the classes except `unknown`, whose segments count where they are
+    mistaken for another class.
     """
 
     folds: _Count
@@ -121,19 +121,19 @@ class Metrics(_Record):
 
 
 class Elsewhere(_Record):
-    """Scores in collections of which nothing was learned, which is what a new home is.
+    """Scores on datasets outside the training data, which represent a new home.
 
     Attributes
     ----------
     right : float
-        Share of them that were recognised.
+        Share of correctly recognised segments.
     macro_f1 : float or None
-        Over the classes of these segments and `unknown`; None of models that were not told.
+        Over the classes of these segments and `unknown`; None if the model has no such score.
     macro_f1_interval : list of float, or None
         95 %, bootstrap over source groups.
     calibration_errors : dict of str to float
-        Of these segments, where ten or more were labelled as a class: how far the mean probability
-        of it is from the share that is right.
+        By class, if at least ten of these segments were labelled as the class: distance of the mean
+        probability from the share of correct labels.
     """
 
     collections: _Count
@@ -157,10 +157,10 @@ class Smoothing(_Record):
     weight : float
         Weight of a frame's probabilities in the hidden Markov model.
     reach_seconds : float
-        Time by which a border of silence is moved at most, to where the level changes.
+        Largest shift of a border of silence, to the change of level.
     class_exponent : float or None
-        Exponent of how likely a class other than silence is, relative to the likeliest of them;
-        then the probability of silence counts by itself. None: the probabilities count as they are.
+        Exponent of the likelihood of a class other than silence, relative to the likeliest of them;
+        the probability of silence is then separate. None: the probabilities are used unchanged.
     """
 
     method: SmoothingMethod
@@ -172,7 +172,7 @@ class Smoothing(_Record):
 
 
 class NamesHead(_Record):
-    """A head that has learned nothing: what the names of a network say as they are."""
+    """An untrained head: the names of a network as they are."""
 
     weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]
     slope: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)]
@@ -190,17 +190,17 @@ class NamesHead(_Record):
 
 
 class EmbeddingMix(_Record):
-    """How a model mixes its classifier with heads on what a network hears.
+    """How a model mixes its classifier with heads on network embeddings.
 
     Attributes
     ----------
     inverse_temperature : float
         Of the mix, the weighted mean of the logarithms of probabilities.
     base_inverse_temperature : float or None
-        That of the model before it was adapted to a home; None if it never was.
+        The value before adaptation to a home; None if the model was never adapted.
     of_home : bool
-        Whether there is one linear head more, of a home: its decision values are no logarithms of
-        probabilities, but added to the sum of those of the other heads.
+        Whether there is an additional linear head of a home: its decision values are not logarithms
+        of probabilities, but are added to the sum over the other heads.
     """
 
     network: _Text
@@ -219,34 +219,34 @@ class EmbeddingMix(_Record):
 
     @property
     def space(self) -> EmbeddingSpace:
-        """Of the embeddings that the heads take."""
+        """Embedding space of the heads."""
         return EmbeddingSpace(self.network, self.projection_sha256, self.values)
 
 
 class Description(_Record):
-    """Everything about a model but its arrays.
+    """Everything about a model except its arrays.
 
     Attributes
     ----------
     feature_set_sha256 : str
-        SHA-256 of the network whose values the features are; empty for other feature sets.
+        SHA-256 of the network that computes the features; empty for other feature sets.
     label_frame : int
-        Frame of a window, from 0 on, which the label of the window speaks of.
+        Index in the window, from 0, of the labelled frame.
     gate : float
-        A window is silence where no band is so many dB above the floor of the room; 0 for no
+        In dB: a window is silence unless some band is this much above the room floor; 0 for no
         gate.
     base_inverse_temperature : float or None
-        The one before the model was adapted to a home; None if it was not.
+        The value before adaptation to a home; None if the model was not adapted.
     novelty : str
-        `doubt`: the probability that a label is wrong. `machine`: what the kind of classifier
-        gives, as older models have it.
+        `doubt`: the probability that a label is wrong. `machine`: the value of the kind of
+        classifier, in older models.
     elsewhere : Elsewhere or None
-        Scores in collections left out, from which the temperature is; None if it is from sources
-        left out, for want of collections.
+        Scores on held-out datasets, which also set the temperature; None if held-out sources set
+        it, for lack of datasets.
     direction_microphones : list of str
-        The arrays of a home whose directions the model takes, by name; with any, the format is 6.
+        Names of the microphone arrays whose directions the model uses; if any, the format is 6.
     embedding : EmbeddingMix or None
-        What it takes of a network's embeddings; with any, the format is 7.
+        Use of network embeddings; if present, the format is 7.
     """
 
     format: Literal[5, 6, 7]
@@ -281,12 +281,12 @@ class Description(_Record):
 
     @property
     def embedding_space(self) -> EmbeddingSpace | None:
-        """Of the embeddings that the model takes; None if it takes none."""
+        """Embedding space of the model; None if it uses no embeddings."""
         return None if self.embedding is None else self.embedding.space
 
     @model_serializer(mode="wrap")
     def _as_older_versions_read_it(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what most models have not; older versions refuse fields they lack."""
+        """Omit fields that most models lack; older versions refuse unknown fields."""
         content: dict[str, Any] = handler(self)
         if self.embedding is None:
             content.pop("embedding", None)
@@ -298,9 +298,9 @@ class Description(_Record):
 
 
 def read_description(text: str) -> Description:
-    """Read a description, of this format or an older one.
+    """Read a description of this format or an older format.
 
-    Raise `ModelError` if the description is of a newer format, is no JSON, or is invalid.
+    Raise `ModelError` if the description is of a newer format, is not JSON, or is invalid.
     """
     try:
         content = json.loads(text)
@@ -328,7 +328,7 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
             "method": _OLD_METHODS.get(inputs, "") if isinstance(inputs, str) else "",
         }
     if number in (2, 3):
-        # A label spoke of the second that ended with its frame.
+        # A label applied to the second that ended with its frame.
         seconds, frames = content.get("window_seconds"), 1
         if isinstance(seconds, int | float) and 0 < seconds <= _LONGEST_SECONDS:
             frames = max(round(seconds / FRAME_SECONDS), 1)
@@ -338,14 +338,14 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def first_problem(error: ValidationError) -> str:
-    """Return the first problem of a description on one line."""
+    """Return the first validation error of a description on one line."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
     return f"{one_line(where)}: {one_line(first['msg'])}"
 
 
 def one_line(text: object) -> str:
-    """Return a text from any file as a part of a message: printable, 200 characters at most."""
+    """Return text from any file as part of a message: printable, at most 200 characters."""
     return printable(text)[:200]
 
 
@@ -360,28 +360,28 @@ class Model:
     ----------
     description : Description
     arrays : mapping of str to np.ndarray
-        Those of its kind of classifier.
+        Arrays of the kind of classifier.
     transitions : np.ndarray [shape=(C, C)], float64
-        Probability that a frame of the row's class is followed by one of the column's class; empty
-        where segments are merged.
+        Probability of the column's class after a frame of the row's class; empty if the smoothing
+        merges segments.
     training_digests : np.ndarray [shape=(k,)], int64
-        Digests of the segments that it was learned from.
+        Digests of the training segments.
     training_windows : np.ndarray [shape=(m, window_frames, d)], float32
-        Features that it was learned from, of some models of earlier versions; else empty.
+        Training features, in some models of earlier versions; else empty.
     training_floor : np.ndarray [shape=(m, b)], float64
         Floor of the room in each training window; empty for a feature set without bands.
     training_target, training_group : np.ndarray [shape=(m,)], int64
         Classes of the training windows, and numbers of their source groups.
     direction_weights : np.ndarray [shape=(M, C, S)], float64
-        For each array of the description, logarithms of how much likelier each class is with each
-        sector of the circle; empty without arrays.
+        For each array of the description, log-likelihood ratio of each class in each sector of the
+        circle; empty without arrays.
     embedding_weights : np.ndarray [shape=(H, W, C)], int32
-        Of H linear heads on the W values that are logged of a window of sound, in units of
+        Of H linear heads on the W logged values of a window of sound, in units of
         `hearthlog.models.classifiers.evidence.UNIT`; empty without heads.
     embedding_bias : np.ndarray [shape=(H, C)], int32
         In the same units.
     embedding_scaler : np.ndarray [shape=(2, W)], float64
-        Mean and standard deviation of these values, of what the heads were learned from.
+        Mean and standard deviation of these values in the heads' training data.
     name : str
         Stem of the model file.
     sha256 : str
@@ -419,12 +419,12 @@ _FORBIDDEN = re.compile(
 
 
 def may_be_shipped(licence: str) -> bool:
-    """Tell whether a model learned from a recording may be shipped, with attribution.
+    """Return whether a model trained on a recording may be shipped, with attribution.
 
     Parameters
     ----------
     licence : str
-        As a manifest states it: it must begin with CC0, public domain, CC BY, CC BY-SA, ODbL or
-        Apache-2.0, and name nothing that forbids or doubts it.
+        As in the manifest. It must begin with CC0, public domain, CC BY, CC BY-SA, ODbL or
+        Apache-2.0, and contain no restriction or doubt.
     """
     return bool(_ALLOWED.match(licence.strip())) and not _FORBIDDEN.search(licence)

@@ -41,8 +41,8 @@ from hearthlog.schemas.arrays import Float32, Float64, write_sealed
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 BY_NAMES: Final = "names"
-MOST_WINDOWS = 4  # that must say a name: two seconds and a half
-MARGIN_FRAMES = (WINDOW_FRAMES - HOP_FRAMES) // 2  # of a window before and behind its middle
+MOST_WINDOWS = 4  # consecutive windows required for a name: two and a half seconds
+MARGIN_FRAMES = (WINDOW_FRAMES - HOP_FRAMES) // 2  # of a window, before and after its middle
 _WINDOW_AHEAD = WINDOW_FRAMES - 1 - MARGIN_FRAMES  # from its middle to the frame that completes it
 MOST_AHEAD_FRAMES = HOP_FRAMES * (MOST_WINDOWS - 1) + _WINDOW_AHEAD
 _ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
@@ -50,14 +50,14 @@ _Logged = Annotated[int, Field(ge=-128, le=127)]
 
 
 class NameRule(BaseModel):
-    """When a logged value says a name.
+    """Decision rule of a name on its logged value.
 
     Attributes
     ----------
     seconds : float
-        Expected duration without a pause; of names at once, that of the shortest sound counts.
+        Expected duration without a pause; of simultaneous names, the one with the shortest wins.
     precision : float
-        Share of such labels that were right where the threshold was measured.
+        Share of correct labels where the threshold was measured.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
@@ -81,17 +81,17 @@ class NamesParameters(BaseModel):
 
     @property
     def ahead(self) -> int:
-        """Frames from one to that at which its label is known.
+        """Number of frames from a frame to the frame that completes its label.
 
-        A frame waits for the windows after that which has it in the middle, as many as the name
-        that needs most of them; and for one, by which it is known whether it is in a pause.
+        A frame waits for the windows after the window centred on it, as many as the most demanding
+        name needs, and for one more, which decides whether the frame is in a pause.
         """
         later = max([2, *(rule.windows for rule in self.rules.values())]) - 1
         return HOP_FRAMES * later + _WINDOW_AHEAD
 
 
 class NamesKind(ClassifierKind):
-    """Names of a network, and thresholds; no arrays. Without embeddings all is silence."""
+    """Names of a network and thresholds; no arrays. Without embeddings all frames are silence."""
 
     name = BY_NAMES
     parameters = NamesParameters
@@ -100,12 +100,12 @@ class NamesKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes: there are none."""
+        """Return no shapes."""
         del classes, width, arrays
         return {}
 
     def machine(self, model: Model) -> "_Silent":
-        """Prepare a model for inference by features, which say nothing here."""
+        """Prepare a model for inference by features, which have no effect here."""
         return _Silent(model.classes)
 
     def summary(self, model: Model) -> str:
@@ -119,7 +119,7 @@ class _Silent:
         self._of_silence = np.where([name == SILENCE for name in classes], 0.0, -100.0)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Say that all windows are silence."""
+        """Decide silence for all windows."""
         return np.tile(self._of_silence, (len(inputs), 1)), np.full(len(inputs), np.nan)
 
 
@@ -132,9 +132,9 @@ NAMES = NamesKind()
 
 
 AUDIOSET = "audioset"
-KEY = "hearthlog"  # of the description, in a model file
-_LOGGED = np.arange(-128, 128)  # all that a value can be
-_HALVES = 2  # of the sources, on one of which a threshold was tried
+KEY = "hearthlog"  # key of the description in a model file
+_LOGGED = np.arange(-128, 128)  # all possible values
+_HALVES = 2  # of the sources; thresholds are tried on one half
 
 
 @lru_cache(maxsize=1)
@@ -191,16 +191,17 @@ def audioset_file() -> bytes:
 
 
 def is_by_names(model: Model) -> bool:
-    """Return whether a model labels by names, which leave a class to any model that learned it."""
+    """Return whether a model labels by names; such labels yield to a model trained on the class."""
     return model.description.kind == BY_NAMES
 
 
 def insist_taught(model: Model) -> None:
-    """Refuse a model that labels by names where one is asked for that was taught.
+    """Refuse a model that labels by names where a trained model is required.
 
     Raises
     ------
     ModelError
+        If the model labels by names.
     """
     if is_by_names(model):
         raise ModelError(
@@ -242,7 +243,7 @@ def without_classes(model: Model, names: Collection[str], features: FeatureSet) 
 
 
 def _rule(name: SoundName, projection: Projection) -> NameRule | None:
-    """Return a threshold in logged integers; None for one that no integer reaches."""
+    """Return the rule of a name in logged integers; None if no integer reaches the threshold."""
     value = projection.names.index(name.group)
     every = np.zeros((len(_LOGGED), len(projection.names)), np.int8)
     every[:, value] = _LOGGED
@@ -269,7 +270,7 @@ def _metrics(precision: float, recall: float) -> ClassMetrics:
 
 
 def _of_features(features: FeatureSet) -> dict[str, Any]:
-    """Return what a description says of the features, which name nothing here."""
+    """Return the description fields of the feature set, which do not affect the names."""
     return {
         "feature_set": features.name,
         "feature_set_version": features.version,

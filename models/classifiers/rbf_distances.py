@@ -1,4 +1,4 @@
-"""Squared distances of windows to the vectors of a machine, as its kernel takes them."""
+"""Squared distances of windows to the vectors of a machine, scaled for its kernel."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.schemas.arrays import Float64
 
-_EXACT = 4096  # steps: the square, 2^24, is the largest whole number up to which float32 has all
+_EXACT = 4096  # steps: its square, 2^24, is the limit up to which float32 holds all whole numbers
 _FARTHEST = 1 << 20  # steps: with a thousand inputs, sums of squares are exact in float64
 
 
@@ -20,7 +20,7 @@ class Prepared(NamedTuple):
     values : np.ndarray [shape=(n, width + 2) or (width + 2, m)], float32 or float64
         Windows in rows, vectors in columns.
     longest : float
-        Length of the longest, in steps; 0 without steps.
+        Length of the longest window or vector, in steps; 0 without steps.
     """
 
     values: NDArray[Any]
@@ -37,14 +37,14 @@ class Distances(Protocol):
         """Prepare scaled vectors, of shape (m, width)."""
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
-        """Return the exponents, of shape (n, m), none of them above 0."""
+        """Return the exponents, of shape (n, m), all at most 0."""
 
 
 class RoundedDistances:
     """Distances of inputs in whole steps: the same bits with any BLAS, on any processor.
 
-    Products of whole numbers, and all their sums, are exact, in whatever order: in float32 where
-    rows and vectors are as near to the mean as nearly all are, else in float64.
+    Products of whole numbers and all their sums are exact in any order: in float32 if rows and
+    vectors are close enough to the mean, as almost all are, else in float64.
     """
 
     def __init__(self, gamma: float, steps: int) -> None:
@@ -63,8 +63,8 @@ class RoundedDistances:
         return Prepared(aligned(values), longest)
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
-        """Return the exponents, of shape (n, m), none of them above 0."""
-        # No sum of some of the products is above (|x| + |s|)^2.
+        """Return the exponents, of shape (n, m), all at most 0."""
+        # No partial sum of the products is above (|x| + |s|)^2.
         type_ = np.float32 if rows.longest + vectors.longest <= _EXACT else np.float64
         product = rows.values.astype(type_, copy=False) @ vectors.values.astype(type_, copy=False)
         exponents: Float64 = np.multiply(product, self._factor, dtype=np.float64)
@@ -72,7 +72,7 @@ class RoundedDistances:
 
 
 class UnroundedDistances:
-    """Distances as models of hearthlog 0.1 take them."""
+    """Distances for models of hearthlog 0.1."""
 
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
@@ -86,9 +86,9 @@ class UnroundedDistances:
         return Prepared(aligned(_as_columns(scaled, self._gamma)), 0.0)
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
-        """Return the exponents, of shape (n, m), none of them above 0."""
+        """Return the exponents, of shape (n, m), all at most 0."""
         product = rowwise_matmul(rows.values, vectors.values)
-        return np.minimum(product, 0.0, out=product)  # by rounding, a few are above
+        return np.minimum(product, 0.0, out=product)  # rounding puts a few above 0
 
 
 def in_steps(scaled: Float64, steps: int) -> Float64:
@@ -121,6 +121,6 @@ def _as_columns(vectors: Float64, gamma: float) -> Float64:
 
 
 def _exact(values: Float64, whole: Float64) -> Prepared:
-    """Take float32 for values that it holds exactly."""
+    """Convert values to float32 if that is exact."""
     longest = float(np.vecdot(whole, whole).max(initial=0.0)) ** 0.5
     return Prepared(values if longest > _EXACT else values.astype(np.float32), longest)

@@ -1,4 +1,4 @@
-"""Inputs in standard deviations from the mean, for the kinds of classifiers that need it."""
+"""Scaling of inputs to standard deviations from the mean."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +16,7 @@ _SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
 
 
 class Scaler:
-    """Scales inputs as a model has it."""
+    """Scales inputs by a model's mean and standard deviation."""
 
     def __init__(self, arrays: Mapping[str, Array]) -> None:
         self._mean = arrays["scaler_mean"]
@@ -33,12 +33,12 @@ def scaler_shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
-    """Return what is wrong with the scaler of a model; None if nothing is.
+    """Return an error in the scaler of a model; None if there is none.
 
     Parameters
     ----------
     arrays : mapping of str to np.ndarray
-        As of `Scaler`; of the right types and shapes, and finite.
+        The arrays of `Scaler`; finite, with valid types and shapes.
     """
     if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
         return None

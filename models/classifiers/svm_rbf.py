@@ -1,4 +1,4 @@
-"""Support vector machines with RBF kernel, one against one, with numpy alone."""
+"""One-against-one support vector machines with RBF kernel, in numpy alone."""
 
 from collections.abc import Mapping
 from itertools import combinations, pairwise
@@ -24,7 +24,7 @@ HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
 HOME_SHARE = 100.0  # weight of a home vector; a support vector has 1
 HOME_SHARPNESS = 10.0
 _TINY = 1e-200
-_SUPPORT_AT_ONCE = 256  # a product this small no BLAS divides among threads
+_SUPPORT_AT_ONCE = 256  # no BLAS splits a product of this size among threads
 
 _Part = tuple[int, slice, Float64]  # a class, its columns, and their coefficients
 _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -38,8 +38,8 @@ class SvmParameters(BaseModel):
     gamma : float
         Of the kernel exp(-gamma |x - s|^2).
     steps : int or None
-        Of a standard deviation, to which inputs are rounded; None for those of hearthlog 0.1, which
-        are not.
+        Rounding steps per standard deviation of the inputs; None for models of hearthlog 0.1, which
+        do not round.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
@@ -55,7 +55,7 @@ class SvmKind(ClassifierKind):
     scaler_mean, scaler_scale : [shape=(width,)], float64
         Mean and standard deviation of the inputs.
     support_vectors : [shape=(n, width)], float32
-        Inputs, not scaled, class after class.
+        Unscaled inputs, sorted by class.
     support_counts : [shape=(C,)], int64
         Number of support vectors of each class.
     dual_coefficients : [shape=(C - 1, n)], float64
@@ -63,18 +63,18 @@ class SvmKind(ClassifierKind):
     intercepts : [shape=(C (C - 1) / 2,)], float64
         For the pairs (0, 1), (0, 2) … (1, 2) …; a positive decision is for the first of a pair.
     home_vectors : [shape=(h, width)], float32, optional
-        Inputs that a home has corrected, which draw similar inputs to their class.
+        Inputs corrected by a home, which attract similar inputs to their class.
     home_target : [shape=(h,)], int64, optional
         Classes of the home vectors.
     base_target : [shape=(b,)], int64, optional
-        Classes of the support vectors of the model that was adapted, from which it is adapted
-        again.
+        Classes of the support vectors of the model before adaptation, kept for further
+        adaptations.
     support_base : [shape=(n,)], int64, optional
-        Which of these each support vector is, from 0 on; -1 for one of the home.
+        Index of each support vector among these, from 0; -1 for a vector of the home.
     base_vectors : [shape=(m, width)], float32, optional
-        Those of them that are support vectors no more, in their order.
+        Those that are no longer support vectors, in their order.
     base_costs : [shape=(C,)], float64, optional
-        What an error on a window of each class costs, relative to the cost of the method.
+        Cost of an error on a window of each class, relative to the cost of the method.
     """
 
     name = "svm-rbf"
@@ -98,7 +98,7 @@ class SvmKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return shapes, as of `ClassifierKind.shapes`."""
+        """Return the required shapes, as `ClassifierKind.shapes`."""
         total, home, base = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
             for name in ("support_vectors", "home_vectors", "base_target")
@@ -121,7 +121,7 @@ class SvmKind(ClassifierKind):
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with the arrays, as of `ClassifierKind.problem`."""
+        """Return an error in the arrays, as `ClassifierKind.problem`."""
         counts, total = arrays["support_counts"], len(arrays["support_vectors"])
         if (counts < 0).any() or counts.sum() != total:
             return f"support_counts do not add up to the {total} support vectors"
@@ -140,7 +140,7 @@ class SvmKind(ClassifierKind):
         return SvmMachine(model)
 
     def summary(self, model: Model) -> str:
-        """Return the number of support vectors, in words."""
+        """Return the number of support vectors in words."""
         return f"{len(model.arrays['support_vectors'])} support vectors"
 
 
@@ -148,9 +148,9 @@ SVM_RBF = SvmKind()
 
 
 class SvmMachine:
-    """Inference of one model; its pairs of classes decide as scikit-learn's `SVC` within 1e-5.
+    """Inference of one model; its pairs of classes agree with scikit-learn's `SVC` within 1e-5.
 
-    The decision value of a class is that of the weakest of its pairs, plus `home_votes`.
+    The decision value of a class is the value of its weakest pair, plus `home_votes`.
     """
 
     def __init__(self, model: Model) -> None:
@@ -176,7 +176,7 @@ class SvmMachine:
         decisions : np.ndarray [shape=(n, C)], float64
         novelty : np.ndarray [shape=(n,)], float64
             One minus the kernel of the nearest support vector, 0 to 1; NaN for a model whose
-            novelty comes from its probabilities.
+            novelty is derived from its probabilities.
         """
         rows = self._distances.rows(self._scaled(inputs))
         pairs, others, nearest = self._pairs(rows)
@@ -194,7 +194,8 @@ class SvmMachine:
         others : np.ndarray [shape=(n, 1)]
             Sums of the sharp kernels of the support vectors; zeros without home vectors.
         nearest : np.ndarray [shape=(n,)]
-            Logarithm of the kernel of the nearest support vector; NaN if novelty is not told.
+            Logarithm of the kernel of the nearest support vector; NaN if the novelty is not
+            computed.
         """
         count = len(rows.values)
         nearest = np.full(count, -np.inf if self._tells_novelty else np.nan)
@@ -250,9 +251,9 @@ class SvmMachine:
 
 
 def weakest_pairs(pairs: Float64, classes: int) -> Float64:
-    """Return the decision value of each class: that of the weakest of its pairs.
+    """Return the decision value of each class: the value of its weakest pair.
 
-    Unlike the number of pairs that a class wins, it can be calibrated.
+    Unlike the number of pairs won by a class, this value can be calibrated.
 
     Parameters
     ----------
@@ -271,11 +272,11 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
 
 
 def home_votes(home: Float64, others: Float64) -> Float64:
-    """Compute what is added to decision values for inputs near to vectors of a home.
+    """Compute the addition to decision values for inputs near the vectors of a home.
 
-    A support vector machine learns a few segments of a home among thousands, but not what is
-    similar to them. A vote is the share of a class of the home among all vectors nearby, so that
-    inputs far from all home vectors stay as they are.
+    A support vector machine learns a few segments of a home among thousands, but not similar
+    sounds. A vote is the share of a home's class among all vectors nearby, so inputs far from all
+    home vectors stay unchanged.
 
     Parameters
     ----------

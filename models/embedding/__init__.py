@@ -1,1 +1,1 @@
-"""Embeddings of sound: what a pretrained network gives for a window, as it is logged."""
+"""Embeddings of sound: the output of a pretrained network for a window, as logged."""

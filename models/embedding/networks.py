@@ -1,4 +1,4 @@
-"""Pretrained networks of sounds: files, folders, runtimes, and answers to synthetic sounds."""
+"""Pretrained networks of sounds: files, folders, runtimes, and known answers."""
 
 import hashlib
 import os
@@ -31,10 +31,10 @@ from hearthlog.schemas.messages.topics import EmbeddingSource
 
 
 def network_folders() -> list[Path]:
-    """Return the folders of networks: `hearthlog/networks` of the folders of data.
+    """Return the folders of networks: `hearthlog/networks` in the data folders.
 
-    Those are `$XDG_DATA_HOME` (`~/.local/share`) and `$XDG_DATA_DIRS` (`/usr/local/share` and
-    `/usr/share`), as in the XDG Base Directory Specification.
+    The data folders are `$XDG_DATA_HOME` (`~/.local/share`) and `$XDG_DATA_DIRS`
+    (`/usr/local/share` and `/usr/share`), as in the XDG Base Directory Specification.
     """
     of_user = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")  # noqa: PTH111  that of Path raises where there is no home
     of_all = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
@@ -43,9 +43,9 @@ def network_folders() -> list[Path]:
 
 
 def folder_for_new() -> Path:
-    """Return the folder that a network is put into: that of the user, for root that of all users.
+    """Return the folder for a new network: the user's; for root, the folder shared by all users.
 
-    A service sees no home, and what root fetches is for it.
+    Services cannot read a user's home, and root fetches networks for a service.
     """
     own, *of_all = network_folders()
     return of_all[0] if of_all and os.geteuid() == 0 else own
@@ -59,9 +59,9 @@ _MODULES = {".tflite": ("ai_edge_litert",), ".onnx": ("onnx", "onnxruntime")}
 
 
 def session_type(suffix: str) -> Callable[[bytes, int, int, int], NetworkSession]:
-    """Return what makes a session of a file's bytes, window, width and number of names.
+    """Return the session factory for a file suffix: bytes, window, width and number of names.
 
-    Raise `ModelError` if there is no runtime for it.
+    Raise `ModelError` if no runtime supports the suffix.
     """
     if suffix not in _TYPES:
         raise ModelError(f"is no network that can be used: it ends in none of {', '.join(_TYPES)}")
@@ -69,7 +69,7 @@ def session_type(suffix: str) -> Callable[[bytes, int, int, int], NetworkSession
 
 
 def missing_modules(suffix: str) -> list[str]:
-    """Return the modules for files of a suffix that are not installed, without importing any."""
+    """Return the missing modules for files of a suffix, without importing any."""
     return [module for module in _MODULES.get(suffix, ()) if find_spec(module) is None]
 
 
@@ -84,7 +84,7 @@ def synthetic_sounds(samples: int) -> dict[str, Float32]:
     Parameters
     ----------
     samples : int
-        So many at 16 kHz, from -1 to 1.
+        Number of samples at 16 kHz, from -1 to 1.
     """
     seconds = np.arange(samples) / SAMPLE_RATE
     noise = 2.0 * np.random.default_rng(_SEED).random(samples) - 1.0
@@ -97,20 +97,20 @@ def synthetic_sounds(samples: int) -> dict[str, Float32]:
     return {name: sound.astype(np.float32) for name, sound in sounds.items()}
 
 
-ANSWER_TOLERANCE = 1.5  # logits; conversions differ by a few tenths, other networks by many
+ANSWER_TOLERANCE = 1.5  # logits; conversions differ by a few tenths, other networks by much more
 _PATIENCE_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """A file that holds a network.
+    """A file with a network.
 
     Attributes
     ----------
     size : int
         In bytes.
     url : str
-        Where it is published; empty for one that is known by its digest alone.
+        Download address; empty for a file identified by its digest alone.
     """
 
     sha256: str
@@ -119,7 +119,7 @@ class NetworkFile:
 
 
 class KnownAnswer(NamedTuple):
-    """What a network is known to say of a synthetic sound."""
+    """The expected output of a network for a synthetic sound."""
 
     sound: str
     number: int
@@ -134,7 +134,7 @@ class EmbeddingNetwork:
     Attributes
     ----------
     window : int
-        Samples at 16 kHz that it takes, of a second at most.
+        Input samples at 16 kHz, at most a second.
     """
 
     name: str
@@ -150,7 +150,7 @@ class EmbeddingNetwork:
 
     @property
     def filename(self) -> str:
-        """Name of its file."""
+        """Name of the network's file."""
         return f"{self.name}{self.suffix}"
 
 
@@ -171,7 +171,7 @@ YAMNET = EmbeddingNetwork(
     projection=Path(__file__).parent / "yamnet.safetensors",
     licence="Apache-2.0",
     attribution="YAMNet, Google LLC, https://github.com/tensorflow/models",
-    answers=(  # of the second file: the first could not be had where this was written
+    answers=(  # of the second file: the first was not available when this was written
         KnownAnswer(TONE, 475, "beep", 2.2),
         KnownAnswer(NOISE, 514, "white noise", 1.3),
         KnownAnswer(BURSTS, 132, "music", -1.1),
@@ -185,11 +185,11 @@ NETWORKS = Extensions(
 
 
 class Embedder:
-    """Computes what is logged for a window of sound.
+    """Computes the logged values of a window of sound.
 
-    It is tried with synthetic sounds first.
+    The network is first run on synthetic sounds.
 
-    Raise `ModelError` if the file is missing, is another one, or cannot be used.
+    Raise `ModelError` if the file is missing, is not the expected file, or cannot be used.
     """
 
     def __init__(self, network: EmbeddingNetwork, path: Path) -> None:
@@ -207,7 +207,7 @@ class Embedder:
 
     @property
     def source(self) -> EmbeddingSource:
-        """What logs say of their embeddings."""
+        """Source of the embeddings, as recorded in logs."""
         steps = tuple(self.projection.steps.tolist())
         sha256 = self.projection.sha256
         return EmbeddingSource(self.network.name, self.sha256, sha256, self.projection.names, steps)
@@ -218,12 +218,12 @@ class Embedder:
         Parameters
         ----------
         window : np.ndarray [shape=(WINDOW_FRAMES, FRAME_SAMPLES)], float32
-            In whose middle the input of the network lies.
+            The network's input lies in its middle.
 
         Returns
         -------
         np.ndarray [shape=(W,)], int8
-            Those of silence where the network fails, with a `HearthlogWarning`.
+            The values of silence if the network fails, with a `HearthlogWarning`.
         """
         samples = window.reshape(-1)
         start = (len(samples) - self.network.window) // 2
@@ -237,10 +237,10 @@ class Embedder:
         return self.projection.quantise(output)
 
     def different_answers(self) -> list[str]:
-        """Return a line for each known answer that this file gives otherwise.
+        """Return a line for each known answer that this file does not reproduce.
 
-        Models were made with the answers of one file; another conversion of the same weights may
-        round otherwise, but not much.
+        Models were trained with the answers of one file; another conversion of the same weights may
+        round differently, but only slightly.
         """
         sounds = synthetic_sounds(self.network.window)
         lines = []
@@ -251,7 +251,7 @@ class Embedder:
         return lines
 
     def _tried(self) -> Int8:
-        """Try it with sounds up to full scale, and with silence; return the integers of that."""
+        """Run the network on loud sounds and on silence; return the values of silence."""
         sounds = synthetic_sounds(self.network.window)
         for window in (10.0 * sounds[NOISE], sounds[BURSTS], sounds[SILENCE]):
             begin = time.monotonic()
@@ -274,7 +274,7 @@ class Embedder:
 
 
 def _check_projection(network: EmbeddingNetwork, projection: Projection) -> None:
-    """Refuse a projection that is of another network's output."""
+    """Refuse a projection made for another network's output."""
     numbers = [number for group in projection.groups.values() for number in group]
     fits = projection.components.shape[0] == projection.mean.shape[0] == network.width
     of_names = all(group for group in projection.groups.values())
@@ -283,14 +283,14 @@ def _check_projection(network: EmbeddingNetwork, projection: Projection) -> None
 
 
 def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str]:
-    """Read a file of a network; return it, and its SHA-256.
+    """Read the file of a network; return its content and SHA-256.
 
-    Raise `ModelError` if it is missing, cannot be read, or is none of those that are known.
+    Raise `ModelError` if the file is missing, cannot be read, or is unknown.
     """
     sizes = {each.size for each in network.files}
     source = "" if network.files[0].url else " --from FILE"
     remedy = f"fetch it: hearthlog models fetch {network.name}{source}"
-    with suppress(OSError):  # which is told when it is read
+    with suppress(OSError):  # the error is raised on reading
         size = path.stat().st_size
         if path.is_file() and size not in sizes:
             known = " or ".join(f"{each:,}" for each in sorted(sizes))
@@ -309,15 +309,15 @@ def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str
 
 
 def find_network(name: str) -> Path | None:
-    """Return the file of a network; None where there is none."""
+    """Return the file of a network; None if there is none."""
     places = [folder / NETWORKS.get(name).filename for folder in network_folders()]
     return next(filter(os.path.lexists, places), None)
 
 
 @lru_cache(maxsize=2)
 def load_embedder(name: str, path: Path) -> Embedder:
-    """Load a network once, however many microphones there are.
+    """Load a network once for all microphones.
 
-    Raise `ModelError` as `Embedder`.
+    Raise `ModelError` as `Embedder` does.
     """
     return Embedder(NETWORKS.get(name), path)

@@ -1,4 +1,4 @@
-"""Embeddings of windows, and their projection onto the integers that are logged."""
+"""Embeddings of windows, and their projection onto logged integers."""
 
 import hashlib
 import json
@@ -28,12 +28,12 @@ from hearthlog.schemas.files import read_whole
 
 @dataclass(frozen=True, eq=False)
 class FrameSpans:
-    """Spans of equal length, with a row for each in every field.
+    """Spans of equal length, with one row per span in every field.
 
     Attributes
     ----------
     frames : np.ndarray [shape=(m,)], int64
-        Number of the first frame of each; increasing.
+        Number of the first frame of each span; increasing.
     stamps : np.ndarray [shape=(m,)], int64
         Starts of these frames in nanoseconds of UTC.
     """
@@ -48,20 +48,20 @@ class FrameSpans:
 
     @property
     def last_frames(self) -> Int64:
-        """Numbers of the frames with which they are known."""
+        """Numbers of the frames that complete the spans."""
         return self.frames + (self.LENGTH - 1)
 
     def rows(self, chosen: slice | Indices | Bool) -> Self:
-        """Return some of them."""
+        """Return the chosen spans."""
         return type(self)(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def known_at(self, first: int, count: int) -> Self:
-        """Return those that become known with some successive frames."""
+        """Return the spans that are completed by some successive frames."""
         begin, end = np.searchsorted(self.last_frames, [first, first + count])
         return self.rows(slice(begin, end))
 
     def begun_in(self, start: int, end: int) -> Self:
-        """Return those that begin in a span of time.
+        """Return the spans that begin in a time interval.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class FrameSpans:
         return self.rows(slice(*np.searchsorted(self.stamps, [start, end])))
 
     def followed_by(self, later: Self) -> Self:
-        """Join these with those that follow; those of none take any width."""
+        """Concatenate these spans and later spans; an empty side may have any width."""
         if not len(self):
             return later
         if not len(later):
@@ -81,9 +81,9 @@ class FrameSpans:
         return type(self)(*map(np.concatenate, pairs))
 
 
-WINDOW_FRAMES = 20  # of a window: a second, in whose middle the network's input lies
-HOP_FRAMES = 10  # from one window to the next; windows begin at multiples of it
-DELAY_FRAMES = WINDOW_FRAMES - 1  # from a frame to the last one of the last window that says of it
+WINDOW_FRAMES = 20  # frames of a window: a second, with the network's input in the middle
+HOP_FRAMES = 10  # frames between windows; windows begin at multiples of it
+DELAY_FRAMES = WINDOW_FRAMES - 1  # frames from a frame to the end of its last window
 
 Int8 = NDArray[np.int8]
 
@@ -95,7 +95,7 @@ class Embeddings(FrameSpans):
     Attributes
     ----------
     values : np.ndarray [shape=(m, W)], int8
-        As `Projection.quantise` gives them.
+        From `Projection.quantise`.
     """
 
     LENGTH = WINDOW_FRAMES
@@ -108,7 +108,7 @@ NO_EMBEDDINGS = Embeddings(np.empty(0, np.int64), np.empty(0, np.int64), np.empt
 
 _KEY = "projection"
 _SIZE_LIMIT = 16 << 20
-_HIGHEST = 127  # of an int8; the lowest is its opposite
+_HIGHEST = 127  # of an int8; symmetric: the lowest is -127
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +118,12 @@ class Projection:
     Attributes
     ----------
     mean : np.ndarray [shape=(E,)], float32
-        In half precision, as the components.
+        In half precision, like the components.
     components : np.ndarray [shape=(E, k)], float32
     steps : np.ndarray [shape=(W,)], float32
-        Differences from one integer to the next.
+        Step between adjacent integers.
     lows : np.ndarray [shape=(W,)], float32
-        Values that are lower count as this.
+        Lower limit of the values.
     """
 
     mean: Float32
@@ -146,12 +146,12 @@ class Projection:
         return numbers, np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.intp)
 
     def quantise(self, output: NetworkOutput) -> Int8:
-        """Turn the output of a network for a window into what is logged.
+        """Convert the output of a network for a window to logged integers.
 
         Parameters
         ----------
         output : NetworkOutput
-            What is not finite counts as 0.
+            Non-finite values count as 0.
 
         Returns
         -------
@@ -166,7 +166,7 @@ class Projection:
         return quantised
 
     def values(self, quantised: Int8) -> Float64:
-        """Turn what is logged into numbers: standard deviations, and logits.
+        """Convert logged integers to numbers: standard deviations, and logits.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ def write_projection(projection: Projection, path: Path) -> None:
 def read_projection(path: Path) -> Projection:
     """Read a projection.
 
-    Raise `ModelError` if there is none, or it is damaged.
+    Raise `ModelError` if the file is missing or damaged.
     """
     data = read_whole(path, "projection of a network", _SIZE_LIMIT, ModelError)
     try:

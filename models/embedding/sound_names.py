@@ -13,23 +13,23 @@ from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Emb
 from hearthlog.schemas.arrays import Float64, Int64
 
 _FILE = Path(__file__).with_name("audioset_names.csv")
-RELEASE = 1.0  # logits below the threshold at which a sound still goes on
-_PAUSE_FRAMES = 2 * HOP_FRAMES  # between windows of one sound at most
-_MARGIN = (WINDOW_FRAMES - HOP_FRAMES) // 2  # frames of a window before and behind its middle
+RELEASE = 1.0  # logits below the threshold down to which a sound continues
+_PAUSE_FRAMES = 2 * HOP_FRAMES  # between windows of one sound, at most
+_MARGIN = (WINDOW_FRAMES - HOP_FRAMES) // 2  # frames of a window before and after its middle
 
 
 class SoundName(NamedTuple):
-    """A name of a sound, and how well it is heard.
+    """A name of a sound, and its detection accuracy.
 
-    The table `audioset_names.csv` has them, as `hearthlog.tools.lab.names` measured them.
+    The table `audioset_names.csv` contains the names, as measured by `hearthlog.tools.lab.names`.
 
     Attributes
     ----------
     is_event : bool
-        Whether it was measured to be right often enough; else it is a hint.
+        Whether its measured precision is sufficient for an event; else it is a hint.
     precision, recall, false_an_hour : float
-        Of an event on sources that its threshold was not chosen on, of a hint on all; NaN where
-        there are too few.
+        For an event, on sources not used to choose its threshold; for a hint, on all sources; NaN
+        for too few sources.
     """
 
     name: str
@@ -48,7 +48,7 @@ class SoundName(NamedTuple):
 
 @cache
 def audioset_names() -> tuple[SoundName, ...]:
-    """Return the names that hearthlog knows."""
+    """Return the names in hearthlog's table."""
     return tuple(read_names(_FILE))
 
 
@@ -58,7 +58,7 @@ def read_names(path: Path) -> list[SoundName]:
     Parameters
     ----------
     path : Path
-        CSV, with the fields of `SoundName` as columns; numbers may be left out.
+        CSV, with the fields of `SoundName` as columns; numbers may be missing.
     """
     types = SoundName.__annotations__
     with path.open(newline="", encoding="utf-8") as stream:
@@ -67,7 +67,7 @@ def read_names(path: Path) -> list[SoundName]:
 
 
 def write_names(names: Sequence[SoundName], path: Path) -> None:
-    """Write a table of names, as `read_names` reads it."""
+    """Write a table of names in the format of `read_names`."""
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(SoundName._fields)
@@ -75,12 +75,12 @@ def write_names(names: Sequence[SoundName], path: Path) -> None:
 
 
 class NamedSound(NamedTuple):
-    """A sound that the network named.
+    """A sound named by the network.
 
     Attributes
     ----------
     first, end : int
-        Numbers of its first frame, and of the one behind its last.
+        Number of its first frame, and of the frame after its last.
     """
 
     name: SoundName
@@ -92,19 +92,19 @@ class NamedSound(NamedTuple):
 def named_sounds(
     embeddings: Embeddings, projection: Projection, names: Sequence[SoundName] | None = None
 ) -> list[NamedSound]:
-    """Find the sounds that the network names in windows of one stream.
+    """Find named sounds in the windows of one stream.
 
-    A sound begins with a window above the threshold, and goes on while windows no more than a
-    second apart are above it or a little below.
+    A sound begins with a window above the threshold, and continues while windows no more than a
+    second apart are above the threshold or slightly below.
 
-    Raise `ValueError` if the projection has not the group of a name.
+    Raise `ValueError` if the projection lacks the group of a name.
     """
     names = audioset_names() if names is None else names
     columns, sounds = _columns(projection, names), list[NamedSound]()
     if not len(embeddings.frames):
         return sounds
     logits = projection.values(embeddings.values)[:, columns]
-    above_low = (projection.lows + projection.steps)[columns]  # the low itself is nothing heard
+    above_low = (projection.lows + projection.steps)[columns]  # the lower limit is no detection
     for place, name in enumerate(names):
         sounds += _named(name, logits[:, place], embeddings.frames, float(above_low[place]))
     return sorted(sounds, key=lambda sound: sound.first)
@@ -156,7 +156,7 @@ def _text(value: object) -> str:
 _VALUES: Mapping[object, Callable[[str], Any]] = {str: str, float: float, int: int, bool: _yes}
 
 
-# The first are for the classes of the scenarios; "outside" is what is none of those of a home.
+# The first groups serve the classes of the scenarios; "outside" covers sounds foreign to a home.
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "silence": ("Silence",),
     "speech": (
@@ -259,7 +259,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "Fireworks",
         "Gunshot, gunfire",
     ),
-    # What the names say by themselves.
+    # Groups of single names.
     "conversation": ("Conversation",),
     "shout": ("Shout", "Yell", "Bellow", "Whoop"),
     "scream": ("Screaming",),
@@ -313,7 +313,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "alarm_clock": ("Alarm clock",),
     "smoke_alarm": ("Smoke detector, smoke alarm", "Fire alarm"),
     "alarm": ("Alarm",),
-    # Without "Siren", which telephones and screams are called, too.
+    # Without "Siren", which the network also gives to telephones and screams.
     "siren": (
         "Police car (siren)",
         "Ambulance (siren)",

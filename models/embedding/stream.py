@@ -1,4 +1,4 @@
-"""Embeddings of one stream of frames, without the steady noise of the room."""
+"""Embeddings of one stream of frames, after subtraction of the room's steady noise."""
 
 from functools import cache
 
@@ -14,31 +14,31 @@ from hearthlog.models.embedding.projection import (
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES
 
-LEFT_DBFS = -75.0  # of noise: so much is behind the clips that heads are learned from
-_FRAME, _HOP = 1600, 800  # samples: noise of long frames sounds least
+LEFT_DBFS = -75.0  # level of the noise behind the clips that heads are trained on
+_FRAME, _HOP = 1600, 800  # samples: the noise of long frames is the least audible
 _LEAST_GAIN = 0.01
-_MOST_WINDOWS = 10  # that the mean remembers: five seconds
+_MOST_WINDOWS = 10  # windows in the running mean: five seconds
 
 
 class SteadyNoise:
-    """Learns the steady noise of one stream of windows, and takes it out of others.
+    """Estimates the steady noise of one stream of windows, and subtracts it from other windows.
 
     The mean power of the noise is subtracted from each bin, as in Boll, "Suppression of acoustic
-    noise in speech using spectral subtraction" (1979), down to the noise that heads have learned
-    with: the noise falls by 7 dB. Subtracting more took away more of what the network knows sounds
-    by. The noise is what there is while nothing is above the floor of the room.
+    noise in speech using spectral subtraction" (1979), down to the noise level of the heads'
+    training data: the noise falls by 7 dB. Stronger subtraction removed more of the cues that the
+    network uses. The noise is the sound while nothing is above the floor of the room.
     """
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past."""
-        self._power: Float64 | None = None  # of each bin
+        """Reset the state."""
+        self._power: Float64 | None = None  # power of each bin
         self._windows = 0
 
     def learn(self, window: Float32) -> None:
-        """Add a window in which there is nothing but the room.
+        """Add a window that contains only the room.
 
         Parameters
         ----------
@@ -53,7 +53,7 @@ class SteadyNoise:
         self._power = self._power + (power - self._power) / self._windows
 
     def reduced(self, window: Float32) -> Float32:
-        """Return a window without the noise; the window itself where there is next to none.
+        """Return a window without the noise; the window itself if the noise is negligible.
 
         Parameters
         ----------
@@ -85,21 +85,22 @@ def _taper() -> Float64:
 
 
 def _smoothed(power: Float64) -> Float64:
-    """Average over three frames and three bins, as single ones of noise are far above its mean."""
+    """Average over three frames and three bins: single noise bins are far above the mean."""
     padded = np.pad(power, 1, mode="edge")
     rows = 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
     smooth: Float64 = 0.25 * rows[:, :-2] + 0.5 * rows[:, 1:-1] + 0.25 * rows[:, 2:]
     return smooth
 
 
-_SOUND_FROM = 4  # frame of a window; what ends before it is more than half a second from the middle
+_SOUND_FROM = 4  # frame of a window; earlier sound is more than half a second from the middle
 
 
 class EmbeddingStream:
-    """Embeds the windows of one stream of frames in which there is sound.
+    """Embeds the windows of one stream of frames that contain sound.
 
-    Windows begin at frames whose number is a multiple of ten. One is embedded if there is sound
-    within half a second of its middle, without the noise of windows in which there is none.
+    Windows begin at frames whose number is a multiple of ten. A window is embedded if there is
+    sound within half a second of its middle; the noise of windows without sound is subtracted
+    first.
     """
 
     def __init__(self, embedder: Embedder) -> None:
@@ -108,7 +109,7 @@ class EmbeddingStream:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self._noise.restart()
         self._frames = np.empty((0, FRAME_SAMPLES), np.float32)
         self._sound = np.empty(0, bool)
@@ -121,7 +122,7 @@ class EmbeddingStream:
         ----------
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
         sound : np.ndarray [shape=(n,)], bool
-            Whether what ends with each frame, 0.4 s at most, is above the floor of the room.
+            Whether the sound that ends with each frame, at most 0.4 s, is above the room floor.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         """

@@ -13,7 +13,7 @@ from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 MFCC_COUNT = 13
-MEL_BANDS = 32  # of which the cepstra are made
+MEL_BANDS = 32  # bands from which the cepstra are computed
 
 _FEATURES = (
     ("energy", "of full scale squared"),
@@ -40,16 +40,16 @@ VALUES = _WIDTH + MEL_BANDS
 _FLOOR = 1e-7
 _OVERSUBTRACTION = 1.5
 _TINY = 1e-12
-_NEPERS = np.log(10.0) / 10.0  # of power in a decibel
-_MOST_DB = 300.0  # no frame has so much; powers and their squares stay finite
+_NEPERS = np.log(10.0) / 10.0  # nepers of power in a decibel
+_MOST_DB = 300.0  # above any real frame; keeps powers and their squares finite
 LABEL_FRAMES = 8
 # Means over quiet stretches of household recordings, in the order of the features before the
-# cepstra, with the logarithm of the flux; the first is not used.
+# cepstra, with the logarithm of the flux; the first is unused.
 _OF_SILENCE = np.array([0.0, 0.17, 3.1, 0.24, 0.2, 1.28, -5.94, 0.26])
 
 
 def band_values(features: Float32) -> Float64:
-    """Compute the values behind the inputs `bands` from the features of each frame.
+    """Compute the values for the inputs `bands` from the features of each frame.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ def band_powers(features: Float32) -> Float64:
     Returns
     -------
     np.ndarray [shape=(n, 33)], float64
-        Of the 32 bands that the cepstra represent, without the constant inside their logarithm,
-        and the energy; not below 0.
+        Powers of the 32 bands that the cepstra represent, without the constant inside their
+        logarithm, then the energy; not below 0.
     """
     powers = np.empty((len(features), MEL_BANDS + 1))
     level = np.minimum(bands_of(features[:, CEPSTRA]), _MOST_DB)
@@ -92,7 +92,7 @@ def band_powers(features: Float32) -> Float64:
 
 
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
-    """Compute the values behind the inputs `above_floor` from the features of each frame.
+    """Compute the values for the inputs `above_floor` from the features of each frame.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     Returns
     -------
     np.ndarray [shape=(n, 53)], float64
-        Like those of `band_values`.
+        As from `band_values`.
 
     Raises
     ------
@@ -114,11 +114,11 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
 
 
 def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Float64]:
-    """Compute what of each frame is above the floor of the room, and how much of its energy.
+    """Compute the values above the floor of the room, and the share of energy above the floor.
 
     The floor is subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech
-    corrupted by acoustic noise", 1979). The other values cannot be changed so; the less of the
-    energy is above the floor, the nearer they are to those of silence.
+    corrupted by acoustic noise", 1979). The other values allow no subtraction; the smaller the
+    share of energy above the floor, the closer they are moved to the values of silence.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Flo
     Returns
     -------
     values : np.ndarray [shape=(n, 53)], float64
-        As of `values_above_floor`.
+        As from `values_above_floor`.
     share : np.ndarray [shape=(n, 1)], float64
         From 0 to 1.
 
@@ -154,7 +154,7 @@ def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Flo
 
 
 def bands_of(cepstra: Float32) -> Float64:
-    """Turn mel cepstra back into mel bands, which are smooth since the higher cepstra are left out.
+    """Convert mel cepstra to mel bands, which are smooth because higher cepstra are missing.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def dct_weights() -> Float64:
     Returns
     -------
     np.ndarray [shape=(32, 13)], float64
-        One column for each of the first 13 coefficients; its transpose turns cepstra into bands.
+        One column for each of the first 13 coefficients; the transpose converts cepstra to bands.
     """
     band = np.arange(MEL_BANDS)[:, np.newaxis]
     order = np.arange(_WIDTH - _SCALARS)
@@ -185,9 +185,9 @@ def dct_weights() -> Float64:
     return weights
 
 
-# `statistics` are those of the paper (section 3.2.1): mean and standard deviation of the features.
-# `bands` makes more of the same features: logarithms of energy and flux, the smooth mel bands that
-# the cepstra represent, and the mean change of all values from frame to frame.
+# `statistics` are from the paper (section 3.2.1): mean and standard deviation of the features.
+# `bands` derives more from the same features: logarithms of energy and flux, the smooth mel bands
+# that the cepstra represent, and the mean change of all values from frame to frame.
 INPUTS = {
     "statistics": WindowStatistics(WINDOW_FRAMES, np.asarray, _WIDTH),
     "bands": WindowStatistics(WINDOW_FRAMES, band_values, VALUES, changes=True),
@@ -198,42 +198,43 @@ INPUTS = {
 
 
 BINS = FRAME_SAMPLES // 2
-_PARTS = 10  # sub-frames, and sub-bands, of the two entropies
+_PARTS = 10  # sub-frames and sub-bands of the two entropies
 _ROLLOFF_BANDS = 20
 _ROLLOFF_SHARE = 0.90
 _RUNNING_SUM = np.triu(np.ones((_ROLLOFF_BANDS, _ROLLOFF_BANDS)))
 _EPSILON = np.finfo(np.float64).eps
 _SANE_SAMPLE = 1e3  # full scale is 1
 _SANE_ENERGY = _SANE_SAMPLE**2
-_POWER_FLOOR = 1e-7  # about -70 dBFS: below it a spectrum is that of the codec
-_FRAMES_AT_ONCE = 384  # more would leave a core's cache, fewer cost more in calls
+_POWER_FLOOR = 1e-7  # about -70 dBFS: below it, a spectrum is an artefact of the codec
+_FRAMES_AT_ONCE = 384  # more would exceed a core's cache, fewer cost more in calls
 
 
 class FeatureExtractor:
     """Features of one stream of frames; the state is the last spectrum, for the flux.
 
-    Everything is computed in float64 over whole arrays of frames and rounded once, to float32. A
-    frame's values do not depend on how many frames are computed together with it, so a stream and a
-    batch of the same samples agree bit for bit.
+    All values are computed in float64 over arrays of frames and rounded once, to float32. A frame's
+    values do not depend on the batch, so a stream and a batch of the same samples agree bit for
+    bit.
     """
 
     width = len(FEATURE_NAMES)
 
     def __init__(self) -> None:
         self._last_magnitude: Float64 | None = None
-        # Scratch arrays: fresh ones of this size cost more in page faults than the transform.
+        # Scratch arrays: allocating arrays of this size costs more in page faults than the
+        # transform.
         self._samples = np.empty((_FRAMES_AT_ONCE, FRAME_SAMPLES))
         self._spectrum = np.empty((_FRAMES_AT_ONCE, BINS + 1), np.complex128)
         self._magnitude = np.empty((_FRAMES_AT_ONCE + 1, BINS))
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self._last_magnitude = None
 
     def __call__(self, frames: Float32) -> Float32:
         """Compute the features of successive frames.
 
-        The definitions are those of the paper (section 3.2.2) and, where the paper and its library
+        The definitions follow the paper (section 3.2.2) and, where the paper and its library
         differ, of pyAudioAnalysis; see docs/features.md.
 
         Parameters
@@ -321,7 +322,7 @@ def zero_crossing_rate(frames: Float32) -> Float64:
 def mel_bank() -> Float64:
     """Return triangular filters of peak 1 on the mel scale, 0 to 8 kHz.
 
-    The scale is that of Slaney's Auditory Toolbox.
+    The scale is from Slaney's Auditory Toolbox.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A feature set: the values computed from each frame, and all that depends on them."""
+"""A feature set: the values computed from each frame, and everything that depends on them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from hearthlog.models.features.window_inputs import Inputs
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
-SILENCE_POWER = 10 ** (-60 / 10)  # mean square, -60 dBFS: below it no event is learned from
+SILENCE_POWER = 10 ** (-60 / 10)  # mean square, -60 dBFS: quieter events are not used for training
 
 
 class Extractor(Protocol):
@@ -26,7 +26,7 @@ class Extractor(Protocol):
         Parameters
         ----------
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            Samples at 16 kHz in full scale, -1 to 1; some may be beyond it, or not finite.
+            Samples at 16 kHz in full scale, -1 to 1; some may be out of range or not finite.
 
         Returns
         -------
@@ -35,12 +35,12 @@ class Extractor(Protocol):
         """
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
 
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """The values computed from each frame, and all that depends on them.
+    """The values computed from each frame, and everything that depends on them.
 
     Attributes
     ----------
@@ -48,13 +48,13 @@ class FeatureSet:
         Maps features, shape (..., d), to the mean square of the samples, shape (...); full scale
         is 1.
     band_powers : callable or None
-        Maps features, shape (n, d), to powers of b bands, shape (n, b), of which the last is that
-        of the frame; the floor of a room is tracked in them. None if the set has no bands.
+        Maps features, shape (n, d), to powers of b bands, shape (n, b), the last of the complete
+        frame; the floor of a room is tracked in these bands. None if the set has no bands.
     augmented : callable or None
-        Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to what
-        another microphone in another room would give. None if features cannot be changed so.
+        Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to the
+        features that another microphone in another room would give. None if not supported.
     digest : str
-        SHA-256 of the file that computes the values, in hexadecimal; empty where it is code.
+        SHA-256 of the file that computes the values, in hexadecimal; empty if code computes them.
     """
 
     name: str
@@ -71,7 +71,7 @@ class FeatureSet:
 
     @property
     def width(self) -> int:
-        """Number of values of a frame."""
+        """Number of values per frame."""
         return len(self.feature_names)
 
     @property
@@ -83,5 +83,5 @@ class FeatureSet:
 
     @property
     def window_seconds(self) -> float:
-        """Length of the window."""
+        """Length of the window in seconds."""
         return FRAME_SECONDS * self.window_frames

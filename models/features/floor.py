@@ -1,10 +1,10 @@
-"""The floor of a room: the power that is there in each band while nothing happens.
+"""The floor of a room: the background power in each band.
 
 The floor falls with the tenth percentile of the last minute, as in minimum statistics (Martin,
 "Noise power spectral density estimation based on optimal smoothing and minimum statistics", 2001),
-and rises only while the sound is as steady as noise. So a fan becomes a part of the room, and ten
-minutes of a shower or of music do not. What is steady and no louder than a fridge belongs to the
-room at once; the floor, which is subtracted from sound, follows what is steady after a minute.
+and rises only while the sound is as steady as noise. So a fan becomes part of the room, and ten
+minutes of a shower or of music do not. Steady sound no louder than a fridge belongs to the room at
+once; the floor, which is subtracted from sound, follows steady sound after a minute.
 """
 
 from typing import NamedTuple
@@ -17,12 +17,12 @@ BLOCK_FRAMES = 8
 SECTION_BLOCKS = 10  # 4 s
 _MINUTE_BLOCKS = 150
 _SECOND_FRAMES = 20  # no window is longer
-_MEMORY_SECTIONS = 10_800  # 12 h; a relabelling looks back no further
-_SHARE = 0.1  # of the blocks of a minute that may be below the floor
-_STANDS_OUT = 10 ** (2 / 10)  # times the power of the floor: what is less is silence anyway
+_MEMORY_SECTIONS = 10_800  # 12 h; a relabelling reads back no further
+_SHARE = 0.1  # share of the blocks of a minute that may be below the floor
+_STANDS_OUT = 10 ** (2 / 10)  # relative to the floor: less is silence anyway
 _STEADY_DB = 0.42  # noise is below 0.4; real showers, taps, music and speech are above
 _LOUD = 10 ** (-35 / 10)  # power: fridges are below it, steady taps and alarm tones above
-NOMINAL = 1e-7  # power, -70 dBFS: differences below it are those of codecs
+NOMINAL = 1e-7  # power, -70 dBFS: differences below it come from codecs
 
 
 class Floors(NamedTuple):
@@ -31,14 +31,15 @@ class Floors(NamedTuple):
     Attributes
     ----------
     powers : np.ndarray [shape=(m, b)], float64
-        Powers of the bands; the last is that of the whole frame.
+        Powers of the bands; the last is of the complete frame.
     room : np.ndarray [shape=(m, b)], float64
-        The same with what is steady, sounds on and is not loud: what is not above it is silence.
+        The same, including steady sound that continues and is not loud: sound not above it is
+        silence.
     sound : np.ndarray [shape=(m, b)], float64
-        Powers of the bands of the frames themselves.
+        Band powers of the frames themselves.
     converged : bool
-        Whether frames before the first one of the stream would leave no trace in them, nor in those
-        of the second before.
+        Whether these floors, and the floors of the preceding second, are independent of frames
+        before the start of the stream.
     """
 
     powers: Float64
@@ -50,21 +51,21 @@ class Floors(NamedTuple):
 class FloorTracker:
     """Tracks the floor of one stream of frames.
 
-    Frames are averaged in blocks whose places depend on the numbers of the frames only, so that
-    the same frames give the same bits in pieces of any size.
+    Frames are averaged in blocks whose positions depend only on the frame numbers, so the same
+    frames give the same bits in blocks of any size.
     """
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self._converged_for: int | None = None  # number of frames
-        self._partial: Float64 | None = None  # frames of a block that is not complete
+        self._partial: Float64 | None = None  # frames of an incomplete block
         self._blocks: Float64 | None = None  # of the last minute
         self._floor: Float64 | None = None
-        self._steady: Float64 | None = None  # powers of what is steady and sounds on
-        self._settled = False  # whether a whole section was heard
+        self._steady: Float64 | None = None  # powers of continuing steady sound
+        self._settled = False  # whether a complete section was processed
         self._unsteady = 0  # number of sections since the last steady one
 
     def __call__(self, powers: Float64, first: int) -> Floors:
@@ -73,14 +74,14 @@ class FloorTracker:
         Parameters
         ----------
         powers : np.ndarray [shape=(n, b)], float64
-            Powers of the bands of each frame; the last is that of the whole frame.
+            Powers of the bands of each frame; the last is of the complete frame.
         first : int
             Number of the first frame.
 
         Returns
         -------
         Floors
-            At the last m of these frames: those at which a block has been complete since the start
+            At the last m of these frames: the frames after the first complete block since the start
             or the last restart.
         """
         converged = self._converged_for is not None and self._converged_for >= _SECOND_FRAMES
@@ -90,7 +91,7 @@ class FloorTracker:
         return Floors(floors, room, powers[len(powers) - len(floors) :], converged)
 
     def _track(self, powers: Float64, first: int) -> Float64:
-        """Return the floor and the room at each frame that has them, beside each other."""
+        """Return floor and room, side by side, at each frame that has them."""
         if self._partial is None:
             skipped = -first % BLOCK_FRAMES
             if skipped >= len(powers):
@@ -108,7 +109,7 @@ class FloorTracker:
         return np.concatenate([before[np.newaxis], floors])[complete]
 
     def _add_blocks(self, blocks: Float64, number: int) -> Float64:
-        """Return floor and room after each of some blocks, of which the first has this number."""
+        """Return floor and room after each of some blocks; `number` is the first block's number."""
         floors = np.empty((len(blocks), 2 * blocks.shape[1]))
         past = 0 if self._blocks is None else len(self._blocks)
         if self._blocks is not None:
@@ -128,7 +129,7 @@ class FloorTracker:
                 )
             elif not self._settled:
                 self._floor = _low(blocks[:end])
-            # Then the floor stays until the section ends.
+            # Then the floor is constant until the section ends.
             stop = place + ((until_ending or SECTION_BLOCKS) if self._settled else 1)
             self._write_floors(blocks[end - 1 : past + stop], floors[place:stop])
             place = stop
@@ -136,7 +137,7 @@ class FloorTracker:
         return floors
 
     def _write_floors(self, blocks: Float64, floors: Float64) -> None:
-        """Write floor and room after each of some blocks, over which the floor is one."""
+        """Write floor and room after each of some blocks with a constant floor."""
         floors[:] = self._now()
         if self._steady is None:
             return
@@ -152,7 +153,7 @@ class FloorTracker:
         return np.concatenate([self._floor, room])
 
     def _end_section(self, minute: Float64, *, is_steady: bool) -> None:
-        """Move the floor at the end of a section, by the blocks of the minute before."""
+        """Update the floor at the end of a section, from the blocks of the last minute."""
         low, section = _low(minute), minute[-SECTION_BLOCKS:]
         self._settled = True
         self._unsteady += 1
@@ -171,7 +172,7 @@ class FloorTracker:
 
 
 def decibels(powers: Float64) -> Float64:
-    """Turn powers into levels.
+    """Convert powers to levels.
 
     Parameters
     ----------
@@ -186,7 +187,7 @@ def decibels(powers: Float64) -> Float64:
 
 
 def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) -> Bool:
-    """Tell which windows are not above the floor.
+    """Return which windows are not above the floor.
 
     Parameters
     ----------
@@ -200,7 +201,7 @@ def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) 
     Returns
     -------
     np.ndarray [shape=(n,)], bool
-        True where the mean power of no band is as much as the gate above the floor.
+        True if no band's mean power is at least `gate` above the floor.
     """
     total = powers[: len(floors)].copy()
     for place in range(1, window_frames):
@@ -211,7 +212,7 @@ def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) 
 
 
 def low_power(powers: Float64, share: float = 0.2) -> Float64:
-    """Return the floor of a recording of nothing but the room.
+    """Return the floor of a recording that contains only the room.
 
     Parameters
     ----------
@@ -223,7 +224,7 @@ def low_power(powers: Float64, share: float = 0.2) -> Float64:
     Returns
     -------
     np.ndarray [shape=(b,)], float64
-        The mean of all frames where there is no whole block.
+        The mean of all frames if there is no complete block.
     """
     count = len(powers) // BLOCK_FRAMES
     if not count:
@@ -233,7 +234,7 @@ def low_power(powers: Float64, share: float = 0.2) -> Float64:
 
 
 def _are_steady(blocks: Float64) -> Bool:
-    """Return which whole sections of successive blocks are as steady as noise."""
+    """Return which complete sections of successive blocks are as steady as noise."""
     sections = blocks[: len(blocks) - len(blocks) % SECTION_BLOCKS, :-1]
     levels = decibels(sections.reshape(-1, SECTION_BLOCKS, sections.shape[1]))
     are_steady: Bool = levels.std(axis=1).mean(axis=1) < _STEADY_DB
@@ -251,7 +252,7 @@ def _low(blocks: Float64, share: float = _SHARE) -> Float64:
 
 
 def _block_means(frames: Float64, count: int) -> Float64:
-    """Average frames in `count` blocks, in an order of summation that does not depend on it."""
+    """Average frames in `count` blocks; the order of summation does not depend on `count`."""
     blocks = frames[: count * BLOCK_FRAMES].reshape(count, BLOCK_FRAMES, frames.shape[1])
     total = blocks[:, 0].copy()
     for place in range(1, BLOCK_FRAMES):

@@ -24,7 +24,7 @@ SHAPE_NAMES = tuple(
 _WIDTH = len(FEATURE_NAMES)
 _EDGES = np.array([3, 13, 25, 50, 100, 200, 400])  # bins of 20 Hz: 60, 260, 500 Hz, 1 … 8 kHz
 _FLOOR = 1e-9  # power; a full-scale sine has 1
-_DIGITS = 11  # binary, as of half precision, in which models know what they have learned from
+_DIGITS = 11  # binary digits of half precision, in which models store training features
 _LEAST_EXPONENTS = np.full(_WIDTH + len(SHAPE_NAMES), -13, np.int32)
 np.put(_LEAST_EXPONENTS, [ENERGY, FLUX], -40)
 
@@ -41,10 +41,10 @@ class HomeExtractor(FeatureExtractor):
 
 
 def shape(power: Float64) -> Float64:
-    """Compute how the power of each band is spread over its bins.
+    """Compute the spread of each band's power over its bins.
 
-    Peakiness is the highest bin over the mean, flatness the geometric mean over the mean. They tell
-    voices, music and rings from water, engines and noise.
+    Peakiness is the highest bin over the mean, flatness the geometric mean over the mean. They
+    distinguish voices, music and rings from water, engines and noise.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ def shape(power: Float64) -> Float64:
 def rounded(values: Float32) -> Float32:
     """Round features to 11 binary digits, as half precision does.
 
-    No classifier feels less, and noise in the last digits does not compress. Rounded values also
-    agree where processors compute the exact ones differently in the last place.
+    No classifier needs more digits, and noise in the last digits does not compress. Rounded values
+    also agree across processors whose exact values differ in the last place.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ def rounded(values: Float32) -> Float32:
     Returns
     -------
     np.ndarray [shape=(n, 33)], float32
-        Like half precision they have no digits behind the 24th of the point, but for energy and
-        flux, which are small.
+        As in half precision, no digits after the 24th binary place, except for energy and flux,
+        which are small.
     """
     exponent = np.maximum(np.frexp(values)[1], _LEAST_EXPONENTS)
     return np.ldexp(np.rint(np.ldexp(values, _DIGITS - exponent)), exponent - _DIGITS)
@@ -93,7 +93,7 @@ _OF_SILENCE = np.array([*_PEAKINESS, *_FLATNESS])
 
 
 def band_powers(features: Float32) -> Float64:
-    """Compute the powers of the mel bands and of the frame, as those of `auros21`.
+    """Compute the powers of the mel bands and of the frame, as in `auros21`.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def band_powers(features: Float32) -> Float64:
 
 
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
-    """Compute the values behind the inputs `above_floor` from the features of each frame.
+    """Compute the values for the inputs `above_floor` from the features of each frame.
 
     Parameters
     ----------
@@ -118,8 +118,8 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     Returns
     -------
     np.ndarray [shape=(n, 65)], float64
-        Those of `auros21`, then peakiness and flatness, which are the nearer to those of silence
-        the less of the energy is above the floor.
+        The values of `auros21`, then peakiness and flatness, which are closer to their values in
+        silence the smaller the share of energy above the floor.
 
     Raises
     ------

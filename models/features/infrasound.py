@@ -1,8 +1,8 @@
 """A filter of offsets, drifts and rumbles below hearing, for frames in which they stand out.
 
-What is below hearing sets the floor of the room and hides the sound above it. Polynomials follow it
-through each frame on its own, so that a step leaves no trace behind it. Frames in which it does not
-stand out stay as they are, to the last bit: feature sets and models know them so.
+Infrasound raises the floor of the room and hides the sound above it. Polynomials are fitted to each
+frame separately, so a step leaves no trace in later frames. Frames in which infrasound does not
+stand out stay unchanged to the last bit, as feature sets and models expect.
 """
 
 from functools import cache
@@ -13,36 +13,36 @@ from hearthlog.models.batch_invariant import rowwise_matmul
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
-_TERMS = 5  # of the polynomials: 12 Hz falls by 40 dB, 50 Hz by 1 dB
-_PROBES = (8.0, 16.0)  # Hz, beside 0: each hears some 20 Hz around it
+_TERMS = 5  # number of terms of the polynomials: attenuates 12 Hz by 40 dB, 50 Hz by 1 dB
+_PROBES = (8.0, 16.0)  # Hz, in addition to 0: each covers about 20 Hz around it
 _LEAST_POWER = 10 ** (-65 / 10)
-_STANDS_OUT = 4.0  # times the power of the rest of a frame
-_IS_PLAIN = 16.0  # in the first frame, before which nothing is known
-_WINDOW, _MOST = 20, 10  # frames: of a second, half; a thump is shorter
+_STANDS_OUT = 4.0  # relative to the power of the rest of a frame
+_IS_PLAIN = 16.0  # the same in the first frame, without history
+_WINDOW, _MOST = 20, 10  # frames: half of a second; a thump is shorter
 _HELD = 200  # frames: ten seconds of speech or music may hide it
-_STEPS = 1 << 15  # to 1: samples of 16 bits remain such
+_STEPS = 1 << 15  # per 1: 16-bit samples stay 16-bit
 _TINY = 1e-20
 _LEAST_ENERGY = _LEAST_POWER * FRAME_SAMPLES
-_ROUNDING = 1e-3  # of the energy of a frame: more than float32 loses of it
-_MOST_GAIN = 1.1  # more than probes find of what the polynomials have of two frames
+_ROUNDING = 1e-3  # share of the energy of a frame: above the rounding error of float32
+_MOST_GAIN = 1.1  # upper bound of the power by probes, relative to the polynomials of two frames
 
 
 class InfrasoundFilter:
-    """Takes what is below some 20 Hz out of one stream of frames, while it stands out.
+    """Removes infrasound below about 20 Hz from one stream of frames, while it stands out.
 
     The same frames give the same bits in blocks of any size.
 
     Attributes
     ----------
     is_active : bool
-        Whether something was taken out of the last frame.
+        Whether the last frame was changed.
     """
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self.is_active = False
         self._last: Float64 | None = None  # coefficients of the last frame
         self._offset, self._wave = _Persistence(), _Persistence()
@@ -58,7 +58,7 @@ class InfrasoundFilter:
         Returns
         -------
         np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            The array that was given, where nothing stands out.
+            The argument itself if nothing stands out.
         """
         if not len(frames):
             return frames
@@ -77,7 +77,7 @@ class InfrasoundFilter:
         return filtered
 
     def _may_stand_out(self, frames: Float32) -> Bool:
-        """Find the frames that need a closer look, by bounds that cost less than the powers."""
+        """Find the frames that need a closer look, by bounds that are cheaper than the powers."""
         with np.errstate(over="ignore", invalid="ignore"):
             energy = np.vecdot(frames, frames)
             coefficients = frames @ _rough_curves()
@@ -89,7 +89,7 @@ class InfrasoundFilter:
         return ~is_clear
 
     def _powers(self, frames: Float32, places: Indices) -> tuple[Float64, Float64, Float64]:
-        """Return the power below 20 Hz around the start of frames, that without offsets, the rest.
+        """Return the power below 20 Hz at frame starts, the same without offsets, and the rest.
 
         They are 0 where nothing stands out.
         """
@@ -114,7 +114,7 @@ class InfrasoundFilter:
 
 
 class _Persistence:
-    """Tells in which frames of a stream something stands out that lasts."""
+    """Finds the frames of a stream in which something persistent stands out."""
 
     def __init__(self) -> None:
         self._recent: Bool | None = None  # whether it stood out in the last frames
@@ -152,7 +152,7 @@ def _power(rows: Float64) -> Float64:
 
 @cache
 def _curves() -> Float64:
-    """Return orthonormal polynomials over a frame, one a column."""
+    """Return orthonormal polynomials over a frame, one per column."""
     place = (np.arange(FRAME_SAMPLES) + 0.5) / FRAME_SAMPLES * 2.0 - 1.0
     powers = np.polynomial.legendre.legvander(place, _TERMS - 1)
     curves: Float64 = powers / np.linalg.norm(powers, axis=0)
@@ -166,9 +166,9 @@ def _rough_curves() -> Float32:
 
 @cache
 def _probes() -> Float64:
-    """Return what maps the coefficients of two frames to their spectrum below 20 Hz.
+    """Return the map from the coefficients of two frames to their spectrum below 20 Hz.
 
-    The first half of the columns is of the whole, the second of all but the means of the frames.
+    The first half of the columns covers everything, the second half excludes the frame means.
     """
     count = 2 * FRAME_SAMPLES
     taper = np.hanning(count + 2)[1:-1]

@@ -1,4 +1,4 @@
-"""The feature sets that are installed."""
+"""Lookup of installed feature sets."""
 
 from hearthlog.models.embedding.networks import network_folders
 from hearthlog.models.errors import ModelError
@@ -18,17 +18,17 @@ FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:
-    """Return a feature set by its name.
+    """Return a feature set by name.
 
     Parameters
     ----------
     name : str
-        Such as "home33"; of ours, of another distribution, or of a network that has a card.
+        Such as "home33": built in, from another distribution, or a network with a card.
 
     Raises
     ------
     ModelError
-        If there is none of this name, or it cannot be imported, or its card says what cannot be.
+        If there is no such feature set, it cannot be imported, or its card is invalid.
     """
     if is_network(name):
         return network_features(name)
@@ -43,11 +43,11 @@ def feature_set(name: str = DEFAULT.name) -> FeatureSet:
 
 
 def is_network(name: str) -> bool:
-    """Tell whether a name is that of a network, and not of a feature set that is installed."""
+    """Return whether a name is a network's, not an installed feature set's."""
     return not FEATURE_SETS.has(name) and has_card(name)
 
 
 def entries_of(features: FeatureSet) -> dict[str, str]:
-    """Return what the metadata record of a log says of its feature set."""
+    """Return the entries about the feature set in the metadata record of a log."""
     source = "" if features.digest else FEATURE_SETS.distribution(features.name)
     return feature_entries(features.name, features.version, features.digest, source)

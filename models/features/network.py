@@ -1,4 +1,4 @@
-"""Feature sets of networks that the user brings: an ONNX file, and a card beside it."""
+"""Feature sets from user-supplied networks: an ONNX file, and a card next to it."""
 
 import hashlib
 import json
@@ -29,8 +29,8 @@ INPUTS = "embedding"
 MOST_VALUES = 4096
 _NAME = re.compile("[a-z][a-z0-9_-]{0,63}")
 _CARD, _NETWORK = ".toml", ".onnx"
-_SIZE_LIMIT = 512 << 20  # the largest of the field have 350 MB
-_LONGEST = int(2.5 * SAMPLE_RATE)  # samples that a label may take
+_SIZE_LIMIT = 512 << 20  # the largest networks of the field have 350 MB
+_LONGEST = int(2.5 * SAMPLE_RATE)  # samples in the window of a label, at most
 _DIGEST = "sha256"
 
 _Name = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f]{1,64}$")]
@@ -52,14 +52,14 @@ class _Content(BaseModel):
 
 @dataclass(frozen=True)
 class NetworkCard:
-    """What a card says.
+    """The content of a card.
 
     Attributes
     ----------
     window, hop : int
-        Samples at 16 kHz that it is given at once, and from one time to the next.
+        Samples at 16 kHz of one input, and between successive inputs.
     input, output : str
-        Names in the network; empty for its only one.
+        Names in the network; empty for its only input or output.
     """
 
     path: Path
@@ -78,7 +78,7 @@ class NetworkCard:
 
     @property
     def window_frames(self) -> int:
-        """Frames at whose end there is a window of the network that lies in them as a whole."""
+        """Smallest number of frames that always ends with a complete window of the network."""
         return -(-self._reach // FRAME_SAMPLES)
 
     @property
@@ -87,35 +87,35 @@ class NetworkCard:
 
     @property
     def version(self) -> int:
-        """A number of what shapes the values besides the network."""
+        """A number derived from the settings, other than the network, that affect the values."""
         shaping = [self.sample_rate, self.window, self.hop, len(self.names)]
         text = json.dumps([*shaping, self.input, self.output])
         return 1 + zlib.crc32(text.encode()) % ((1 << 31) - 1)
 
 
 def card_names() -> list[str]:
-    """Return the names of all networks that have a card, in alphabetical order."""
+    """Return the names of all networks with a card, in alphabetical order."""
     names = set()
     for folder in network_folders():
         try:
             names |= {path.stem for path in folder.glob("*" + _CARD)}
-        except OSError:  # such as a home that a service must not see
+        except OSError:  # such as a home folder hidden from a service
             continue
     return sorted(filter(_NAME.fullmatch, names))
 
 
 def has_card(name: str) -> bool:
-    """Tell whether there is a card of a name."""
+    """Return whether there is a card of this name."""
     return bool(_NAME.fullmatch(name)) and os.path.lexists(find_card(name))
 
 
 def find_card(name: str) -> Path:
-    """Return the card of a name.
+    """Return the card of a network.
 
     Returns
     -------
     Path
-        The first in the folders of networks; where there is none, the place for it.
+        The first match in the folders of networks; without a match, the path for a new card.
     """
     places = [folder / (name + _CARD) for folder in network_folders()]
     return next(filter(os.path.lexists, places), places[0])
@@ -127,12 +127,12 @@ def read_card(path: Path) -> NetworkCard:
     Parameters
     ----------
     path : Path
-        A file `NAME.toml`; the network is `NAME.onnx` beside it, and is not opened.
+        A file `NAME.toml`; the network is `NAME.onnx` next to it, and is not opened.
 
     Raises
     ------
     ModelError
-        If the card cannot be read, or says what cannot be.
+        If the card cannot be read or is invalid.
     """
     content = read_toml(path, "card of a network", ModelError)
     network = path.with_suffix(_NETWORK)
@@ -160,9 +160,9 @@ def read_card(path: Path) -> NetworkCard:
 
 
 def read_network(path: Path) -> bytes:
-    """Read the file of a network, of 512 MB at most.
+    """Read the file of a network, at most 512 MB.
 
-    Raise `ModelError` if there is none, it is larger, or cannot be read.
+    Raise `ModelError` if the file is missing, larger, or cannot be read.
     """
     return read_whole(path, "network", _SIZE_LIMIT, ModelError)
 
@@ -204,8 +204,8 @@ class Network:
     Raises
     ------
     ModelError
-        If the file is not the network of the card, or no network that takes and gives what the card
-        says, or if onnxruntime is not installed.
+        If the file is not the network of the card, its input or output contradicts the card, or
+        onnxruntime is not installed.
     """
 
     def __init__(self, card: NetworkCard) -> None:
@@ -231,8 +231,8 @@ class Network:
         Returns
         -------
         np.ndarray [shape=(width,)], float32
-            In half precision; the mean where the network gives several. What is not finite is 0.
-            That of silence where the network fails, with a `HearthlogWarning`.
+            In half precision; the mean if the network gives several. Non-finite values are 0. The
+            embedding of silence if the network fails, with a `HearthlogWarning`.
         """
         try:
             (values,) = self._model.run(self._resampled(window), [self._output])
@@ -252,7 +252,7 @@ class Network:
         return resampled
 
     def _tried(self) -> Float32:
-        """Try it with noise and with silence; embed the silence."""
+        """Run the network on noise and on silence; return the embedding of silence."""
         noise = np.random.default_rng(_SOUND_SEED).uniform(-1.0, 1.0, self._card.window)
         windows = [
             self._resampled(window.astype(np.float32))
@@ -279,9 +279,9 @@ class Network:
 
 @lru_cache(maxsize=4)
 def load_network(card: NetworkCard) -> Network:
-    """Load a network once, however many extractors are made.
+    """Load a network once for all extractors.
 
-    Raise `ModelError` as `Network`.
+    Raise `ModelError` as `Network` does.
     """
     return Network(card)
 
@@ -305,11 +305,10 @@ _FLOOR = 1e-10  # -100 dBFS
 class NetworkExtractor:
     """Features of one stream of frames.
 
-    Windows of the network end every hop after the start or the last restart; what was before that
-    is silence to it. They are given to it one by one, so that blocks of any size give the same
-    bits.
+    Windows of the network end every hop after the start or the last restart; earlier samples count
+    as silence. The network receives windows one by one, so blocks of any size give the same bits.
 
-    Raise `ModelError` if the network is not that of the card, or not what the card says.
+    Raise `ModelError` if the network is not the network of the card, or contradicts the card.
     """
 
     def __init__(self, card: NetworkCard) -> None:
@@ -319,7 +318,7 @@ class NetworkExtractor:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self._recent = np.zeros(self._window, np.float32)  # samples, up to the end of the last hop
         self._last = self._of_silence
 
@@ -329,8 +328,7 @@ class NetworkExtractor:
         Parameters
         ----------
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            Samples in full scale; those that are not finite count as 0, those beyond it are
-            clipped.
+            Samples, -1 to 1; non-finite samples count as 0, samples out of range are clipped.
 
         Returns
         -------
@@ -363,12 +361,12 @@ def _levels(samples: Float32) -> Float32:
 
 @dataclass(frozen=True)
 class LastEmbedding:
-    """The embedding that the last frame of a window has, as `Inputs`.
+    """The embedding at the last frame of a window, as `Inputs`.
 
     Attributes
     ----------
     window_frames : int
-        So many that the sound behind that embedding lies in the window as a whole.
+        Large enough for the complete sound of that embedding to lie in the window.
     """
 
     window_frames: int
@@ -386,7 +384,7 @@ class LastEmbedding:
         ----------
         windows : np.ndarray [shape=(n, window_frames, 1 + width)], float32
         floors : np.ndarray [shape=(n, b)], float64, optional
-            Not used.
+            Unused.
 
         Returns
         -------
@@ -404,8 +402,8 @@ class LastEmbeddingStream:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
-        self._lacking = self._inputs.window_frames - 1  # frames before the first whole window
+        """Reset the state; the next frame does not follow the previous frame."""
+        self._lacking = self._inputs.window_frames - 1  # frames before the first complete window
 
     def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
         """Return the inputs at successive frames.
@@ -414,12 +412,12 @@ class LastEmbeddingStream:
         ----------
         features : np.ndarray [shape=(n, 1 + width)], float32
         floors : np.ndarray [shape=(n, b)], float64, optional
-            Not used.
+            Unused.
 
         Returns
         -------
         np.ndarray [shape=(m, width)], float32
-            At the last m of these frames: those with a whole window since the start or the last
+            At the last m of these frames: frames with a complete window since the start or the last
             restart.
         """
         del floors
@@ -431,7 +429,7 @@ class LastEmbeddingStream:
 def network_features(name: str) -> FeatureSet:
     """Return the feature set of a network.
 
-    Raise `ModelError` if the card cannot be read, or says what cannot be.
+    Raise `ModelError` if the card cannot be read or is invalid.
     """
     return _features(read_card(find_card(name)))
 
@@ -458,6 +456,6 @@ def _power(features: NDArray[Any]) -> NDArray[Any]:
 
 
 def _band_powers(features: Float32) -> Float64:
-    """Return the power of the only band, and that of the frame, which is the same."""
+    """Return the power of the only band, and the identical power of the frame."""
     power: Float64 = _power(features)
     return np.stack([power, power], axis=1)

@@ -23,18 +23,18 @@ class InputStream(Protocol):
         ----------
         features : np.ndarray [shape=(n, d)], float32
         floors : np.ndarray [shape=(n, b)], float64, optional
-            Floor of the room at each frame, as of `FloorTracker`; inputs that need it raise
+            Floor of the room at each frame, from `FloorTracker`; inputs that need it raise
             TypeError without.
 
         Returns
         -------
         np.ndarray [shape=(m, width)], float32
-            At the last m of these frames: those with a whole window since the start or the last
+            At the last m of these frames: frames with a complete window since the start or the last
             restart. The same frames give the same bits in blocks of any size.
         """
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
 
 
 class Inputs(Protocol):
@@ -46,7 +46,7 @@ class Inputs(Protocol):
         Number of inputs.
     window_frames : int
     needs_floor : bool
-        Whether they depend on the floor of the room; then a window has a second at most.
+        Whether the inputs depend on the floor of the room; then a window is at most a second.
     """
 
     @property
@@ -59,7 +59,7 @@ class Inputs(Protocol):
 
     @property
     def needs_floor(self) -> bool:
-        """Whether they depend on the floor of the room."""
+        """Whether the inputs depend on the floor of the room."""
 
     def stream(self) -> InputStream:
         """Begin a stream."""
@@ -77,7 +77,7 @@ class Inputs(Protocol):
         Returns
         -------
         np.ndarray [shape=(n, width)], float32
-            The same bits as of a stream.
+            The same bits as from a stream.
         """
 
 
@@ -87,7 +87,7 @@ def of_segments(inputs: Inputs, segments: Float32, floors: Float64 | None = None
     Parameters
     ----------
     segments : np.ndarray [shape=(n, f, d)], float32
-        Features of successive frames, at least a window.
+        Features of successive frames, at least one window.
     floors : np.ndarray [shape=(n, b)], float64, optional
         Floor of the room in each segment.
 
@@ -107,13 +107,13 @@ def of_segments(inputs: Inputs, segments: Float32, floors: Float64 | None = None
 
 
 def window_places(segment_frames: int, window_frames: int) -> range:
-    """Return where the windows of a segment begin: 0.3 s from each other."""
+    """Return the starts of the windows of a segment, 0.3 s apart."""
     return range(0, segment_frames - window_frames + 1, STEP_FRAMES)
 
 
 @dataclass(frozen=True)
 class WindowStatistics:
-    """Mean and standard deviation of a window, of its features or of values made of them.
+    """Mean and standard deviation over a window of features, or of values derived from them.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class WindowStatistics:
         return inputs
 
     def values_of(self, features: Float32, floors: Float64 | None) -> NDArray[Any]:
-        """Return the values of each frame, by its floor if they need it."""
+        """Return the values of each frame, using its floor if needed."""
         return self.values(features, floors) if self.needs_floor else self.values(features)
 
     def reduce(
@@ -178,10 +178,10 @@ class WindowStatistics:
         Parameters
         ----------
         frames : sequence of np.ndarray [shape=(n, d')]
-            Values of the first frames of all windows, of their second frames and so on, as of
+            Values of the first frames of all windows, of their second frames and so on, from
             `successive`.
         changes : sequence of np.ndarray [shape=(n, d')]
-            The same of the absolute differences from frame to frame; not used without `changes`.
+            Absolute differences from frame to frame, likewise; unused without `changes`.
         out : np.ndarray [shape=(n, width)], float32
             Overwritten: means, standard deviations and, with `changes`, mean absolute differences.
         """
@@ -199,7 +199,7 @@ class StatisticsStream:
         self._values: NDArray[Any] | None = None  # of the last frames, one less than a window
 
     def restart(self) -> None:
-        """Forget the past: the next frame does not follow the last one."""
+        """Reset the state; the next frame does not follow the previous frame."""
         self._values = None
 
     def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
@@ -209,13 +209,13 @@ class StatisticsStream:
         ----------
         features : np.ndarray [shape=(n, d)], float32
         floors : np.ndarray [shape=(n, b)], float64, optional
-            Floor of the room at each frame, as of `FloorTracker`; inputs that need it raise
+            Floor of the room at each frame, from `FloorTracker`; inputs that need it raise
             TypeError without.
 
         Returns
         -------
         np.ndarray [shape=(m, width)], float32
-            At the last m of these frames: those with a whole window since the start or the last
+            At the last m of these frames: frames with a complete window since the start or the last
             restart.
         """
         kind, length = self._inputs, self._inputs.window_frames
@@ -254,12 +254,12 @@ def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
 def mean_and_std(frames: Sequence[NDArray[Any]]) -> tuple[Float64, Float64]:
     """Compute mean and standard deviation of many windows at once, in float64.
 
-    The sums go from frame to frame for all windows, so that they stay in the cache.
+    All windows are summed frame by frame, so the sums stay in the cache.
 
     Parameters
     ----------
     frames : sequence of np.ndarray [shape=(n, d)]
-        As of `successive`.
+        From `successive`.
 
     Returns
     -------

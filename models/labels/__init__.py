@@ -1,1 +1,1 @@
-"""From probabilities to labels: smoothing and segments."""
+"""Smoothing of probabilities, and segments."""

@@ -1,4 +1,4 @@
-"""From the features of one stream to labels and segments, and to columns of their messages."""
+"""Labels and segments from the features of one stream, and the columns of their messages."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -24,7 +24,7 @@ from hearthlog.schemas.messages.topics import EmbeddingSource
 
 
 class FrameLabels(NamedTuple):
-    """What a classifier says of successive frames, each by the window around it.
+    """Classifier results of successive frames, each from the window around the frame.
 
     Attributes
     ----------
@@ -35,15 +35,15 @@ class FrameLabels(NamedTuple):
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
     known_at : np.ndarray [shape=(n,)], int64
-        Starts of the last frames of the windows.
+        Starts of the last frames of the windows, which complete the labels.
     probabilities : np.ndarray [shape=(n, C)], float32
     by_features : np.ndarray [shape=(n, C)], float32
-        The same by the features alone: what is private is decided by them.
+        Probabilities from the features alone, which the privacy filter uses.
     novelty : np.ndarray [shape=(n,)], float32
-        From 0 to 1; NaN where the classifier has none.
+        From 0 to 1; NaN if the classifier computes none.
     by_names : np.ndarray [shape=(n, C)], float64, or None
-        Highest logit that a network gives to the names of each class around the frame; NaN where
-        there is no embedding, or the class has no names.
+        Highest network logit of the names of each class around the frame; NaN without an embedding,
+        or for a class without names.
     """
 
     classes: tuple[str, ...]
@@ -58,21 +58,21 @@ class FrameLabels(NamedTuple):
     by_names: Float64 | None = None
 
     def columns(self, microphone: str) -> dict[str, Column]:
-        """Return the fields of one `AudioLabel` for each frame."""
+        """Return the fields of one `AudioLabel` per frame."""
         return label_columns(self._asdict(), self.classes, microphone)
 
 
 def label_columns(
     labels: Mapping[str, Any] | NDArray[np.void], classes: Sequence[str], microphone: str
 ) -> dict[str, Column]:
-    """Return the fields of one `AudioLabel` for each frame.
+    """Return the fields of one `AudioLabel` per frame.
 
     Parameters
     ----------
     labels : mapping of str to array, or structured array
-        With the names `frames`, `stamps`, `probabilities` and `novelty` of `FrameLabels`.
+        With the fields `frames`, `stamps`, `probabilities` and `novelty` of `FrameLabels`.
     classes : sequence of str
-        Names behind the columns of the probabilities.
+        Names of the columns of the probabilities.
     """
     probabilities = labels["probabilities"]
     best = probabilities.argmax(axis=1)
@@ -88,23 +88,19 @@ def label_columns(
 
 
 class Labeller:
-    """Labels one stream of frames, and divides it into segments.
+    """Labels one stream of frames and divides the stream into segments.
 
     Parameters
     ----------
-    classifier : Classifier
     microphone : str
-        Name of the one that is heard; the directions of an array that the model knows count.
+        Name of the microphone; selects the direction weights of the model.
     embedding : EmbeddingSource, optional
-        Of the embeddings; those of another network or projection than that of the model do not
-        count.
+        Source of the embeddings; ignored unless network and projection match the model.
 
     Attributes
     ----------
     classes : tuple of str
-        Names behind the columns of the probabilities.
-    timing : LabelTiming
-    segmenter : Segmenter
+        Names of the columns of the probabilities.
     """
 
     def __init__(
@@ -128,26 +124,26 @@ class Labeller:
             self._embedded = EmbeddingEvidence(heads, len(self.classes))
             self._named = EmbeddingEvidence(logits, len(self.classes))
         self._window_evidence = [one for one in (self._embedded, self._named) if one is not None]
-        self._pending: SegmenterInput | None = None  # that embeddings to come say something of
-        self._pending_evidence: Float64 | None = None  # of directions, for them
+        self._pending: SegmenterInput | None = None  # frames that wait for embeddings
+        self._pending_evidence: Float64 | None = None  # direction evidence of the pending frames
         self._inputs_converged = (
             not self.timing.needs_floor and self._evidence is None and self._embedded is None
         )
-        self._first_label = self._first_segment = 0  # numbers of frames
+        self._first_label = self._first_segment = 0  # frame numbers
 
     @property
     def states_converged(self) -> bool:
-        """Whether frames before the first one would leave no trace in the states to come."""
+        """Whether the states to come are independent of frames before the first frame."""
         return self._inputs_converged and self.segmenter.states_converged
 
     @property
     def segments_converged(self) -> bool:
-        """Whether frames before the first one would leave no trace in the segments to come."""
+        """Whether the segments to come are independent of frames before the first frame."""
         return self._inputs_converged and self.segmenter.segments_converged
 
     @property
     def takes_auxiliary(self) -> bool:
-        """Whether directions or embeddings change its labels."""
+        """Whether directions or embeddings affect the labels."""
         return self._evidence is not None or self._embedded is not None
 
     def follow(  # noqa: PLR0913, PLR0917
@@ -159,22 +155,22 @@ class Labeller:
         unlabelled: int,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> None:
-        """Take the place of another labeller before a frame, with which segments begin.
+        """Take over from another labeller before a frame, at which segments begin.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
-            Of the last frames before it.
+            Of the last n frames before that frame.
         floors : np.ndarray [shape=(m, b)], float64, or None
-            At the last m of them, at most n; None if the feature set has no bands.
+            Floors at the last m of these frames, m <= n; None if the feature set has no bands.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of these frames in nanoseconds of UTC.
         frame : int
             Number of the frame.
         unlabelled : int
-            Number of the first frame that the other one has not labelled.
+            Number of the first frame not labelled by the other labeller.
         auxiliary : Auxiliary, optional
-            Of the last second before the frame, or more.
+            Of at least the last second before the frame.
         """
         self._first_label, self._first_segment = unlabelled, frame
         powers, known = self._classifier.feature_set.band_powers, None
@@ -202,21 +198,21 @@ class Labeller:
         ----------
         features : np.ndarray [shape=(n, d)], float32
         floors : Floors or None
-            At the last of these frames, before which none is labelled. None if the feature set has
-            no bands.
+            Floors at the last of these frames; frames without a floor are not labelled. None if the
+            feature set has no bands.
         first : int
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         auxiliary : Auxiliary, optional
-            That become known with these frames.
+            Directions and embeddings that become available with these frames.
 
         Returns
         -------
         labels : FrameLabels
-            Of the frames that these frames complete the windows of, and the embeddings.
+            Of the frames whose windows and embeddings are now complete.
         segments : list of Segment
-            Those whose end these frames decide.
+            Segments whose end is decided by these frames.
         """
         self._converge(floors, first)
         window = self._advance(features, floors if self.timing.needs_floor else None, stamps)
@@ -242,7 +238,7 @@ class Labeller:
             labelled, novelty = self._mixed(by_features, end - len(by_features.stamps), evidence)
         count, first = len(labelled.stamps), end - len(labelled.stamps)
         by_names = None if self._named is None else self._named.highest_at(first, count)
-        again = max(self._first_label - first, 0)  # frames that were labelled before
+        again = max(self._first_label - first, 0)  # frames already labelled
         labels = FrameLabels(
             self.classes,
             np.arange(first, first + count)[again:],
@@ -259,17 +255,17 @@ class Labeller:
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments of a sound that ends, and begin anew.
+        """Return the remaining segments at the end of the sound, and reset.
 
         Parameters
         ----------
         end : int
-            End of the sound, in nanoseconds of UTC.
+            End of the sound in nanoseconds of UTC.
 
         Returns
         -------
         list of Segment
-            In the order of time.
+            In order of time.
         """
         if self._evidence is not None:
             self._evidence.restart()
@@ -280,7 +276,7 @@ class Labeller:
         return self.segmenter.close(end)
 
     def _converge(self, floors: Floors | None, first: int) -> None:
-        """Note from which frame on the inputs do not depend on sound before the first frame."""
+        """Record the frame from which the inputs do not depend on sound before the first frame."""
         if self._inputs_converged or (
             self.timing.needs_floor and not (floors and floors.converged)
         ):
@@ -293,7 +289,7 @@ class Labeller:
     def _complete(
         self, frames: SegmenterInput, evidence: Float64 | None
     ) -> tuple[SegmenterInput, Float64 | None]:
-        """Add frames labelled by their features; return those whose embeddings are all known."""
+        """Add frames labelled by features; return the frames whose embeddings are complete."""
         ahead = self.timing.ahead
         pending = frames if self._pending is None else self._pending.followed_by(frames)
         if evidence is not None and self._pending_evidence is not None:
@@ -308,7 +304,7 @@ class Labeller:
     def _mixed(
         self, frames: SegmenterInput, first: int, evidence: Float64 | None
     ) -> tuple[SegmenterInput, Float32]:
-        """Let embeddings say what the sound of frames is; return also its novelty."""
+        """Combine the feature probabilities of frames with embeddings; return also the novelty."""
         count = len(frames.stamps)
         by_heads = np.full((count, len(self.classes)), np.nan)
         if self._embedded is not None:
@@ -317,7 +313,7 @@ class Labeller:
         return frames._replace(probabilities=probabilities), novelty
 
     def _advance(self, features: Float32, floors: Floors | None, stamps: Int64) -> "_Frames":
-        """Return the frames of the windows that are complete now, or will be."""
+        """Return the frames of the windows that are complete now or pending."""
         known = len(features) if floors is None else len(floors.powers)
         features, stamps = features[len(features) - known :], stamps[len(stamps) - known :]
         frames = _Frames(features, self._classifier.feature_set.power(features), stamps)
@@ -331,7 +327,7 @@ class Labeller:
     def _classify(
         self, frames: "_Frames", count: int, room: Float64 | None, evidence: Float64 | None
     ) -> tuple[Float32, Float32]:
-        """Classify so many windows; those that are not above the room by the gate are silence."""
+        """Classify `count` windows; windows below the gate above the room floor are silence."""
         length, gate = self.timing.window_frames, self._classifier.gate
         loud = np.ones(count, bool)
         if gate and room is not None and frames.bands is not None and count:
@@ -347,7 +343,7 @@ class Labeller:
         return probabilities, novelty
 
     def _inputs_of(self, frames: "_Frames", wanted: Bool) -> Float32:
-        """Compute the inputs of some of the windows, from the frames that lie in one of them."""
+        """Compute the inputs of the wanted windows, from only the frames inside those windows."""
         within = np.zeros(len(frames.stamps), bool)
         for place in range(self.timing.window_frames):
             within[place : place + len(wanted)] |= wanted
@@ -358,7 +354,7 @@ class Labeller:
 
 
 def _logits_of_names(values: Int8, source: EmbeddingSource, classes: Sequence[str]) -> Float64:
-    """Return the logit of the names of each class in windows; NaN for a class without names."""
+    """Return the highest logit of each class's names per window; NaN for a class without names."""
     logits = np.full((len(values), len(classes)), np.nan)
     for number, name in enumerate(classes):
         if name in source.names:
@@ -368,7 +364,7 @@ def _logits_of_names(values: Int8, source: EmbeddingSource, classes: Sequence[st
 
 
 class _Frames(NamedTuple):
-    """Successive frames, with the floor at each and the powers of its bands where they count."""
+    """Successive frames, with the floor and band powers at each frame if the model needs them."""
 
     features: Float32
     powers: NDArray[Any]
@@ -403,7 +399,7 @@ def _both(before: Float64 | None, after: Float64 | None) -> Float64 | None:
 def segment_columns(
     segments: Sequence[Segment], classes: Sequence[str], microphone: str
 ) -> dict[str, Column]:
-    """Return the fields of one `AudioSegment` for each segment."""
+    """Return the fields of one `AudioSegment` per segment."""
     starts = np.array([segment.start for segment in segments], np.int64)
     ends = np.array([segment.end for segment in segments], np.int64)
     return {

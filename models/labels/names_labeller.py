@@ -1,9 +1,9 @@
-"""From the embeddings of one stream to labels and segments, by the names of a network alone.
+"""Labels and segments from the embeddings of one stream, by the names of a network alone.
 
-A sound begins with a window whose logged value is above the threshold of a name, and goes on while
-windows at most a second apart are above it or a little below; it is labelled once enough windows
-were above. That is how `hearthlog.models.embedding.sound_names` finds sounds, here with a bounded
-delay and one name for each frame.
+A sound begins with a window whose logged value is above the threshold of a name. The sound
+continues while windows at most a second apart are above the threshold or slightly below, and is
+labelled once enough windows were above. `hearthlog.models.embedding.sound_names` uses the same
+rule; here the delay is bounded and each frame has one name.
 """
 
 import numpy as np
@@ -20,14 +20,14 @@ from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
 _PAUSE = 2  # hops between windows of one sound, at most
-_DONE = -1  # in place of a window: all has converged
-_STEPS = 1 << 16  # of a probability, as of the classifiers
+_DONE = -1  # replaces a window number: everything has converged
+_STEPS = 1 << 16  # steps of a probability, as in the classifiers
 
 
 class NamesLabeller:
-    """Labels one stream of frames by names; as `Labeller` for other models.
+    """Labels one stream of frames by names; the counterpart of `Labeller`.
 
-    Where the embeddings are not those of the model's network and projection, all is silence.
+    All frames are silence if network or projection of the embeddings differ from the model's.
     """
 
     def __init__(self, classifier: Classifier, embedding: EmbeddingSource | None = None) -> None:
@@ -38,7 +38,7 @@ class NamesLabeller:
         self.segmenter = Segmenter(classifier.classes, classifier.smoothing, classifier.transitions)
         self._calibrated_elsewhere = classifier.calibrated_elsewhere
         rules = classifier.names.rules if self.takes_auxiliary else {}
-        # Of names at once the first counts: the shorter a sound is, the less would be left of it.
+        # Of simultaneous names the first wins: the shorter a sound, the less of it would remain.
         names = sorted(rules, key=lambda name: rules[name].seconds)
         own = [rules[name] for name in names]
         self._labels = np.array([self.classes.index(name) for name in names], np.intp)
@@ -55,27 +55,27 @@ class NamesLabeller:
 
     def _restart(self) -> None:
         count = len(self._labels)
-        self._stamps = np.empty(0, np.int64)  # of the frames without a label
+        self._stamps = np.empty(0, np.int64)  # of the unlabelled frames
         self._end: int | None = None  # number of the next frame
-        self._window = 0  # number of the next window: a tenth of that of its first frame
-        self._open = np.zeros(count, bool)  # whether a sound goes on
-        self._first = np.zeros(count, np.int64)  # its first window, and its last one so far
+        self._window = 0  # number of the next window: a tenth of the number of its first frame
+        self._open = np.zeros(count, bool)  # whether a sound continues
+        self._first = np.zeros(count, np.int64)  # first and latest window of the sound
         self._last = np.zeros(count, np.int64)
-        self._above = np.zeros(count, np.int64)  # windows above the threshold
-        # Whether the last windows are within sounds that are labelled.
+        self._above = np.zeros(count, np.int64)  # number of windows above the threshold
+        # Whether the last windows lie in labelled sounds.
         self._named = np.zeros((self._later + 1, count), bool)
-        self._below = np.zeros(count, np.int64)  # windows with which no sound goes on, in a row
-        self._known = np.zeros(count, bool)  # whether earlier windows leave no trace in a sound
-        self._converged: int | None = None  # window behind which they leave none in any
+        self._below = np.zeros(count, np.int64)  # successive windows without a continuing sound
+        self._known = np.zeros(count, bool)  # whether a sound is independent of earlier windows
+        self._converged: int | None = None  # from this window on, all sounds are
 
     @property
     def states_converged(self) -> bool:
-        """Whether frames before the first one would leave no trace in the states to come."""
+        """Whether the states to come are independent of frames before the first frame."""
         return self._converged == _DONE and self.segmenter.states_converged
 
     @property
     def segments_converged(self) -> bool:
-        """Whether frames before the first one would leave no trace in the segments to come."""
+        """Whether the segments to come are independent of frames before the first frame."""
         return self._converged == _DONE and self.segmenter.segments_converged
 
     def follow(  # noqa: PLR0913, PLR0917
@@ -87,7 +87,7 @@ class NamesLabeller:
         unlabelled: int,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> None:
-        """Take the place of another labeller: what was heard before does not count."""
+        """Take over from another labeller; earlier sound is ignored."""
 
     def push(
         self,
@@ -127,19 +127,19 @@ class NamesLabeller:
         return labels, self._segments(labelled, end - len(known))
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments of a sound that ends, and begin anew.
+        """Return the remaining segments at the end of the sound, and reset.
 
         Parameters
         ----------
         end : int
-            End of the sound, in nanoseconds of UTC.
+            End of the sound in nanoseconds of UTC.
         """
         segments: list[Segment] = []
         count = len(self._stamps)
-        if self._end is not None and count:  # whose labels nobody waits for
+        if self._end is not None and count:  # only segments: these labels are not returned
             frames = np.arange(self._end - count, self._end)
             window = self._window - len(self._named)
-            nothing = np.zeros((1, len(self._labels)), bool)  # said by a window that is not whole
+            nothing = np.zeros((1, len(self._labels)), bool)  # an incomplete window has no names
             labelled = SegmenterInput(
                 self._probabilities(frames, window, np.concatenate([self._named, nothing])),
                 np.zeros(count),
@@ -153,10 +153,10 @@ class NamesLabeller:
         return segments
 
     def _add_windows(self, embeddings: Embeddings) -> tuple[int, Bool]:
-        """Add the windows that are complete now.
+        """Add the windows that are now complete.
 
-        Return which names each window has that the next labels speak of, and the number of the
-        first of these windows.
+        Return the names active in each window used by the next labels, and the number of the first
+        of these windows.
         """
         assert self._end is not None
         begin = self._window
@@ -180,7 +180,7 @@ class NamesLabeller:
         return first, named
 
     def _add(self, window: int, values: Int64) -> Bool:
-        """Add a window; return which sounds are labelled that go on with it."""
+        """Add a window; return the labelled sounds that continue in the window."""
         self._open &= window - self._last <= _PAUSE
         above, goes_on = values >= self._begins, values >= self._goes_on
         begins = above & ~self._open
@@ -198,7 +198,7 @@ class NamesLabeller:
         return heard
 
     def _probabilities(self, frames: Int64, window: int, named: Bool) -> Float32:
-        """Return the probabilities of frames, each by the window that has it in the middle."""
+        """Return the probabilities of frames, each from the window centred on the frame."""
         result = np.zeros((len(frames), len(self.classes)), np.float32)
         if not named.any() or not len(frames):
             result[:, self._silence] = 1.0
@@ -211,7 +211,7 @@ class NamesLabeller:
         return result
 
     def _segments(self, labelled: SegmenterInput, first: int) -> list[Segment]:
-        """Return the segments whose end frames decide, of which the first has a number."""
+        """Return the segments whose end is decided by frames; `first` is the first frame number."""
         segments: list[Segment] = []
         if self._converged not in {None, _DONE}:
             doubtful = (self._converged + 1) * HOP_FRAMES + MARGIN_FRAMES - first
@@ -227,7 +227,7 @@ class NamesLabeller:
 def labeller_of(
     classifier: Classifier, microphone: str = "", embedding: EmbeddingSource | None = None
 ) -> Labeller | NamesLabeller:
-    """Return what labels a stream of frames by a classifier."""
+    """Return the labeller for a stream of frames and a classifier."""
     if classifier.names is not None:
         return NamesLabeller(classifier, embedding)
     return Labeller(classifier, microphone, embedding)

@@ -1,4 +1,4 @@
-"""Segments from the probabilities of classes: runs of one state, with refined borders."""
+"""Segments from class probabilities: runs of one state with refined borders."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,20 +13,20 @@ from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 _QUIETEST = 1e-9  # power, -90 dBFS
-_LEAST_STEP = 1e-6  # dB; below it are errors of rounding
+_LEAST_STEP = 1e-6  # dB; smaller steps are rounding errors
 
 
 class Borders:
-    """Refines the states of one stream of frames, which come in pieces of any size.
+    """Refines the states of one stream of frames, in blocks of any size.
 
-    A border of silence is moved to the frame, within `reach` frames, that divides the level best
-    into two constants, by least squares. After that a state of fewer than `shortest` frames gives
-    way to the state before it.
+    A border of silence moves, within `reach` frames, to the frame that best divides the level into
+    two constants, by least squares. Then a state of fewer than `shortest` frames is replaced by the
+    state before it.
 
     Parameters
     ----------
     reach, shortest : int
-        Numbers of frames; 0 and 1 leave all as it is.
+        Numbers of frames; 0 and 1 disable the refinement.
     """
 
     def __init__(self, silence: int, reach: int, shortest: int) -> None:
@@ -37,14 +37,14 @@ class Borders:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the past: the next state does not follow the last one."""
+        """Reset the state; the next state does not follow the previous state."""
         self._states = np.empty(0, np.intp)
-        self._levels = np.empty(0)  # in dB, from the first of `_states` on
-        self._examined = 1  # changes before this place in `_states` have been moved
-        self._moved: list[tuple[int, int]] = []  # places of moved borders, and the states behind
-        self._before: int | None = None  # refined state at the first place
+        self._levels = np.empty(0)  # in dB, aligned with `_states`
+        self._examined = 1  # changes before this index of `_states` have been moved
+        self._moved: list[tuple[int, int]] = []  # indices of moved borders, and states after
+        self._before: int | None = None  # refined state at the first index
         self._held = np.empty(0, np.intp)  # moved states that may be too short
-        self._last: int | None = None  # last state that was given away
+        self._last: int | None = None  # last state returned
 
     def push(self, states: Indices, powers: Float64) -> Indices:
         """Add successive states and powers.
@@ -53,7 +53,8 @@ class Borders:
         ----------
         states : np.ndarray [shape=(n,)], intp
         powers : np.ndarray [shape=(m,)], float64
-            Mean squares of successive frames; there are never more states than powers so far.
+            Mean squares of successive frames; the total number of states never exceeds that of
+            powers.
 
         Returns
         -------
@@ -67,14 +68,14 @@ class Borders:
         return self._without_short(moved, self._shortest - 1)
 
     def close(self) -> Indices:
-        """Return the refined states of the remaining frames, and begin anew."""
+        """Return the refined states of the remaining frames, and reset."""
         end = len(self._states)
         states = self._without_short(self._move(end, end), 0)
         self.restart()
         return states
 
     def _move(self, end: int, final: int) -> Indices:
-        """Move the borders before `end`, and take away the states before `final`."""
+        """Move the borders before `end`, and remove the states before `final`."""
         states = self._states
         if not self._reach or not len(states):
             self._states, self._levels = states[:0], self._levels[len(states) :]
@@ -93,7 +94,7 @@ class Borders:
         return np.repeat(np.array(values, np.intp), np.diff([*places, final]))
 
     def _place(self, change: int, limit: int) -> int:
-        """Return the place of a border whose states change at a place, and next at `limit`."""
+        """Return the refined index of the border at `change`; the next change is at `limit`."""
         if self._silence not in self._states[change - 1 : change + 1]:
             return change
         last = self._moved[-1][0] if self._moved else -1
@@ -110,7 +111,7 @@ class Borders:
         return first + 1 + int(gain.argmax()) if gain.max() > _LEAST_STEP else change
 
     def _without_short(self, states: Indices, held: int) -> Indices:
-        """Add moved states; return all but the last `held`, too short ones replaced."""
+        """Add moved states; return all but the last `held`, with short states replaced."""
         states = np.concatenate([self._held, states])
         count = max(len(states) - held, 0)
         refined, self._held = states[:count].copy(), states[count:]
@@ -128,19 +129,19 @@ class Borders:
         return refined
 
 
-_UNITS = 1 << 30  # to 1: finer than what a float32 below 1 can tell
+_UNITS = 1 << 30  # to 1: finer than the resolution of a float32 below 1
 
 
 class StateRun(NamedTuple):
-    """Successive frames of one state, of which more may follow.
+    """Successive frames of one state; the run may continue.
 
     Attributes
     ----------
     start : int
-        Start of the first frame, in nanoseconds of UTC.
+        Start of the first frame in nanoseconds of UTC.
     confidence : int
-        Sum of the probabilities of the class, in units of 2**-30: whole numbers give the same sum
-        in any order.
+        Sum of the probabilities of the class in units of 2**-30: integer sums do not depend on
+        order.
     """
 
     label: int
@@ -149,12 +150,12 @@ class StateRun(NamedTuple):
     confidence: int
 
     def prepend(self, earlier: "StateRun | None") -> "StateRun":
-        """Join an earlier run to the start of this one.
+        """Prepend an earlier run to this run.
 
         Parameters
         ----------
         earlier : Run or None
-            Of the same label, ending where this run starts; None for none.
+            Run of the same label that ends where this run starts; None for none.
         """
         if earlier is None:
             return self
@@ -168,10 +169,10 @@ class Segment(NamedTuple):
     Attributes
     ----------
     end : int
-        End of the last frame, in nanoseconds of UTC.
+        End of the last frame in nanoseconds of UTC.
     decided_at : int
-        Start of the frame with which the end became certain, in nanoseconds of UTC; where the
-        sound ends, the end of the sound.
+        Start of the frame that decided the end, in nanoseconds of UTC; at the end of the sound,
+        that end.
     """
 
     run: StateRun
@@ -180,7 +181,7 @@ class Segment(NamedTuple):
 
     @property
     def start(self) -> int:
-        """Start of the first frame, in nanoseconds of UTC."""
+        """Start of the first frame in nanoseconds of UTC."""
         return self.run.start
 
     @property
@@ -195,7 +196,7 @@ class Segment(NamedTuple):
 
 
 class SegmenterInput(NamedTuple):
-    """Successive frames with the probabilities of classes.
+    """Successive frames with class probabilities.
 
     Attributes
     ----------
@@ -205,7 +206,7 @@ class SegmenterInput(NamedTuple):
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
     known_at : np.ndarray [shape=(n,)], int64
-        Starts of the frames with which the probabilities became known.
+        Starts of the frames that completed the probabilities.
     """
 
     probabilities: Float32
@@ -214,7 +215,7 @@ class SegmenterInput(NamedTuple):
     known_at: Int64
 
     def followed_by(self, later: "SegmenterInput") -> "SegmenterInput":
-        """Join these frames with those that follow."""
+        """Concatenate these frames and later frames."""
         return SegmenterInput(
             np.concatenate([self.probabilities, later.probabilities]),
             np.concatenate([self.powers, later.powers]),
@@ -223,7 +224,7 @@ class SegmenterInput(NamedTuple):
         )
 
     def part(self, frames: slice) -> "SegmenterInput":
-        """Return some of the frames."""
+        """Return a slice of the frames."""
         return SegmenterInput(
             self.probabilities[frames],
             self.powers[frames],
@@ -233,19 +234,20 @@ class SegmenterInput(NamedTuple):
 
 
 class Segmenter:
-    """Divides one stream of frames into segments, as a model's smoothing says.
+    """Divides one stream of frames into segments, by a model's smoothing.
 
     Parameters
     ----------
     classes : sequence of str
-        Names behind the columns of the probabilities.
+        Names of the columns of the probabilities.
     transitions : np.ndarray [shape=(C, C)], float64
-        Transition probabilities of the hidden Markov model; unused where segments are merged.
+        Transition probabilities of the hidden Markov model; unused if the smoothing merges
+        segments.
 
     Attributes
     ----------
     segments_converged : bool
-        Whether frames before the first one would leave no trace in the segments to come.
+        Whether the segments to come are independent of frames before the first frame.
     """
 
     def __init__(self, classes: Sequence[str], smoothing: Smoothing, transitions: Float64) -> None:
@@ -260,7 +262,7 @@ class Segmenter:
         self._reach = _frames(smoothing.reach_seconds) if silence >= 0 else 0
         shortest = max(_frames(smoothing.shortest_seconds), 1)
         self._borders = Borders(silence, self._reach, shortest)
-        self._forgetting = 2 * self._reach + shortest  # equal states, after which borders converge
+        self._forgetting = 2 * self._reach + shortest  # equal states until borders converge
         self._delay = lag + self._borders.delay
         self.segments_converged = False
         self.open_run: StateRun | None = None
@@ -268,27 +270,27 @@ class Segmenter:
 
     def _restart(self) -> None:
         self._undecided: SegmenterInput | None = None
-        self._decided = 0  # number of frames whose states are decided
-        self._states = 0  # number of states so far, before their borders are moved
-        self._doubtful = 0  # number of frames that may depend on those before the first one
-        self._same = -1, 0  # the last of them that have converged: their value and number
-        self._converged_at: int | None = None  # stamp from which on states have converged
+        self._decided = 0  # number of frames with decided states
+        self._states = 0  # number of states so far, before border refinement
+        self._doubtful = 0  # number of frames that may depend on frames before the first frame
+        self._same = -1, 0  # value and length of the last run of converged states
+        self._converged_at: int | None = None  # stamp from which states have converged
 
     @property
     def states_converged(self) -> bool:
-        """Whether frames before the first one would leave no trace in the states to come."""
+        """Whether the states to come are independent of frames before the first frame."""
         if self._undecided is None or self._converged_at is None:
             return False
         stamps = self._undecided.stamps
         return not len(stamps) or self._converged_at <= int(stamps[0])
 
     def discard_open(self) -> None:
-        """Set the counts of the open run to zero; its label and start stay."""
+        """Set the counts of the open run to zero; keep its label and start."""
         if self.open_run is not None:
             self.open_run = self.open_run._replace(frames=0, confidence=0)
 
     def forget(self) -> None:
-        """Doubt all frames so far: only later ones count for `segments_converged`."""
+        """Mark all frames so far as unconverged for `segments_converged`."""
         undecided = 0 if self._undecided is None else len(self._undecided.stamps)
         self._doubtful = self._decided + undecided
         self._same, self._converged_at, self.segments_converged = (-1, 0), None, False
@@ -296,7 +298,7 @@ class Segmenter:
             self._smoother.forget()
 
     def push(self, frames: SegmenterInput) -> list[Segment]:
-        """Add successive frames and return the segments whose end they decide.
+        """Add successive frames and return the segments whose end is now decided.
 
         Parameters
         ----------
@@ -321,12 +323,12 @@ class Segmenter:
         return segments
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments of a sound that ends, and begin anew.
+        """Return the remaining segments at the end of the sound, and reset.
 
         Parameters
         ----------
         end : int
-            End of the sound, in nanoseconds of UTC.
+            End of the sound in nanoseconds of UTC.
         """
         segments = []
         if self._undecided is not None:
@@ -341,9 +343,9 @@ class Segmenter:
         return segments
 
     def _note_convergence(self, states: Indices, stamps: Int64) -> None:
-        """Note from when on states have converged; `stamps` are those of all undecided frames.
+        """Record when states converged; `stamps` covers all undecided frames.
 
-        Borders have where enough states that have are equal.
+        Borders converge after enough equal converged states.
         """
         first = self._states
         self._states += len(states)

@@ -1,7 +1,7 @@
 """Smoothing: fixed-lag Viterbi decoding of the classifier's probabilities.
 
-The algorithm is that of Viterbi, "Error bounds for convolutional codes", 1967, with each state
-decided a fixed number of frames after its own.
+The algorithm is from Viterbi, "Error bounds for convolutional codes", 1967; each state is decided a
+fixed number of frames later.
 """
 
 from typing import NamedTuple
@@ -10,19 +10,19 @@ import numpy as np
 
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
-_TINY = 1e-38  # of float32
-_LEAST = np.log(1e-6)  # no single frame forbids a class
-# Logarithms are rounded to multiples of this, so that their sums are exact. The path then depends
-# neither on when the scores are rescaled to zero, nor on frames long past.
+_TINY = 1e-38  # about the smallest normal float32
+_LEAST = np.log(1e-6)  # so that no single frame excludes a class
+# Logarithms are rounded to multiples of this step, so their sums are exact. The path is then
+# independent of when the scores are rescaled to zero, and of frames long past.
 _STEP = 2.0**-30
 _FRAMES_AT_ONCE = 4096
 _LANE = 64  # frames
-_WARM_UP = 32  # frames; in dense sound a half of the lanes needs more
+_WARM_UP = 32  # frames; in dense sound half of the lanes need more
 _FEWEST_LANES = 3
 
 
 class ClassesApart(NamedTuple):
-    """How doubts about the class of a sound are kept from counting for silence."""
+    """How uncertainty between sound classes is kept from favouring silence."""
 
     silence: int
     exponent: float
@@ -31,9 +31,9 @@ class ClassesApart(NamedTuple):
 def log_likelihoods(
     probabilities: Float32, weight: float, apart: ClassesApart | None = None
 ) -> Float64:
-    """Turn the probabilities of a classifier into the log-likelihoods of a hidden Markov model.
+    """Convert classifier probabilities to log-likelihoods of a hidden Markov model.
 
-    Classes are trained with even weights, so their prior is uniform.
+    Classes are trained with equal weights, so their prior is uniform.
 
     Parameters
     ----------
@@ -65,21 +65,21 @@ def _with_classes_apart(
 class FixedLagSmoother:
     """Decides the state of each frame `lag_frames` frames later.
 
-    It is the frame's state on the likeliest path up to that later frame, which is the state that
-    Viterbi gives over the whole sound unless still later frames change it. The same frames give
-    the same states in blocks of any size.
+    The decided state lies on the likeliest path up to that later frame. It equals the Viterbi state
+    over the complete sound unless still later frames change the path. The same frames give the same
+    states in blocks of any size.
 
     Parameters
     ----------
     transitions : np.ndarray [shape=(C, C)], float64
-        Probability that a frame of the row's class is followed by one of the column's class. The
-        first frame may be of any class.
+        Probability of the column's class after a frame of the row's class. The first frame may be
+        of any class.
 
     Attributes
     ----------
     converged_after : int or None
-        Number of frames after which earlier sound would leave no trace: the states from the last
-        of these frames on do not depend on it. None if that is not reached yet.
+        Number of frames after which the states, from the last of these frames on, are independent
+        of earlier sound. None if not yet reached.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class FixedLagSmoother:
         weight: float = 1.0,
         apart: ClassesApart | None = None,
     ) -> None:
-        with np.errstate(divide="ignore"):  # never: minus infinity
+        with np.errstate(divide="ignore"):  # log(0) means never
             self._transitions = _rounded(np.log(transitions))
         self._to_each = np.ascontiguousarray(self._transitions.T)
         self._lag = lag_frames
@@ -98,15 +98,15 @@ class FixedLagSmoother:
         self._restart()
 
     def forget(self) -> None:
-        """Doubt all frames so far: only later ones count for `converged_after`."""
+        """Mark all frames so far as unconverged for `converged_after`."""
         count = len(self._transitions)
         self.converged_after: int | None = None
-        # Scores had the sound begun in each of the states: once they differ by constants only, any
-        # other beginning would have led to the same path.
+        # Scores for a sound that begins in each of the states: once they differ only by constants,
+        # any other beginning would have led to the same path.
         self._scores_from = np.where(np.eye(count, dtype=bool), 0.0, -np.inf)
 
     def push(self, probabilities: Float32) -> Indices:
-        """Add successive frames and return the states that they decide.
+        """Add successive frames and return the states that are now decided.
 
         Parameters
         ----------
@@ -116,7 +116,8 @@ class FixedLagSmoother:
         Returns
         -------
         np.ndarray [shape=(m,)], intp
-            States of the frames after those already decided, up to `lag_frames` before the last.
+            States of the frames after the already decided frames, up to `lag_frames` before the
+            last.
         """
         starts = range(0, len(probabilities), _FRAMES_AT_ONCE)
         blocks = (probabilities[start : start + _FRAMES_AT_ONCE] for start in starts)
@@ -124,13 +125,7 @@ class FixedLagSmoother:
         return np.concatenate([np.empty(0, np.intp), *parts])
 
     def close(self) -> Indices:
-        """Return the states of the remaining frames, and begin anew.
-
-        Returns
-        -------
-        np.ndarray [shape=(m,)], intp
-            Of the last `lag_frames` frames, or fewer if there were no more.
-        """
+        """Return the states of the remaining frames, at most `lag_frames`, and reset."""
         states = np.empty(len(self._back), np.intp)
         if len(states):
             states[-1] = self._score.argmax()
@@ -143,7 +138,7 @@ class FixedLagSmoother:
         count = len(self._transitions)
         self._count = 0  # number of frames so far
         self._score = np.zeros(count)  # score of the likeliest path to each state
-        self._back = np.empty((0, count), np.intp)  # best predecessors, of undecided frames
+        self._back = np.empty((0, count), np.intp)  # best predecessors of undecided frames
         self.forget()
 
     def _push(self, observed: Float64) -> Indices:
@@ -155,7 +150,7 @@ class FixedLagSmoother:
             self._note_convergence(steps)
         scores = _forward_in_lanes(self._transitions, start, steps)
         back = np.zeros((count, len(start)), np.intp)
-        # Sources last: numpy is three times as fast at the largest of what is beside each other.
+        # Sources last: numpy finds the largest of adjacent values three times as fast.
         reached = scores[:-1, np.newaxis] + self._to_each
         reached.argmax(axis=2, out=back[count - len(steps) :])
         best = scores[-count:].argmax(axis=1)
@@ -192,9 +187,10 @@ class FixedLagSmoother:
 def _forward_in_lanes(transitions: Float64, start: Float64, observed: Float64) -> Float64:
     """Score as `_forward` does, up to a constant per frame.
 
-    The frames are divided into lanes that are scored side by side, all but the first from a guess:
-    an uninformed start some frames before. A lane whose guess is not what the lane before it ends
-    with is scored again from there. As the sums are exact, none is wrong in the end.
+    The frames are divided into lanes that are scored in parallel. All lanes but the first start
+    from a guess: an uninformed start some frames earlier. A lane whose guess differs from the end
+    of the lane before it is scored again from there. As the sums are exact, the final result is
+    exact.
     """
     count = -(-len(observed) // _LANE)
     if count < _FEWEST_LANES:
@@ -229,7 +225,7 @@ def _forward(transitions: Float64, start: Float64, observed: Float64) -> Float64
     ----------
     transitions : np.ndarray [shape=(C, C)], float64
     start : np.ndarray [shape=(C,) or (C, k)], float64
-        Scores of the frame before, for k sounds.
+        Scores of the previous frame, for k sounds.
     observed : np.ndarray [shape=(n, C), (n, C, 1) or (n, C, k)], float64
 
     Returns

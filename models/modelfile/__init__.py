@@ -1,1 +1,1 @@
-"""The model file, its card, and the folder of models of a recorder."""
+"""The model file, its card, and a recorder's folder of models."""

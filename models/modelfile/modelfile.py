@@ -1,4 +1,4 @@
-"""The model file, checked when loaded, and a model's attachments in a log."""
+"""The model file, validated on loading, and the attachments of a model in a log."""
 
 import hashlib
 import json
@@ -48,10 +48,10 @@ from hearthlog.schemas.new_files import check_new, new_file
 
 SUFFIX = ".safetensors"
 _SIZE_LIMIT = 64 << 20  # a hundred times the usual size
-_HEADER_LIMIT = 4 << 20  # its parsed form takes many times as much
+_HEADER_LIMIT = 4 << 20  # parsing takes many times this size
 _LARGEST = 1e9  # no product of finite inputs overflows
 _ROUNDING = 1e-9
-_COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are optional
+_COMMON: dict[str, np.dtype[Any]] = {  # of all kinds of classifiers; all optional
     "transitions": np.dtype(np.float64),
     "training_digests": np.dtype(np.int64),
     "training_windows": np.dtype(np.float32),
@@ -66,10 +66,10 @@ _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are op
 
 
 def check_output(path: Path) -> None:
-    """Check that a model can be saved under a name.
+    """Check that a model can be saved at a path.
 
-    Raise `ModelError` if the name has another ending or cannot be printed, if there is a file
-    of this name, or if its folder does not exist or cannot be written.
+    Raise `ModelError` if the suffix is wrong, the name is not printable, the file exists, or the
+    folder does not exist or is not writable.
     """
     if path.suffix != SUFFIX:
         raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
@@ -84,8 +84,8 @@ def check_output(path: Path) -> None:
 def save_model(model: Model, path: Path) -> None:
     """Write a model file; the same model gives the same bytes.
 
-    Raise `ModelError` if `check_output` refuses the name, the file cannot be written, or the
-    model is inconsistent.
+    Raise `ModelError` if `check_output` refuses the path, the file cannot be written, or the model
+    is inconsistent.
     """
     check_output(path)
     common = {name: getattr(model, name) for name in _COMMON if getattr(model, name).size}
@@ -102,29 +102,29 @@ def save_model(model: Model, path: Path) -> None:
 
 
 def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> Model:
-    """Read a model file and check everything in it; nothing of it is executed.
+    """Read and validate a model file; nothing in the file is executed.
 
     Parameters
     ----------
     path : Path
-        The file, or a symbolic link to it: the model has the name of the file. Where there is none,
-        the name of a starter model (`hearthlog.models.starter`) means that, and `audioset` the
-        names of YAMNet.
+        The file, or a symbolic link to the file, whose name the model takes. Without such a file,
+        the name of a starter model (`hearthlog.models.starter`), or `audioset` for the names of
+        YAMNet.
     on_damage : callable, optional
-        Told in a line that the file is not as it was written; by default that is an error.
+        Receives one line if the checksum does not match; by default a mismatch is an error.
 
     Raises
     ------
     ModelError
-        If the file is missing, larger than 64 MiB, damaged or inconsistent, if its name cannot be
-        printed, or if it is made for another feature set, or for a feature set or kind of
-        classifier that is not installed.
+        If the file is missing, larger than 64 MiB, damaged or inconsistent, if its name is not
+        printable, or if the model needs another feature set, or a feature set or kind of classifier
+        that is not installed.
     """
     path, data = _read(path)
     _check_header(path, data)
     try:
         arrays, text, damaged = read_sealed(path, data, KEY)
-    except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
+    except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type that numpy lacks
         raise ModelError(f"{path}: is not a model file ({one_line(error)})") from error
     digest = hashlib.sha256(data).hexdigest()
     if path.stem in STARTERS and path == starter_file(path.stem) and digest != SHA256[path.stem]:
@@ -143,33 +143,32 @@ def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> 
 
 
 def starter_for(path: Path, network: str) -> Path:
-    """Return the starter model that a name means where a network is, or is not.
+    """Return the starter model of a name, given the available embedding network.
 
     Parameters
     ----------
     path : Path
-        Any model; `general` and `bathroom` mean those that take embeddings, if they are of this
-        network, and there is no file of this name.
+        Any model. `general` and `bathroom` select their variants with embeddings if those use this
+        network and there is no file of this name.
     network : str
-        Whose embeddings there are; empty for none.
+        Network of the available embeddings; empty for none.
     """
     named = str(path) in BY_FEATURES and not os.path.lexists(path)
     return Path(with_network(str(path))) if named and network == NETWORK else path
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:
-    """Return what tells a model from others, `Model.name` and `Model.sha256`, without loading it.
+    """Return `Model.name` and `Model.sha256`, which identify a model, without loading the model.
 
-    Raise `ModelError` if the file is missing or larger than 64 MiB, or its name cannot be
-    printed.
+    Raise `ModelError` if the file is missing or larger than 64 MiB, or its name is not printable.
     """
     path, data = _read(path)
     return path.stem, hashlib.sha256(data).hexdigest()
 
 
 def _read(path: Path) -> tuple[Path, bytes]:
-    """Return the file that is meant, and its content."""
-    if str(path) == AUDIOSET:  # whatever folder of recordings has this name
+    """Resolve a path to a model file and read the file."""
+    if str(path) == AUDIOSET:  # even if a folder of recordings has this name
         return path.with_suffix(SUFFIX), audioset_file()
     path = _starter(path) or _pointed_to(path)
     if not path.stem.isprintable():
@@ -183,7 +182,7 @@ def _read(path: Path) -> tuple[Path, bytes]:
 
 
 def _halved(array: Array) -> Array:
-    """Return an array in half precision if nothing is lost, else as it is."""
+    """Return an array in half precision if that is lossless, else unchanged."""
     if array.dtype != np.float32:
         return array
     with np.errstate(over="ignore"):
@@ -192,11 +191,11 @@ def _halved(array: Array) -> Array:
 
 
 def _widened(description: Description, arrays: dict[str, Array]) -> dict[str, Array]:
-    """Return arrays that were halved as they were before."""
+    """Undo `_halved` for the arrays of a model."""
     try:
         kind = classifier_kind(description.kind)
     except ModelError:
-        return arrays  # the check says what is not installed
+        return arrays  # the validation reports what is not installed
     dtypes = {**kind.arrays, **kind.optional, **_COMMON}
     halved = {
         name: array.astype(np.float32)
@@ -207,7 +206,7 @@ def _widened(description: Description, arrays: dict[str, Array]) -> dict[str, Ar
 
 
 def _starter(path: Path) -> Path | None:
-    """Return the file of the starter model that is meant; None if none is."""
+    """Return the file of the starter model of this name, or None."""
     if str(path) not in STARTERS or os.path.lexists(path):
         return None
     file = starter_file(str(path))
@@ -220,11 +219,11 @@ def _starter(path: Path) -> Path | None:
 
 
 def _pointed_to(path: Path) -> Path:
-    """Follow a link such as `champion` to the file that has the name of the model."""
+    """Follow a link such as `champion` to the file with the model's name."""
     try:
         return Path(os.path.realpath(path)) if path.is_symlink() else path
     except OSError:
-        return path  # reading it will raise the error
+        return path  # reading the file raises the error
 
 
 def _check_header(path: Path, data: bytes) -> None:
@@ -251,7 +250,7 @@ def _check(path: Path, description: Description, arrays: Mapping[str, Array]) ->
 
 
 def _problem(description: Description) -> str | None:
-    """Return what in a description contradicts the rest of it, or what is installed here."""
+    """Return a contradiction within a description, or with the installed extensions."""
     features = feature_set(description.feature_set)
     if description.feature_set_version != features.version:
         return (
@@ -309,7 +308,7 @@ def _problem_of_classes(description: Description) -> str | None:
 
 
 def _problem_of_arrays(description: Description) -> str | None:
-    """Return what is wrong with the arrays of microphones whose directions a model takes."""
+    """Check the microphone arrays whose directions a model uses."""
     names = description.direction_microphones
     if len(set(names)) < len(names):
         return "its direction_microphones name one twice"
@@ -321,7 +320,7 @@ def _problem_of_arrays(description: Description) -> str | None:
 
 
 def _problem_of_heads(description: Description) -> str | None:
-    """Return what is wrong with how a model takes the embeddings of a network."""
+    """Check a model's use of network embeddings."""
     mix, classes = description.embedding, set(description.classes)
     if (mix is not None) != (description.format == FORMAT_OF_EMBEDDINGS):
         return f"format: is {description.format}; those with heads are {FORMAT_OF_EMBEDDINGS}"
@@ -340,7 +339,7 @@ def _problem_of_heads(description: Description) -> str | None:
 
 
 def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | None:
-    """Return what is wrong with the arrays of a model."""
+    """Check the arrays of a model."""
     kind, classes = classifier_kind(description.kind), len(description.classes)
     dtypes = {**kind.arrays, **kind.optional, **_COMMON}
     if not kind.arrays.keys() <= arrays.keys() <= dtypes.keys():
@@ -360,7 +359,7 @@ def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | 
 
 
 def _problem_of_untaught(description: Description, arrays: Mapping[str, Array]) -> str | None:
-    """Return what is wrong with the classes that heads leave to others."""
+    """Check the classes that the heads leave to other heads."""
     mix = description.embedding
     if mix is None:
         return None
@@ -374,7 +373,7 @@ def _problem_of_untaught(description: Description, arrays: Mapping[str, Array]) 
 
 
 def _problem_of_values(classes: int, arrays: Mapping[str, Array]) -> str | None:
-    """Return what is wrong with arrays that all kinds of classifiers have."""
+    """Check the values of the arrays that all kinds of classifiers have."""
     target = arrays.get("training_target", np.empty(0))
     if ((target < 0) | (target >= classes)).any():
         return "training_target has classes that the model has not"
@@ -403,7 +402,7 @@ def _problem_of_array(
 
 
 def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
-    """Return the shape that each array must have."""
+    """Return the required shape of each array."""
     features, classes = feature_set(description.feature_set), len(description.classes)
     width = features.inputs[description.inputs].width
     shapes = classifier_kind(description.kind).shapes(classes, width, arrays)
@@ -435,16 +434,15 @@ _FEW = 12  # sources
 
 
 def attachment_of(name: str, microphone: str) -> str:
-    """Name an attachment about the model of one microphone, where others have another model."""
+    """Return the attachment name for one microphone's model, where microphones differ in model."""
     stem, suffix = name.rsplit(".", 1)
     return f"{stem}.{microphone}.{suffix}"
 
 
 def model_attachments(model: Model) -> list[Attachment]:
-    """Return the attachments of a log with labels of a model: its card and its description.
+    """Return the attachments for a log labelled by a model: its card and its description.
 
-    Raise `ModelError` if the model's kind of classifier is not installed, or cannot be
-    imported.
+    Raise `ModelError` if the model's kind of classifier is not installed or cannot be imported.
     """
     description = {"name": model.name, "sha256": model.sha256, **model.description.model_dump()}
     text = json.dumps(description, ensure_ascii=False)
@@ -455,10 +453,9 @@ def model_attachments(model: Model) -> list[Attachment]:
 
 
 def model_card(model: Model) -> str:
-    """Describe a model for people, as Markdown.
+    """Render the model card as Markdown.
 
-    Raise `ModelError` if the model's kind of classifier is not installed, or cannot be
-    imported.
+    Raise `ModelError` if the model's kind of classifier is not installed or cannot be imported.
     """
     description, metrics = model.description, model.description.metrics
     amounts = description.training_data.classes
@@ -486,7 +483,7 @@ def model_card(model: Model) -> str:
     for name in description.classes:
         amount, result = amounts[name], metrics.classes[name]
         figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
-        if not amount.sources:  # a class of the home
+        if not amount.sources:  # a class added by the home
             figures = ("-" for _ in range(3))
         lines.append(
             f"| {name} | {', '.join(description.scenario[name])} | {amount.sources} | "
@@ -537,7 +534,7 @@ def model_card(model: Model) -> str:
 
 
 def _elsewhere(description: Description) -> list[str]:
-    """Describe the scores in collections of which nothing was learned."""
+    """Describe the scores on datasets outside the training data."""
     elsewhere = description.elsewhere
     if elsewhere is None:
         return []

@@ -1,4 +1,4 @@
-"""A folder of model files: champion, candidate, history, and judgements of what may label."""
+"""A folder of model files: champion, candidate, history, and labelling judgements."""
 
 import hashlib
 import os
@@ -35,18 +35,19 @@ _Text = Annotated[str, StringConstraints(max_length=_LONGEST_REASON, pattern="^[
 
 
 class Judgement(BaseModel):
-    """Whether a model may label a home, and why not: one small file for each, beside the models.
+    """The decision whether a model may label a home: one small file per model, next to the models.
 
-    The file is named by the content of the model, so that another model of the same name has none.
+    The file name contains the hash of the model, so another model of the same name has no
+    judgement.
 
     Attributes
     ----------
     champion : str
-        SHA-256 of the model that it was compared with; empty if there was none.
+        SHA-256 of the model used for comparison; empty if there was none.
     judged : int
-        When, in nanoseconds of UTC.
+        Time of the judgement in nanoseconds of UTC.
     reasons : tuple of str
-        Why it may not, each a sentence; empty if it may.
+        Reasons for a refusal, one sentence each; empty if the model may label.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -64,12 +65,12 @@ class Judgement(BaseModel):
 
 
 def judgement_path(folder: Path, sha256: str) -> Path:
-    """Return where the judgement of a model is kept."""
+    """Return the path of a model's judgement."""
     return folder / _FOLDER / f"{sha256}.json"
 
 
 def judgements_of(folder: Path) -> list[Path]:
-    """List the files of the judgements of a folder of models."""
+    """List the judgement files of a folder of models."""
     return list((folder / _FOLDER).glob("*.json"))
 
 
@@ -79,7 +80,7 @@ def read_judgement(folder: Path, sha256: str) -> Judgement | None:
     Returns
     -------
     Judgement or None
-        None if there is none; what is no judgement of this model counts as none.
+        None if there is no valid judgement of this model.
     """
     path = judgement_path(folder, sha256)
     with suppress(OSError, ValidationError):
@@ -93,9 +94,9 @@ def read_judgement(folder: Path, sha256: str) -> Judgement | None:
 
 
 def write_judgement(folder: Path, judgement: Judgement) -> None:
-    """Keep a judgement, in the place of an earlier one of the same model.
+    """Write a judgement, replacing an earlier judgement of the same model.
 
-    Raise `ModelError` if it cannot be written.
+    Raise `ModelError` if the file cannot be written.
     """
     path = judgement_path(folder, judgement.model)
     try:
@@ -107,9 +108,9 @@ def write_judgement(folder: Path, judgement: Judgement) -> None:
 
 
 def insist(folder: Path, sha256: str) -> None:
-    """Let a model label whatever its judgement says, or without one.
+    """Allow a model to label regardless of its judgement, or without one.
 
-    Raise `ModelError` if that cannot be written.
+    Raise `ModelError` if the permission cannot be written.
     """
     judgement = read_judgement(folder, sha256)
     if judgement is None or not judgement.may_label:
@@ -117,10 +118,10 @@ def insist(folder: Path, sha256: str) -> None:
         write_judgement(folder, judgement.model_copy(update={"insisted": True}))
 
 
-# Both are symbolic links in the folder, so that any program can open them. A link is replaced in
-# one step, so that there always is a champion. The file `history` lists earlier champions, the last
-# one at the end. It is written before the link: if a command is killed between the two, it ends
-# with the current champion, which is skipped.
+# Both are symbolic links in the folder, so any program can open them. A link is replaced in one
+# step, so there is always a champion. The file `history` lists earlier champions, the last one at
+# the end. It is written before the link: if a command is killed between the two writes, `history`
+# ends with the current champion, which is skipped.
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
 DEFAULT_FOLDER = Path("models")
 DEFAULT_MODEL = DEFAULT_FOLDER / (CHAMPION + SUFFIX)
@@ -130,28 +131,29 @@ _KEPT = 100  # earlier champions
 
 @dataclass(frozen=True, eq=False)
 class ModelEntry:
-    """One model file of the folder, or a starter."""
+    """One model file of the folder, or a starter model."""
 
     name: str
-    aliases: tuple[str, ...]  # that point to it
+    aliases: tuple[str, ...]  # aliases of this model
     size: int  # bytes
     model: Model | None
-    problem: str = ""  # why the file cannot be used
-    starter: bool = False  # comes with this version, whether it is in the folder or not
+    problem: str = ""  # reason why the file cannot be used
+    starter: bool = False  # shipped with this version, whether or not the folder has a copy
 
 
 def list_models(folder: Path) -> list[ModelEntry]:
-    """Load every model of a folder, and the starters; list the targets of broken aliases too.
+    """Load every model of a folder and the starter models; list the targets of broken aliases too.
 
     Returns
     -------
     list of ModelEntry
-        By name; one that cannot be used says why. The starters alone, if there is no such folder.
+        Sorted by name; an unusable entry has a `problem`. Only the starter models if the folder
+        does not exist.
 
     Raises
     ------
     ModelError
-        If this is no folder, or an alias is no link to a model file of it.
+        If the path is not a folder, or an alias is not a link to a model file in the folder.
     """
     if os.path.lexists(folder):
         _check_folder(folder)
@@ -166,17 +168,17 @@ def list_models(folder: Path) -> list[ModelEntry]:
 
 
 def target(folder: Path, alias: str) -> str | None:
-    """Return the name of the model that an alias points to.
+    """Return the name of an alias's target.
 
     Returns
     -------
     str or None
-        None if there is no such alias. That there is such a model is not checked.
+        None if there is no such alias. The target need not exist.
 
     Raises
     ------
     ModelError
-        If a file of this name is not a link to a model file of the folder.
+        If the alias exists but is not a link to a model file in the folder.
     """
     link = _path(folder, alias)
     if not os.path.lexists(link):
@@ -191,17 +193,17 @@ def target(folder: Path, alias: str) -> str | None:
 
 
 def resolve(folder: Path, name: str) -> str:
-    """Return the name of the model that a name or an alias means.
+    """Resolve a model name or an alias to the name of a model.
 
     Parameters
     ----------
     name : str
-        Name of a model, of its file, or an alias. That there is such a model is not checked.
+        Name of a model or of its file, or an alias. The model need not exist.
 
     Raises
     ------
     ModelError
-        If the alias does not exist or is no link to a model file, or the name is one of another
+        If the alias does not exist or is not a link to a model file, or the name points outside the
         folder.
     """
     name = name.removesuffix(SUFFIX)
@@ -221,13 +223,13 @@ def load(folder: Path, name: str) -> Model:
     Parameters
     ----------
     name : str
-        Name of a model, of its file, or an alias; a starter of which there is no file, or
+        Name of a model or of its file, or an alias; without such a file, a starter model or
         `audioset`.
 
     Raises
     ------
     ModelError
-        If there is no such folder, or `resolve` or `load_model` refuses the model.
+        If the folder does not exist, or `resolve` or `load_model` refuses the model.
     """
     stem = name.removesuffix(SUFFIX)
     if stem in {*STARTERS, AUDIOSET} and not os.path.lexists(_path(folder, stem)):
@@ -237,13 +239,7 @@ def load(folder: Path, name: str) -> Model:
 
 
 def find_model(folder: Path, sha256: str) -> Path | None:
-    """Find a model by its content, in a folder or among the starter models.
-
-    Returns
-    -------
-    Path or None
-        The file; None if there is none.
-    """
+    """Find a model by its SHA-256, in a folder or among the starter models."""
     for path in [*sorted(folder.glob("[!.]*" + SUFFIX)), *map(starter_file, STARTERS)]:
         if path.is_file() and not path.is_symlink() and _digest(path) == sha256:
             return path
@@ -251,20 +247,20 @@ def find_model(folder: Path, sha256: str) -> Path | None:
 
 
 def is_starter(name: str, sha256: str) -> bool:
-    """Tell whether a model is a starter model of this version."""
+    """Return whether a model is a starter model of this version."""
     file = starter_file(name)
     return name in STARTERS and file.is_file() and _digest(file) == sha256
 
 
 def first_starter(folder: Path) -> str | None:
-    """Name the starter model that labelled a home before the champion.
+    """Return the name of the starter model that preceded the champion.
 
     Returns
     -------
     str or None
-        The one that the champion was adapted from, over models of the folder that are still there;
-        else `general`, with which a recorder begins, or that which takes embeddings, as the
-        champion does; None if that is the champion, or is of another feature set.
+        The starter model from which the champion was adapted, traced through models still in the
+        folder; else `general`, the default of a recorder, in the variant with embeddings if the
+        champion uses embeddings. None if the champion is that model, or has another feature set.
     """
     try:
         champion = model = load(folder, CHAMPION)
@@ -288,14 +284,13 @@ def first_starter(folder: Path) -> str | None:
 
 
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
-    """Point an alias to a model, if that model can be used; a starter is copied to the folder.
+    """Point an alias to a usable model; a starter model is first copied to the folder.
 
-    For a starter the folder is made, if there is none.
+    The folder is created if needed for a starter model. Permission to label is a separate
+    judgement, which the recorder reads.
 
-    Whether it may label is for a judgement to say, which a recorder asks for.
-
-    Raise `ModelError` if the model cannot be used, if the folder does not exist or cannot be
-    written, or if a file in the place of the alias is no link to a model file.
+    Raise `ModelError` if the model cannot be used, if the folder does not exist or is not writable,
+    or if the file at the alias is not a link to a model file.
     """
     with _locked(folder, make=name.removesuffix(SUFFIX) in STARTERS):
         before = target(folder, alias)
@@ -314,12 +309,12 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
 
 
 def rollback(folder: Path) -> tuple[Model, str]:
-    """Make the last earlier champion that can still be used the champion again: it may label.
+    """Restore the last earlier champion that is still usable, and permit it to label.
 
-    Before the first one that was the starter model which the recorder began with.
+    The default starter model counts as the predecessor of the first champion.
 
-    Raise `ModelError` if there is no champion, or none before it that can be used, or the
-    folder does not exist or cannot be written.
+    Raise `ModelError` if there is no champion, no usable earlier champion, or the folder does not
+    exist or is not writable.
     """
     with _locked(folder):
         before = resolve(folder, CHAMPION)
@@ -348,7 +343,7 @@ def rollback(folder: Path) -> tuple[Model, str]:
 
 
 def _copy_starter(folder: Path, model: Model) -> None:
-    """Put a starter model into a folder, if no file of its name is there."""
+    """Copy a starter model to a folder, unless the folder has a file of this name."""
     path = _path(folder, model.name)
     if not os.path.lexists(path):
         with replaced_file(path) as temporary:
@@ -383,7 +378,7 @@ def _check_folder(folder: Path) -> None:
 
 @contextmanager
 def _locked(folder: Path, *, make: bool = False) -> Iterator[None]:
-    """Keep other processes from changing the aliases of a folder at the same time."""
+    """Lock the aliases of a folder against other processes."""
     try:
         if make:
             private_folder(folder)
@@ -397,17 +392,17 @@ def _locked(folder: Path, *, make: bool = False) -> Iterator[None]:
 
 
 def _point(folder: Path, alias: str, name: str) -> None:
-    """Replace a link in one step."""
+    """Replace a link atomically."""
     link = _path(folder, alias)
     temporary = folder / f".{link.name}.tmp"
-    temporary.unlink(missing_ok=True)  # left by a command that was killed
+    temporary.unlink(missing_ok=True)  # left by a killed command
     temporary.symlink_to(name + SUFFIX)
     temporary.replace(link)
     sync_folder(folder)
 
 
 def _earlier(folder: Path) -> list[str]:
-    """Read the earlier champions, without the current one."""
+    """Read the earlier champions, without the current champion."""
     path = folder / _HISTORY
     names = path.read_text(errors="replace").splitlines() if path.is_file() else []
     champion = target(folder, CHAMPION)

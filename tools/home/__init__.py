@@ -1,1 +1,1 @@
-"""A simulated home, to try everything without a microphone."""
+"""A simulated home, to try hearthlog without a microphone."""

@@ -1,4 +1,4 @@
-"""The clips that a simulated home is composed of: recordings of a manifest, and made-up sounds."""
+"""The clips of a simulated home: recordings of a manifest, and synthetic sounds."""
 
 import os
 from collections import OrderedDict
@@ -46,10 +46,10 @@ _MADE_UP_SECONDS = {
     SHOWER: 10.0,
     TAP_WATER: 8.0,
 }
-_MADE_UP = 8  # different ones of a label
+_MADE_UP = 8  # different synthetic sounds per label
 _LONGEST_SECONDS = 60.0
 _CACHE_BYTES = 64 << 20
-_LOUD_DB = 15.0  # below the loudest frame: what the level of a clip is measured over
+_LOUD_DB = 15.0  # dB below the loudest frame: frames above it define the level of a clip
 _CROSSFADE = SAMPLE_RATE // 10
 _FADE = SAMPLE_RATE // 100
 _TINY = 1e-12
@@ -57,14 +57,14 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class HomeClip:
-    """One sound that a home is composed of.
+    """One sound of a simulated home.
 
     Attributes
     ----------
     path : Path or None
-        None for a made-up sound.
+        None for a synthetic sound.
     start : float
-        Where it begins in the recording, in seconds.
+        Start in the recording, in seconds.
     """
 
     name: str
@@ -77,19 +77,19 @@ class HomeClip:
 
 
 class ClipLibrary:
-    """Recordings of a manifest, and made-up sounds of the labels that it has none of.
+    """Recordings of a manifest, and synthetic sounds for labels without recordings.
 
     Parameters
     ----------
     manifest : Path or None
-        As of `hearthlog train`, with any labels; None for made-up sounds alone.
+        As in `hearthlog train`, with any labels; None for synthetic sounds alone.
 
     Raises
     ------
     DataError
         If the manifest cannot be used.
     SimulationError
-        If a clip of it is no audio, or shorter than a frame.
+        If a clip is not audio, or is shorter than a frame.
     """
 
     def __init__(self, manifest: Path | None = SHIPPED) -> None:
@@ -102,13 +102,7 @@ class ClipLibrary:
         self._decoded = ArrayCache(_CACHE_BYTES)
 
     def of(self, label: str) -> Sequence[HomeClip]:
-        """Return the clips of a label.
-
-        Returns
-        -------
-        sequence of Clip
-            Empty where there is no such sound.
-        """
+        """Return the clips of a label; empty if there is no such sound."""
         return self._clips.get(label, [])
 
     def of_groups(self, label: str, count: int, rng: np.random.Generator) -> Sequence[HomeClip]:
@@ -117,14 +111,14 @@ class ClipLibrary:
         Parameters
         ----------
         count : int
-            Groups, at most.
+            Maximum number of groups.
         """
         groups = sorted({clip.source_group for clip in self.of(label)})
         chosen = {groups[place] for place in rng.permutation(len(groups))[:count]}
         return [clip for clip in self.of(label) if clip.source_group in chosen]
 
     def sound(self, clip: HomeClip, frames: int) -> Float32:
-        """Return a clip as loud as every other, cut or repeated to a length.
+        """Return a clip at a common loudness, cut or repeated to a length.
 
         Parameters
         ----------
@@ -150,12 +144,12 @@ class ClipLibrary:
 
 
 class ArrayCache:
-    """The arrays that were used last, up to so many bytes.
+    """The most recently used arrays, up to a number of bytes.
 
     Parameters
     ----------
     limit : int
-        Bytes; the array that was used last is kept even where it is larger.
+        In bytes; the most recently used array is kept even if it is larger.
     """
 
     def __init__(self, limit: int) -> None:
@@ -177,7 +171,7 @@ class ArrayCache:
 
 
 class _AnyLabel(Collection[str]):
-    """Every label is allowed in the manifest of a home; those of no use are not used."""
+    """Accepts every label in the manifest of a home; unused labels do no harm."""
 
     def __contains__(self, _label: object) -> bool:
         return True
@@ -214,7 +208,7 @@ def _made_up(label: str) -> list[HomeClip]:
 
 
 def _decode(clip: HomeClip) -> Float32:
-    """Read or make a clip, with a mean square of 1 where it is loud."""
+    """Read or synthesise a clip, with a mean square of 1 in its loud frames."""
     if clip.path is None:
         place = list(_MADE_UP_SECONDS).index(clip.label)
         made = dry_sound(clip.label, clip.frames * FRAME_SAMPLES, generator(clip.seed, place))

@@ -27,8 +27,8 @@ from hearthlog.tools.home.plan import (
 )
 from hearthlog.tools.home.sounds import SimulationError, generator
 
-PERIOD_FRAMES = 2400  # after which steady noise repeats itself
-TAIL_FRAMES = 8  # of reverberation behind a sound
+PERIOD_FRAMES = 2400  # period of steady noise
+TAIL_FRAMES = 8  # frames of reverberation after a sound
 
 _WALLS = {  # attenuation in dB, doors ajar
     frozenset({LIVING_ROOM, KITCHEN}): 10.0,
@@ -39,11 +39,11 @@ _WALLS = {  # attenuation in dB, doors ajar
     frozenset({BEDROOM, BATHROOM}): 14.0,
 }
 _WINDOW = 24.0
-_DULLING_DB = 9.0  # of attenuation take an octave off the top
+_DULLING_DB = 9.0  # dB of attenuation that remove an octave at the top
 _FLOOR_DBFS = {LIVING_ROOM: -64.0, KITCHEN: -60.0, BATHROOM: -62.0, BEDROOM: -67.0}
 _FLOOR_SPREAD_DB = 3.0
 _REVERBERATION = {LIVING_ROOM: 0.35, KITCHEN: 0.4, BATHROOM: 0.55, BEDROOM: 0.25, OUTSIDE: 0.2}
-_DIRECT_DB = {True: 8.0, False: 0.0}  # over the reverberation, in the same room or not
+_DIRECT_DB = {True: 8.0, False: 0.0}  # dB over the reverberation, in the same room or not
 _DIRECT_SAMPLES = 48
 _STEADY = {FRIDGE: (KITCHEN, -50.0), FAN: (BATHROOM, -42.0), STREET: (OUTSIDE, -42.0)}
 _HUM_HERTZ, _HUM_HARMONICS = 50.0, 8
@@ -51,19 +51,19 @@ _LOWEST_HERTZ = 20.0
 
 
 def attenuation(room: str, microphone: str) -> float:
-    """Return by how many dB a sound of a room is weaker where the microphone is."""
+    """Return the attenuation in dB from a room to the microphone's room."""
     if room == microphone:
         return 0.0
     return _WALLS.get(frozenset({room, microphone}), _WINDOW)
 
 
 class Rooms:
-    """What a microphone hears of a home.
+    """The acoustics of a home from the position of a microphone.
 
     Attributes
     ----------
     floor : np.ndarray [shape=(PERIOD_FRAMES, FRAME_SAMPLES)], float32
-        Noise of the room, which repeats itself.
+        Periodic noise of the room.
 
     Raises
     ------
@@ -85,7 +85,7 @@ class Rooms:
         self._responses: dict[str, Float64] = {}
 
     def heard(self, sound: Float32, room: str) -> Float32:
-        """Return a sound of a room as the microphone hears it.
+        """Return a sound of a room as received by the microphone.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Rooms:
         return heard.astype(np.float32)
 
     def _response(self, room: str) -> Float64:
-        """Make the impulse response from a room to the microphone: the sound, and its echoes."""
+        """Make the impulse response from a room to the microphone: direct sound and echoes."""
         place = (*ROOMS, OUTSIDE).index(room)
         rng = generator(self._seed, 3, place, ROOMS.index(self._microphone))
         seconds = max(_REVERBERATION[room], _REVERBERATION[self._microphone])
@@ -129,14 +129,14 @@ class Rooms:
 
 
 def _dulled(sound: Float64, lost: float) -> Float64:
-    """Take the high frequencies, which walls take first."""
+    """Attenuate high frequencies, as walls do."""
     pole = _pole(lost)
     dulled: Float64 = lfilter([1.0 - pole], [1.0, -pole], sound)
     return dulled
 
 
 def _low_passed(spectrum: Float64, lost: float) -> Float64:
-    """Do the same to the spectrum of a noise that repeats itself."""
+    """Attenuate high frequencies in the spectrum of periodic noise."""
     pole = _pole(lost)
     turn = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, len(spectrum)))
     passed: Float64 = spectrum * np.abs((1.0 - pole) / (1.0 - pole * turn))
@@ -157,10 +157,10 @@ def _noise(
     hum: float = 0.0,
     passed: Callable[[Float64], Float64] = np.asarray,
 ) -> Float32:
-    """Make noise of so many dBFS, whose end its beginning follows.
+    """Make periodic noise of a level in dBFS.
 
-    Its amplitude falls with the frequency to the power of `slope`; `hum` is the share of its power
-    that is mains hum.
+    Its amplitude falls with the frequency to the power of `slope`; `hum` is the share of mains hum
+    in its power.
     """
     count = PERIOD_FRAMES * FRAME_SAMPLES
     frequency = np.maximum(np.fft.rfftfreq(count, 1.0 / SAMPLE_RATE), _LOWEST_HERTZ)
@@ -179,18 +179,18 @@ def _noise(
 
 _CACHE_BYTES = 96 << 20
 _MAX_PEAK = 0.9
-_PAUSE_FRAMES = 11  # shorter pauses of a sound belong to it
+_PAUSE_FRAMES = 11  # shorter pauses belong to the sound
 _FRAMES_AT_ONCE = 384
 _TINY = 1e-9
 
 
 class HeardSound(NamedTuple):
-    """A planned sound as loud as the microphone hears it.
+    """A planned sound at the level received by the microphone.
 
     Attributes
     ----------
     power : np.ndarray [shape=(n,)], float64
-        Mean square in each frame from its start on, pauses filled up.
+        Mean square of each frame from its start on, with pauses filled.
     """
 
     plan: PlannedSound
@@ -198,7 +198,7 @@ class HeardSound(NamedTuple):
 
 
 class Composition:
-    """What a microphone hears of a plan."""
+    """The sound of a plan as received by a microphone."""
 
     def __init__(self, plan: HomePlan, library: ClipLibrary, rooms: Rooms) -> None:
         self.plan = plan
@@ -234,13 +234,13 @@ class Composition:
         return FeatureStream(self, features)
 
     def heard(self, first: int, count: int) -> Iterator[HeardSound]:
-        """Yield the sounds that begin in some frames, as loud as they are heard."""
+        """Yield the sounds that begin in some frames, at their received level."""
         places = np.searchsorted(self._starts, (first, first + count))
         for sound in self.plan.sounds[places[0] : places[1]]:
             yield HeardSound(sound, np.float64(self._gain(sound) ** 2) * self._loudness(sound)[0])
 
     def floor_power(self, first: int, count: int) -> Float64:
-        """Return the mean square of what is steady.
+        """Return the mean square of the steady noise.
 
         Returns
         -------
@@ -252,7 +252,7 @@ class Composition:
         return power
 
     def busy(self, first: int, count: int) -> Bool:
-        """Tell which frames hold more than noise that repeats itself.
+        """Return which frames contain more than periodic noise.
 
         Returns
         -------
@@ -266,7 +266,7 @@ class Composition:
         return busy
 
     def state(self, frame: int) -> tuple[str, ...]:
-        """Return the names of the steady noises that are on in a frame."""
+        """Return the names of the active steady noises in a frame."""
         return tuple(name for name, gains in self._gains(frame, 1).items() if gains[1] > 0.0)
 
     def steady(self, state: tuple[str, ...]) -> Int16:
@@ -306,13 +306,13 @@ class Composition:
         return gains
 
     def _sounds(self, first: int, end: int) -> list[PlannedSound]:
-        """Find the sounds that are heard in some frames, in the order of the plan."""
+        """Find the audible sounds in some frames, in the order of the plan."""
         places = np.searchsorted(self._starts, (first - self._reach, end))
         near = self.plan.sounds[places[0] : places[1]]
         return [sound for sound in near if _heard_until(sound) > first]
 
     def _wet(self, sound: PlannedSound) -> Float32:
-        """Return a sound as it is heard, shape (frames, FRAME_SAMPLES), for a level of 0 dBFS."""
+        """Return a sound as received, shape (frames, FRAME_SAMPLES), for a level of 0 dBFS."""
 
         def make() -> Float32:
             dry = self._library.sound(sound.clip, sound.frames)
@@ -321,7 +321,7 @@ class Composition:
         return self._heard((sound.clip.name, sound.frames, sound.room), make)
 
     def _loudness(self, sound: PlannedSound) -> tuple[Float32, float]:
-        """Return the mean square of each frame, and the highest sample, for 0 dBFS."""
+        """Return the mean square of each frame and the highest sample, for a level of 0 dBFS."""
 
         def make() -> Float32:
             wet = self._wet(sound)
@@ -340,13 +340,13 @@ class Composition:
 class FeatureStream:
     """The features of a composition, in the order of the frames.
 
-    Where a frame and the one before hold only steady noise, they are looked up: that noise repeats
-    itself, and so do its features. Elsewhere the frames are composed and their features computed.
+    Features are looked up if a frame and its predecessor contain only steady noise, whose features
+    are periodic. Other frames are composed and their features computed.
 
     Parameters
     ----------
     features : FeatureSet
-        The features of a frame must depend on it and the frame before alone.
+        Its values of a frame must depend only on the frame and its predecessor.
     """
 
     def __init__(self, composition: Composition, features: FeatureSet) -> None:
@@ -356,7 +356,7 @@ class FeatureStream:
         self._tables: dict[tuple[str, ...], Float32] = {}
 
     def __call__(self, first: int, count: int) -> Float32:
-        """Return the features of frames: the same bits as those of their samples.
+        """Return the features of frames, bit-identical to the features of their samples.
 
         Returns
         -------
@@ -384,7 +384,7 @@ class FeatureStream:
         return np.concatenate(blocks)[before:]
 
     def _table(self, state: tuple[str, ...]) -> Float32:
-        """Return the features of steady noise, each frame behind the one before in its period."""
+        """Return the features of one period of steady noise, each frame after its predecessor."""
         if state not in self._tables:
             noise = full_scale(self._composition.steady(state))
             extractor = self._features.extractor()
@@ -402,7 +402,7 @@ def _quantised(mix: Float32) -> Int16:
 
 
 def full_scale(samples: Int16) -> Float32:
-    """Return samples as those of an audio file are read.
+    """Convert samples to floats as an audio file reader does.
 
     Parameters
     ----------
@@ -412,6 +412,6 @@ def full_scale(samples: Int16) -> Float32:
 
 
 def _runs(flags: Bool) -> list[tuple[int, int]]:
-    """Return where runs of true values begin and end."""
+    """Return the starts and ends of runs of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.view(np.int8), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""The plan of a simulated home: sounds with place and time, and the cast that makes them."""
+"""The plan of a simulated home: sounds with place and time, and their clips."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ BEDROOM, BATHROOM, KITCHEN, LIVING_ROOM = "bedroom", "bathroom", "kitchen", "liv
 ROOMS = (BEDROOM, BATHROOM, KITCHEN, LIVING_ROOM)
 
 FRIDGE, STREET, FAN = "fridge", "street", "fan"
-STEADY_FRAMES = 20  # in which a steady noise comes or goes
+STEADY_FRAMES = 20  # fade of a steady noise
 LONGEST_FRAMES = 1200  # of one sound
 
 
@@ -53,19 +53,18 @@ class PlannedSound:
 
     @property
     def end(self) -> int:
-        """The frame after the last one."""
+        """The frame after the last frame."""
         return self.start + self.frames
 
 
 @dataclass(frozen=True)
 class PlannedNoise:
-    """A steady noise that is on for some time.
+    """A steady noise during some time.
 
     Attributes
     ----------
     start, end : int
-        First frame, and the frame after the last one; it comes and goes within a second each,
-        inside of them.
+        First frame, and the frame after the last frame; including fades of a second each.
     """
 
     name: str
@@ -75,7 +74,7 @@ class PlannedNoise:
 
 @dataclass(frozen=True)
 class HomePlan:
-    """What sounds in a home."""
+    """The sounds of a simulated home."""
 
     frames: int
     sounds: Sequence[PlannedSound]
@@ -100,11 +99,11 @@ LEVELS: dict[str, Range] = {
     OTHER_NEGATIVE: (-26.0, -16.0),
 }
 _QUIETER_DB = {TELEVISION: 6.0, RADIO: 4.0}
-_SUSTAINED = {MUSIC, SHOWER, TAP_WATER, PHONE_RING}  # may go on for longer than their clips
+_SUSTAINED = {MUSIC, SHOWER, TAP_WATER, PHONE_RING}  # may last longer than their clips
 
 
 class Cast:
-    """Who sounds how: which clips are whose."""
+    """The assignment of clips to the origins of sounds."""
 
     def __init__(self, library: ClipLibrary, rng: np.random.Generator) -> None:
         self._library = library
@@ -116,18 +115,12 @@ class Cast:
             self._clips[VISITOR, label] = self._clips[TELEVISION, label] = others or own
 
     def of(self, origin: str, label: str) -> Sequence[HomeClip]:
-        """Return the clips of a label that may sound from an origin.
-
-        Returns
-        -------
-        sequence of Clip
-            Empty if there are none.
-        """
+        """Return the clips of a label for an origin; empty if there are none."""
         return self._clips.get((origin, label)) or self._library.of(label)
 
 
 class SoundCourse:
-    """One course of sounds of which none overlaps another."""
+    """A sequence of sounds without overlaps."""
 
     def __init__(self, cast: Cast, rng: np.random.Generator, end: int) -> None:
         self.now = 0
@@ -137,11 +130,11 @@ class SoundCourse:
         self._end = end
 
     def wait(self, seconds: Range) -> None:
-        """Let a random time pass."""
+        """Advance by a random time."""
         self.now += round(self._rng.uniform(*seconds) / FRAME_SECONDS)
 
     def wait_until(self, frame: int) -> None:
-        """Let time pass, if it is not that late already."""
+        """Advance to a frame, unless it has passed."""
         self.now = max(self.now, frame)
 
     def sound(
@@ -152,7 +145,7 @@ class SoundCourse:
         seconds: float | None = None,
         origin: str = RESIDENT,
     ) -> None:
-        """Add a clip, or as many as last for some seconds."""
+        """Add one clip, or enough clips to last some seconds."""
         clips = self._cast.of(origin, label)
         if not clips:
             return

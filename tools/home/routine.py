@@ -1,4 +1,4 @@
-"""Days of a person who lives alone as plans of sounds: real days, and one in some minutes."""
+"""Days of a person living alone as plans of sounds: full days, and one compressed day."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,23 +49,23 @@ DAY_FRAMES = round(86_400 / FRAME_SECONDS)
 _HOUR = 3600.0
 _DAY = 24 * _HOUR
 
-_NIGHT_COUGHS, _DAY_COUGHS = 4.0, 6.0  # bouts, on average
-_WORSE, _WORST = 0.5, 6.0  # more bouts each day, and at most, as a factor
+_NIGHT_COUGHS, _DAY_COUGHS = 4.0, 6.0  # average number of bouts
+_WORSE, _WORST = 0.5, 6.0  # additional bouts per day, and the limit, as factors
 _VISIT_CHANCE = (0.3, 0.7)  # on a weekday, at a weekend
 
 
 @dataclass(frozen=True)
 class Habits:
-    """What a simulated person does differently from others.
+    """The habits of a simulated person.
 
     Attributes
     ----------
     seed : int
-        Not negative; it draws the days, and who sounds how.
+        Not negative; determines the days and the clips.
     first_weekday : int
-        Of the first day, 0 for Monday.
+        Weekday of the first day, 0 for Monday.
     coughs_from : int or None
-        Day, from 0, from which on every night has more coughs than the one before.
+        Day, from 0, from which every night has more coughs than the night before.
     """
 
     seed: int = 0
@@ -101,7 +101,7 @@ def plan_days(days: int, library: ClipLibrary, habits: Habits) -> HomePlan:
 
 
 class _Day:
-    """One day: what is done when, and then the sounds of it."""
+    """One day: its schedule, then the resulting sounds."""
 
     def __init__(self, number: int, cast: Cast, habits: Habits) -> None:
         self._rng = generator(habits.seed, 1, number)
@@ -122,13 +122,13 @@ class _Day:
         self.steady: list[PlannedNoise] = []
 
     def sounds(self) -> list[PlannedSound]:
-        """Return all sounds of the day by their start."""
+        """Return all sounds of the day, sorted by start."""
         voices = (self._person, self._television, self._radio, self._outside)
         found = [sound for voice in voices for sound in voice.sounds]
         return sorted(found, key=lambda sound: (sound.start, sound.origin))
 
     def live(self) -> None:
-        """Draw what is done when, and do it in that order."""
+        """Draw the schedule of the day, and carry it out in order."""
         rng = self._rng
         up = (8.2 if self._weekend else 7.0) + rng.normal(0.0, 0.3)
         bed = 22.6 + rng.normal(0.0, 0.3)
@@ -237,7 +237,7 @@ class _Day:
             person.wait((0.2, 6.0))
 
     def _watch(self, least: float, most: float) -> None:
-        """Turn the television on, which goes on by itself."""
+        """Turn the television on; it continues by itself."""
         self._play(self._television, TELEVISION, LIVING_ROOM, self._rng.uniform(least, most))
         if self._rng.random() < 0.5:
             self._person.wait((300.0, 1500.0))
@@ -278,7 +278,7 @@ class _Day:
         self._person.sound(TAP_WATER, BATHROOM, "washing", self._rng.uniform(5.0, 30.0))
 
     def _hum(self) -> None:
-        """Let the fridge come and go, and the street be heard by day."""
+        """Add the fridge, on and off, and the street by day."""
         rng = self._rng
         self.steady.append(
             PlannedNoise(
@@ -308,7 +308,7 @@ _EVENT_SECONDS = {
     SHOWER: (30.0, 60.0),
     TAP_WATER: (4.0, 15.0),
 }
-# Parts of the day: their seconds in a day of 24 minutes, the room, and what is heard there.
+# Parts of the day: their seconds in a day of 24 minutes, the room, and the sounds.
 _DAY_PARTS = (
     ("night", 110, BEDROOM, RESIDENT, "coughing"),
     ("getting up", 110, BATHROOM, RESIDENT, "flushing_water tap_water shower"),
@@ -349,11 +349,11 @@ _DAY_PARTS = (
     ("night", 70, BEDROOM, RESIDENT, "coughing"),
 )
 _ROOMS = {FLUSHING_WATER: BATHROOM, SHOWER: BATHROOM}
-_DEVICES = {SPEECH, MUSIC, LAUGHING}  # what comes from a television
+_DEVICES = {SPEECH, MUSIC, LAUGHING}  # sounds of a television
 
 
 def plan_short_day(minutes: float, library: ClipLibrary, seed: int) -> HomePlan:
-    """Plan a day in the life of a person living alone, compressed into some minutes.
+    """Plan a day of a person living alone, compressed into some minutes.
 
     A shorter day has less silence between the sounds, and then fewer of them (10 minutes hold about
     three quarters of what 24 do).
@@ -389,7 +389,7 @@ def plan_short_day(minutes: float, library: ClipLibrary, seed: int) -> HomePlan:
 def _placed(
     rng: np.random.Generator, seconds: float, labels: list[str]
 ) -> list[tuple[float, float, str]]:
-    """Place the sounds that fit, in their order, with random silences between them."""
+    """Place the sounds that fit, in order, with random silences between them."""
     chosen, left = [], seconds - _MIN_SILENCE
     for label in labels:
         length = rng.uniform(*_EVENT_SECONDS[label])
@@ -404,7 +404,7 @@ def _placed(
 
 
 def _steady(rng: np.random.Generator, frames: int) -> list[PlannedNoise]:
-    """Let the street be heard by day, and the fridge come and go."""
+    """Add the street by day, and the fridge, on and off."""
     steady = [PlannedNoise(STREET, round(0.08 * frames), round(0.9 * frames))]
     begin = round(rng.uniform(10.0, 60.0) / FRAME_SECONDS)
     while begin < frames:

@@ -31,7 +31,7 @@ from hearthlog.tools.home.plan import LIVING_ROOM, PlannedSound
 from hearthlog.tools.home.routine import DAY_FRAMES, plan_short_day
 from hearthlog.tools.home.sounds import LABELS, SimulationError, generator, synthesize
 
-_PUSHED_FRAMES = 200  # as `FileSource` yields them, with a report of health before
+_PUSHED_FRAMES = 200  # as from `FileSource`, after a health report
 _COMPUTED_FRAMES = 12_000  # 10 minutes
 
 
@@ -42,23 +42,23 @@ def record_composition(
     device: str = "simulated home",
     progress: Progress = ignore_progress,
 ) -> list[Path]:
-    """Write the logs that a recorder would leave of a home.
+    """Write the logs of a simulated home as a recorder would.
 
-    Only for a model that takes embeddings all of the sound is composed; for others, most of it is
-    not.
+    The complete sound is composed only for a model that uses embeddings; for other models most of
+    it is not.
 
     Parameters
     ----------
     settings : Settings
-        Its model labels the sound, by embeddings of its network if it takes any; clips are not
+        Its model labels the sound, with embeddings of its network if it uses any; clips are not
         kept.
     start : int
-        Time of the first sample, in nanoseconds of UTC.
+        Time of the first sample in nanoseconds of UTC.
 
     Raises
     ------
     ModelError
-        If the model cannot be used, or the network of its embeddings is not there.
+        If the model cannot be used, or its embedding network is missing.
     LogError
         If a log exists, or cannot be written.
     """
@@ -84,9 +84,9 @@ def record_composition(
 
 
 def embedder_of(model: Model | None) -> Embedder | None:
-    """Load the network of the embeddings that a model takes, if it takes any.
+    """Load the embedding network of a model; None if the model uses none.
 
-    Raise `ModelError` if it is not there, or cannot be used.
+    Raise `ModelError` if the network is missing or cannot be used.
     """
     space = None if model is None else model.description.embedding_space
     return None if space is None else load_embedder(space.network, network_path(space.network))
@@ -99,7 +99,7 @@ def write_sound(
     frames: int,
     progress: Progress = ignore_progress,
 ) -> None:
-    """Write some of a composition as a FLAC file, 16 kHz mono.
+    """Write part of a composition as a FLAC file, 16 kHz mono.
 
     Raise `OSError` if the file exists or cannot be written. Raise `LibsndfileError` if it
     cannot be encoded.
@@ -121,7 +121,7 @@ def _blocks(composition: Composition, first: int, frames: int) -> Iterator[tuple
 def _messages(
     composition: Composition, pipeline: Pipeline, start: int, device: str, progress: Progress
 ) -> Iterator[list[EncodedMessage]]:
-    """Yield what the pipeline makes of the sound, and of the health of its source."""
+    """Yield the pipeline's messages for the sound, and the health of its source."""
     frames = composition.plan.frames
     if pipeline.embedding is not None:
         for first, samples in _blocks(composition, 0, frames):
@@ -141,21 +141,21 @@ def _messages(
         progress((block + len(values)) / frames)
 
 
-LabelledSpan = tuple[float, float, str]  # seconds from the start, and the label
+LabelledSpan = tuple[float, float, str]  # start and end in seconds, and the label
 
-_AUDIBLE_DB = 0.0  # over what is steady
+_AUDIBLE_DB = 0.0  # dB over the steady noise
 _PLANNED = ("start", "end", "label", "from", "room", "activity", "clip", "source_group", "made_up")
 _HEARD = ("level_dbfs", "heard_seconds")
 _TINY = 1e-30
 
 
 class TrueEvent(NamedTuple):
-    """A planned sound, and what the microphone hears of it.
+    """A planned sound at the level received by the microphone.
 
     Attributes
     ----------
     level : float
-        Of its loudest frame as it is heard, in dBFS.
+        Level of its loudest frame as received, in dBFS.
     """
 
     plan: PlannedSound
@@ -164,13 +164,13 @@ class TrueEvent(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """What is true of a composition.
+    """The true labels and sounds of a composition.
 
     Attributes
     ----------
     spans : list of LabelledSpan
-        Without gaps: a frame has the label of the loudest sound that is audible in it, which is
-        that as loud as all steady noise; silence where there is none.
+        Without gaps. A frame has the label of its loudest audible sound, else silence; a
+        sound is audible if it is at least as loud as all steady noise.
     """
 
     spans: list[LabelledSpan]
@@ -178,10 +178,10 @@ class Truth(NamedTuple):
 
 
 def truth_of(composition: Composition) -> Truth:
-    """Tell the truth of a composition, without composing its sound."""
+    """Compute the truth of a composition, without composing its sound."""
     events: list[TrueEvent] = []
     runs: list[tuple[int, int, str]] = []
-    held: list[tuple[int, HeardSound]] = []  # that go on from one day to the next
+    held: list[tuple[int, HeardSound]] = []  # sounds that continue into the next day
     for first in range(0, composition.plan.frames, DAY_FRAMES):
         count = min(DAY_FRAMES, composition.plan.frames - first)
         begun = enumerate(composition.heard(first, count), start=len(events))
@@ -202,7 +202,7 @@ def truth_of(composition: Composition) -> Truth:
 def write_truth(truth: Truth, spans: Path, events: Path) -> None:
     """Write a label track for Audacity, and a table of the sounds.
 
-    Raise `OSError` if one cannot be written.
+    Raise `OSError` if one of the files cannot be written.
     """
     with spans.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(f"{start:.6f}\t{end:.6f}\t{label}\n" for start, end, label in truth.spans)
@@ -234,7 +234,7 @@ def _event(sound: HeardSound) -> TrueEvent:
 
 
 def _loudest(sounds: list[tuple[int, HeardSound]], floor: Float64, first: int) -> Int64:
-    """Return the number of the loudest audible sound of each frame, -1 where there is none."""
+    """Return the index of the loudest audible sound in each frame; -1 for none."""
     power = floor * 10.0 ** (_AUDIBLE_DB / 10.0)
     loudest = np.full(len(floor), -1)
     for number, sound in sounds:
@@ -254,7 +254,7 @@ def _runs(values: Int64) -> Iterator[tuple[int, int, int]]:
 
 
 def _spans(runs: list[tuple[int, int, str]]) -> list[LabelledSpan]:
-    """Join runs of one label."""
+    """Merge adjacent spans of one label."""
     spans: list[LabelledSpan] = []
     for begin, end, label in runs:
         start = begin * FRAME_SECONDS
@@ -282,13 +282,13 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
     Returns
     -------
     Path
-        `manifest.csv` in the folder: path (relative to the folder), label, source_group (one a
+        `manifest.csv` in the folder: path (relative to the folder), label, source_group (one per
         clip), source, licence, seconds.
 
     Raises
     ------
     SimulationError
-        If the folder holds something or cannot be written, or if one of the numbers is too low.
+        If the folder is not empty or cannot be written, or if one of the numbers is too low.
     """
     if clips_per_class < 1:
         raise SimulationError(f"a training set has at least 1 clip a class, not {clips_per_class}")
@@ -316,9 +316,9 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
 
 
 def write_day(path: Path, minutes: float, seed: int, manifest: Path | None = SHIPPED) -> Truth:
-    """Write a day in the life of a person living alone, compressed into some minutes.
+    """Write a day of a person living alone, compressed into some minutes.
 
-    The true labels are written beside the audio, as a label track for Audacity (`.txt`), and the
+    The true labels are written next to the audio, as a label track for Audacity (`.txt`), and the
     sounds one by one as a table (`.csv`).
 
     Parameters
@@ -330,7 +330,7 @@ def write_day(path: Path, minutes: float, seed: int, manifest: Path | None = SHI
     seed : int
         Not negative. The same arguments give the same bytes.
     manifest : Path or None
-        Of the clips; None for made-up sounds alone.
+        Manifest of the clips; None for synthetic sounds alone.
 
     Raises
     ------
@@ -358,7 +358,7 @@ def write_day(path: Path, minutes: float, seed: int, manifest: Path | None = SHI
 
 @contextmanager
 def reported(path: Path) -> Iterator[None]:
-    """Turn errors of the file system and of the encoder into one line."""
+    """Convert errors of the file system and of the encoder to one line."""
     try:
         yield
     except OSError as error:

@@ -1,6 +1,6 @@
-"""Sounds of a simulated home.
+"""Synthetic sounds of a simulated home.
 
-They are caricatures: rhythm, pitch and colour are right, so that a model can tell them apart, and
+The sounds are caricatures: rhythm, pitch and colour are right, so a model can distinguish them, and
 no two are the same. A model trained on them is useless in a real home.
 """
 
@@ -13,7 +13,7 @@ from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
-# First three formants of a man's vowels (Peterson & Barney 1952), and a fixed fourth.
+# First three formants of a man's vowels (Peterson & Barney 1952), and a constant fourth.
 _VOWELS = {
     "a": (730, 1090, 2440, 3400),
     "e": (530, 1840, 2480, 3400),
@@ -41,9 +41,9 @@ class Train:
     Attributes
     ----------
     starts : np.ndarray [shape=(count,)], intp
-        Samples at which the elements start.
+        First samples of the elements.
     lengths : np.ndarray [shape=(count,)], float64
-        Samples that they last.
+        Lengths of the elements in samples.
     """
 
     def __init__(  # noqa: PLR0913 - five ranges describe a rhythm
@@ -70,7 +70,7 @@ class Train:
         self.count = len(self.starts)
 
     def ends(self) -> Indices:
-        """Return the samples at which elements end, inside the sound.
+        """Return the samples at which elements end, within the sound.
 
         Returns
         -------
@@ -87,7 +87,7 @@ class Train:
         gains : np.ndarray [shape=(count,)], float64
             Height of each element.
         attack, release : float
-            Shares of an element in which it rises and falls, 0 to 1.
+            Shares of an element for the rise and the fall, 0 to 1.
 
         Returns
         -------
@@ -178,7 +178,7 @@ def _resonance(frequency: float, bandwidth: float) -> tuple[float, float]:
 
 
 def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
-    """Return decaying sines, as of struck objects.
+    """Return decaying sines, as from struck objects.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ _SCALES = ((0, 2, 4, 5, 7, 9, 11), (0, 2, 3, 5, 7, 8, 10))  # major, minor; semi
 
 
 class SimulationError(HearthlogError):
-    """The simulated home cannot make what was asked for."""
+    """The simulated home cannot fulfil a request."""
 
 
 class RoomTone:
@@ -317,7 +317,7 @@ class RoomTone:
         self._rng = rng
         self._level = _amplitude(rng.uniform(-65.0, -60.0))
         self._pole = rng.uniform(0.85, 0.95)
-        self._gain = np.sqrt(1.0 - self._pole**2)  # a noise of power 1 keeps its power
+        self._gain = np.sqrt(1.0 - self._pole**2)  # keeps the power of noise of power 1
         self._state = np.zeros(1)
 
     def __call__(self, samples: int) -> Float64:
@@ -334,7 +334,7 @@ class RoomTone:
 
 
 def synthesize(label: str, seconds: float, seed: int) -> Float32:
-    """Make one sound, with the room's background noise.
+    """Synthesise one sound, with the room's background noise.
 
     Parameters
     ----------
@@ -351,7 +351,7 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
     Raises
     ------
     SimulationError
-        If there is no such sound, if it cannot last that long, or if the seed is negative.
+        If there is no such sound, its duration is out of range, or the seed is negative.
     """
     samples = round(seconds * SAMPLE_RATE) if 0 < seconds <= _MAX_SECONDS else 0
     if samples < 1:
@@ -366,7 +366,7 @@ def generator(*seed: int) -> np.random.Generator:
     Parameters
     ----------
     *seed : int
-        A seed, and further integers that tell its uses apart. None is negative.
+        A seed, and further integers that distinguish its uses. None is negative.
 
     Raises
     ------
@@ -379,7 +379,7 @@ def generator(*seed: int) -> np.random.Generator:
 
 
 def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
-    """Make one sound without the room; its ends are faded.
+    """Synthesise one sound without the room; its ends are faded.
 
     Parameters
     ----------
@@ -399,8 +399,8 @@ def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
     if label not in _SOUNDS:
         raise SimulationError(f"no sound is called {label!r}; there are {', '.join(LABELS)}")
     make, levels = _SOUNDS[label]
-    distance = rng.uniform()  # 0 beside the microphone, 1 behind a door
-    # A one-pole low-pass: distance and doors take the high frequencies first.
+    distance = rng.uniform()  # 0 next to the microphone, 1 behind a door
+    # A one-pole low-pass: distance and doors attenuate high frequencies first.
     pole = _MAX_DULLNESS * distance
     sound = lfilter([1.0 - pole], [1.0, -pole], make(rng, samples))
     sound -= sound.mean()
@@ -549,7 +549,7 @@ def _tap_water(rng: np.random.Generator, samples: int) -> Float64:
     return stream + rng.uniform(0.3, 0.8) * bubbles / (bubbles.std() + _TINY) * stream.std()
 
 
-# How each sound is made, and its level in dBFS beside the microphone.
+# The synthesis of each sound, and its level in dBFS next to the microphone.
 _SOUNDS: dict[str, tuple[Callable[[np.random.Generator, int], Float64], Range]] = {
     "silence": (_silence, (-99.0, -99.0)),
     "speech": (_speech, (-34.0, -24.0)),

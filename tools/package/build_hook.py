@@ -1,4 +1,4 @@
-"""Build of the wheel: what hatchling cannot be told in pyproject.toml."""
+"""Build hook of the wheel: settings that hatchling does not support in pyproject.toml."""
 
 from typing import Any
 
@@ -6,17 +6,17 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class PackageHook(BuildHookInterface):  # type: ignore[type-arg]
-    """Puts the package itself at the top of the wheel: it lies below `tools`, which has a place."""
+    """Adds the files below `tools/package` at the top of the wheel."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Add them, unless the install is editable.
+        """Add the files, unless the install is editable.
 
         Parameters
         ----------
         version : str
             `standard` or `editable`.
         build_data : dict
-            What is built, changed in place.
+            Build settings, changed in place.
         """
         if version == "standard":
-            build_data["force_include"]["tools/package/hearthlog"] = "/"  # which is hearthlog
+            build_data["force_include"]["tools/package/hearthlog"] = "/"  # the package hearthlog

@@ -1,1 +1,1 @@
-"""The recorder as a service of systemd."""
+"""The recorder as a systemd service."""

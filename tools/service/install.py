@@ -1,4 +1,4 @@
-"""The recorder or the bridge made a service: checked, written, enabled and started."""
+"""Installation of the recorder or the bridge as a service: check, write, enable and start."""
 
 import json
 import os
@@ -38,10 +38,10 @@ _REHEARSAL_SECONDS = 120
 
 
 def install_for_system(account: str, config: Path | None) -> Installed:
-    """Make the recorder a service of this machine, and start it, or start it anew.
+    """Install the recorder as a system service, and start or restart it.
 
-    Raise `ConfigurationError` if the configuration is wrong. Raise `ServiceError` if it cannot
-    be for another reason. Nothing was written then, unless it did not start.
+    Raise `ConfigurationError` if the configuration is invalid. Raise `ServiceError` for other
+    failures. Nothing is written on failure, unless only the start failed.
     """
     check_root()
     unit = place_of(SYSTEM_UNITS, NAME)
@@ -58,7 +58,7 @@ def install_for_system(account: str, config: Path | None) -> Installed:
 
 
 def install_for_user(config: Path | None) -> Installed:
-    """Make the recorder a service of the user, in the current folder, and start it or again.
+    """Install the recorder as a user service in the current folder, and start or restart it.
 
     Raise `ConfigurationError, ServiceError` as `install_for_system`.
     """
@@ -80,7 +80,7 @@ def _person(account: str) -> pwd.struct_passwd:
 
 
 def _rehearse(folder: Path, config: Path | None, person: pwd.struct_passwd | None) -> Needs:
-    """Ask what the recorder needs, as the user that will run it, without our variables."""
+    """Determine the recorder's needs as the user that will run it, without our variables."""
     command = [*module_command("hearthlog.tools.service.rehearsal"), str(folder)]
     env = {name: value for name, value in os.environ.items() if not name.startswith("HEARTHLOG_")}
     as_whom: dict[str, Any] = {}
@@ -118,24 +118,24 @@ def _cannot_run(person: pwd.struct_passwd | None, reason: str) -> str:
     )
 
 
-RECORDER = "hearthlog"  # the user of the recorder
+RECORDER = "hearthlog"  # user of the recorder
 
 
 def install_bridge(config: Path, account: str | None) -> Installed:
-    """Make the bridge a service of this machine, and start it, or start it anew.
+    """Install the bridge as a system service, and start or restart it.
 
     Parameters
     ----------
     account : str or None
-        The user that it is run by; by default one of its own, who may read logs that the group of
-        the recorder may read, and write none.
+        User that runs the bridge; by default a user of its own, which may read logs readable by the
+        recorder's group, and write none.
 
     Raises
     ------
     ConfigurationError
-        If the configuration is wrong.
+        If the configuration is invalid.
     ServiceError
-        If it cannot be for another reason. Nothing was written then, unless it did not start.
+        For other failures. Nothing is written on failure, unless only the start failed.
     """
     check_root()
     unit = place_of(SYSTEM_UNITS, BRIDGE_NAME)
@@ -143,7 +143,7 @@ def install_bridge(config: Path, account: str | None) -> Installed:
     check_program_seen()
     check_seen("the configuration", config)
     for name in [name for name in os.environ if name.startswith("HEARTHLOG_")]:
-        del os.environ[name]  # the service will have none of them
+        del os.environ[name]  # the service will not have these variables
     settings, bridge = load_bridge_settings(config)
     if not bridge.has_outputs():
         raise ServiceError(
@@ -167,11 +167,11 @@ def install_bridge(config: Path, account: str | None) -> Installed:
 
 
 def _check_files(bridge: BridgeSettings) -> None:
-    """Check that the service sees what it reads besides; a relative name is of a credential."""
+    """Check that the service sees its further input files; a relative name is a credential's."""
     tables = bridge.mqtt, bridge.page, bridge.delivery, bridge.prometheus, bridge.ping
     for table in (each for each in tables if each is not None):
         for key, path in table:
-            if isinstance(path, Path) and path.is_absolute() and key != "text_file":  # is written
+            if isinstance(path, Path) and path.is_absolute() and key != "text_file":  # an output
                 check_seen(key, path)
 
 

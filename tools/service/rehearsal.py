@@ -1,7 +1,7 @@
-"""What the service will find at its start: tried as the user that it is run by.
+"""Start conditions of the service, checked as the user that will run it.
 
-A process of its own: ``rehearsal FOLDER [CONFIG]``. It answers in one line of JSON, with what the
-unit must allow, or with an error.
+Runs as a separate process: ``rehearsal FOLDER [CONFIG]``. It prints one line of JSON with the
+permissions that the unit must grant, or with an error.
 """
 
 import json
@@ -22,10 +22,10 @@ from hearthlog.tools.service.unit import STATE, Needs
 
 
 def main() -> None:
-    """Answer what the recorder needs, or why it cannot start."""
+    """Report the needs of the recorder, or the reason why it cannot start."""
     folder = Path(sys.argv[1])
     config = Path(sys.argv[2]) if len(sys.argv) > 2 else None
-    with suppress(FileNotFoundError):  # systemd makes it
+    with suppress(FileNotFoundError):  # systemd creates it
         os.chdir(folder)
     try:
         answer = asdict(_rehearsed(load_settings(config, {}, {}), folder))
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def _rehearsed(settings: Settings, folder: Path) -> Needs:
-    """Return what a recorder needs, once it is known that it would start."""
+    """Return the needs of a recorder after checking that it would start."""
     output = folder / settings.output
     _check_folder(output, folder)
     is_made = output.is_relative_to(STATE) and not os.access(STATE, os.W_OK)  # by systemd
@@ -48,7 +48,7 @@ def _rehearsed(settings: Settings, folder: Path) -> Needs:
 
 
 def _check_folder(output: Path, folder: Path) -> None:
-    """Check a folder of logs, which must be there if it is outside of that of the service."""
+    """Check a folder of logs, which must exist if it is outside the service's folder."""
     user = pwd.getpwuid(os.getuid()).pw_name
     if not output.is_relative_to(folder) and not output.is_dir():
         raise LogError(f"{output}: no such folder; make it, and give it to {user}")

@@ -1,7 +1,7 @@
-"""Listens to a home for years: sound to features and labels every 50 ms, in MCAP logs.
+"""Long-term sound monitoring of a home: features and labels every 50 ms, in MCAP logs.
 
-What is public is in `__all__`; all other modules may change from one version to the next. The names
-are imported when they are used: `import hearthlog` costs a recorder nothing.
+The public API is `__all__`; all other modules may change between versions. Names are imported on
+first use, so `import hearthlog` costs a recorder nothing.
 """
 
 from importlib import import_module
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hearthlog._training import Comparison, compare, train
     from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 
-if not Path(__file__).with_name("schemas").is_dir():  # a clone, installed to be edited
+if not Path(__file__).with_name("schemas").is_dir():  # an editable install of a clone
     __path__.append(str(Path(__file__).parents[3]))
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Read logs as arrays, tables, segments and marks: `open_logs` and `follow`."""
+"""Logs as arrays, tables, segments and marks: `open_logs` and `follow`."""
 
 import warnings
 from collections.abc import Collection, Iterator
@@ -51,17 +51,17 @@ __all__ = ["Bearings", "Columns", "Labelling", "Logs", "Mark", "follow", "open_l
 
 
 class Logs:
-    """A log, or the logs of a folder, and the layers beside them, as `open_logs` returns them.
+    """A log or a folder of logs with their layers, as returned by `open_logs`.
 
-    All times are integers: nanoseconds of UTC since 1970. A topic that has no message in the span
-    of time is read as a table without rows.
+    All times are integers: nanoseconds of UTC since 1970. A topic without messages in the time span
+    is read as a table without rows.
 
     Attributes
     ----------
     path : Path
-        Of the log or the folder.
+        Path of the log or the folder.
     start, end : int or None
-        Span of time to read, as log times: from `start` on, before `end`; None for no limit.
+        Time span to read, as log times: from `start` on, before `end`; None for no limit.
     """
 
     def __init__(self, path: Path, start: int | None = None, end: int | None = None) -> None:
@@ -72,12 +72,12 @@ class Logs:
 
     @property
     def paths(self) -> list[Path]:
-        """Logs and layers that have messages in the span of time, in the order of time."""
+        """Logs and layers with messages in the time span, in order of time."""
         return list(self._selection.logs)
 
     @property
     def topics(self) -> dict[str, str]:
-        """Topics of these logs and layers, each with its message type."""
+        """Topics of these logs and layers, with their message types."""
         channels = self._selection.channels
         named = {topic: schema for topic, same in channels.items() for _, schema in same}
         return {topic: schema.name if schema else "" for topic, schema in sorted(named.items())}
@@ -95,17 +95,17 @@ class Logs:
 
     @property
     def labellings(self) -> dict[str, list[str]]:
-        """Names of the labellings of each microphone, as `segments` takes them."""
+        """Names of the labellings of each microphone, for `segments`."""
         named = {name: self._labellings.names(name) for name in self.microphones}
         return {name: names for name, names in named.items() if names}
 
     def columns(self, topic: str, fields: Collection[str] | None = None) -> Columns:
-        """Read a topic as numpy arrays, one row a message.
+        """Read a topic as numpy arrays, one row per message.
 
         Parameters
         ----------
         topic : str
-            One of `topics`, or of another span of time.
+            One of `topics`, or a topic of another time span.
         fields : collection of str, optional
             Paths of the fields to read, such as `header.stamp`; all by default.
 
@@ -121,7 +121,7 @@ class Logs:
         Warns
         -----
         HearthlogWarning
-            If a chunk is left out because it is damaged.
+            If a damaged chunk is skipped.
 
         Examples
         --------
@@ -137,12 +137,12 @@ class Logs:
         return columns[topic] if columns else join(decode(selection.no_messages(), fields))
 
     def arrow(self, topic: str) -> "pa.Table":
-        """Read a topic as an Arrow table, with the columns that `hearthlog export` gives Parquet.
+        """Read a topic as an Arrow table, with the same columns as `hearthlog export` to Parquet.
 
         Parameters
         ----------
         topic : str
-            As of `columns`.
+            As in `columns`.
 
         Returns
         -------
@@ -153,10 +153,10 @@ class Logs:
         Raises
         ------
         LogError
-            If there is no such topic, or the topic has several types, or a field of a type changed
+            If there is no such topic, or the topic has several types, or a field changed its type
             so that no column holds all of its values.
         HearthlogError
-            If pyarrow is not installed; it is a `ModuleNotFoundError` too.
+            If pyarrow is not installed; also a `ModuleNotFoundError`.
 
         Examples
         --------
@@ -178,23 +178,23 @@ class Logs:
         Parameters
         ----------
         topic : str
-            As of `columns`.
+            As in `columns`.
 
         Returns
         -------
         pandas.DataFrame
-            One row a message; the index is the log time, of type `datetime64[ns, UTC]`. Elements of
-            arrays are called as the log names them (`values.energy`, `probabilities.speech`), else
-            by number (`values.0`); an image, or another array of more than 4096 elements without
-            names, is one column. A field that only some definitions of the type have is missing in
-            the other messages, with a `HearthlogWarning`.
+            One row per message; the index is the log time, of type `datetime64[ns, UTC]`. Elements
+            of arrays are named as in the log (`values.energy`, `probabilities.speech`), else by
+            number (`values.0`); an image, or another array of more than 4096 elements without
+            names, is one column. A field that only some definitions of the type have is
+            missing in the other messages, with a `HearthlogWarning`.
 
         Raises
         ------
         LogError
             If there is no such topic.
         HearthlogError
-            If pandas is not installed; it is a `ModuleNotFoundError` too.
+            If pandas is not installed; also a `ModuleNotFoundError`.
 
         Examples
         --------
@@ -227,31 +227,31 @@ class Logs:
         return frame if index.is_monotonic_increasing else frame.sort_index(kind="stable")
 
     def segments(self, labelling: str = "live", microphone: str | None = None) -> Labelling:
-        """Read the spans of time that a recorder, a relabelling or a reviewer has labelled.
+        """Read the labelled time spans of a recorder, a relabelling or a reviewer.
 
         Parameters
         ----------
         labelling : str
             `live`, `review`, the name of a model, or `relabel` if there is only one.
         microphone : str, optional
-            By default the only one.
+            Name of the microphone; by default the only microphone.
 
         Returns
         -------
         Labelling
-            In the order of time; no two segments overlap.
+            In order of time; no two segments overlap.
 
         Raises
         ------
         DataError
             If there is no such labelling, or there are several microphones.
         LogError
-            If there is no segment in this span of time.
+            If there is no segment in the time span.
 
         Warns
         -----
         HearthlogWarning
-            If a log is left out because it is damaged.
+            If a damaged log is skipped.
 
         Examples
         --------
@@ -267,17 +267,17 @@ class Logs:
         return segments
 
     def directions(self, labelling: str = "live", microphone: str | None = None) -> Bearings:
-        """Compute whence the sound of each segment came, of an array of microphones.
+        """Compute the direction of the sound of each segment, for a microphone array.
 
         Parameters
         ----------
         labelling, microphone : str, optional
-            As of `segments`.
+            As in `segments`.
 
         Returns
         -------
         Bearings
-            Of each segment of `segments`.
+            One row per segment of `segments`.
 
         Raises
         ------
@@ -301,18 +301,17 @@ class Logs:
         return mean_bearings(columns["header.stamp"], vectors, segments.starts, segments.ends)
 
     def marks(self, scenario: str = "") -> list[Mark]:
-        """Read the marks of reviewers, which correct labels.
+        """Read the marks with which reviewers corrected labels.
 
         Parameters
         ----------
         scenario : str, optional
-            The marks of this scenario, by its name, instead of those of the sounds of the home.
+            Name of a scenario, to read its marks instead of the marks of the home's sounds.
 
         Returns
         -------
         list of Mark
-            Those that begin or end in the span of time, or last all through it; in the order of
-            their starts.
+            Marks that begin or end in the time span, or last all through it; in order of start.
 
         Raises
         ------
@@ -335,7 +334,7 @@ class Logs:
         return find_labellings(self.path)
 
     def _select(self, topic: str) -> LogSelection:
-        """Select one topic, which may be only in logs outside of the span of time."""
+        """Select one topic, which may have messages only outside the time span."""
         selection = self._selection
         if topic not in selection.channels:
             selection = replace(selection, channels=select(with_layers(self.path)).channels)
@@ -351,7 +350,7 @@ def open_logs(path: Path | str, start: int | None = None, end: int | None = None
     Parameters
     ----------
     path : Path or str
-        Logs in a folder may lie at any depth. Of a log, the layers beside it belong to it.
+        Logs in a folder may lie at any depth. The layers next to a log are included.
     start, end : int, optional
         Log times in nanoseconds of UTC: from `start` on, before `end`.
 
@@ -362,7 +361,7 @@ def open_logs(path: Path | str, start: int | None = None, end: int | None = None
     Raises
     ------
     LogError
-        If there is no log, or nothing of it can be read.
+        If there is no log, or no part of the logs can be read.
 
     Examples
     --------
@@ -381,7 +380,7 @@ def follow(
     start: int | None = None,
     stop: Event | None = None,
 ) -> Iterator[list[Columns]]:
-    """Read the logs of a folder as a recorder writes them, from file to file.
+    """Follow the logs of a folder while a recorder writes them, from file to file.
 
     Parameters
     ----------
@@ -389,20 +388,19 @@ def follow(
     topics : collection of str, optional
         Names of the topics; all by default.
     start : int, optional
-        Log time in nanoseconds of UTC from which on messages are read; by default those that are
-        written from now on.
+        Log time of the first message, in nanoseconds of UTC; by default only new messages.
     stop : threading.Event, optional
-        Ends the reading when it is set; by default it never ends.
+        Ends the iteration when set; by default it never ends.
 
     Yields
     ------
     list of Columns
-        What was written to one log since the last time, in the order of time.
+        New messages of one log, in order of time.
 
     Raises
     ------
     LogError
-        If there is no such folder, or no more, or if a log cannot be read or is damaged.
+        If the folder does not exist or disappears, or if a log cannot be read or is damaged.
 
     Examples
     --------
@@ -415,7 +413,7 @@ def follow(
 
 
 def _read_table(selection: LogSelection) -> tuple[Table, list[list[TypedColumns]]]:
-    """Read a topic whose messages fit into one table; LogError if they do not."""
+    """Read a topic whose messages fit into one table; raise LogError if they do not."""
     ((topic, channels),) = selection.channels.items()
     batches = list(filter(None, map(decode_all, selection.messages())))
     batches = batches or [decode_all(selection.no_messages())]
@@ -426,7 +424,7 @@ def _read_table(selection: LogSelection) -> tuple[Table, list[list[TypedColumns]
 
 
 def _series(pandas: Any, columns: Columns, path: str, field: Field) -> dict[str, Any]:
-    """Make the columns of a field; those of an array are its elements, unless it is an image."""
+    """Make the columns of a field; an array gives one per element, unless it is an image."""
     values = columns[path]
     if (
         values.ndim == 2
@@ -444,7 +442,7 @@ def _series(pandas: Any, columns: Columns, path: str, field: Field) -> dict[str,
 
 
 def _with_missing(series: Any, rows: NDArray[np.intp], count: int) -> Any:
-    """Spread values over rows; the others are missing, and whole numbers stay whole."""
+    """Spread values over rows; other rows are missing values, and integers stay integers."""
     kind = series.dtype.kind
     if kind in "iub":
         name = {"i": "Int", "u": "UInt", "b": "boolean"}[kind]
@@ -453,9 +451,9 @@ def _with_missing(series: Any, rows: NDArray[np.intp], count: int) -> Any:
 
 
 def _elements(columns: Columns, path: str) -> dict[str, NDArray[Any]]:
-    """Make a column of each element of an array, called as the log does, else by its place."""
+    """Make a column of each element of an array, named as in the log, else by index."""
     names, values = array_names(columns.metadata, path), columns[path]
-    if values.shape == (0, 0):  # without messages nothing else tells how many there are
+    if values.shape == (0, 0):  # without messages, the number of elements is unknown
         values = values.reshape(0, len(names))
     if len(names) != values.shape[1]:
         names = [f"{i}" for i in range(values.shape[1])]
@@ -463,6 +461,6 @@ def _elements(columns: Columns, path: str) -> dict[str, NDArray[Any]]:
 
 
 def _optional(module: str) -> Any:
-    """Import a module that is part of the extra `headless`."""
+    """Import a module of the extra `headless`."""
     require(module)
     return import_module(module)

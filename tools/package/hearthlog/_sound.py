@@ -1,4 +1,4 @@
-"""The public way from sound to features and labels, as a recorder goes it."""
+"""Public API from sound to features and labels, with the code path of a recorder."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -32,12 +32,12 @@ __all__ = [
 
 
 class SoundFeatures(NamedTuple):
-    """Features of sound, one row a frame of 50 ms.
+    """Features of sound, one row per frame of 50 ms.
 
     Attributes
     ----------
     names, units : tuple of str
-        Of the d values of a frame.
+        Names and units of the d values of a frame.
     times : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds.
     values : np.ndarray [shape=(n, d)], float32
@@ -50,7 +50,7 @@ class SoundFeatures(NamedTuple):
 
 
 class SoundLabels(NamedTuple):
-    """Labels of sound, one a frame of 50 ms, from the end of the first whole window on.
+    """Labels of sound, one per frame of 50 ms, from the end of the first complete window on.
 
     Attributes
     ----------
@@ -58,13 +58,13 @@ class SoundLabels(NamedTuple):
     times : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds.
     labels : np.ndarray [shape=(n,)] of str
-        The likeliest class of each.
+        The likeliest class of each frame.
     probabilities : np.ndarray [shape=(n, C)], float32
         In the order of `classes`.
     novelty : np.ndarray [shape=(n,)], float32
-        From 0 to 1; NaN where the model does not know it.
+        From 0 to 1; NaN if the model computes none.
     segments : Labelling
-        The spans of time that they become by the model's smoothing.
+        The time spans from the model's smoothing.
     """
 
     classes: tuple[str, ...]
@@ -78,16 +78,16 @@ class SoundLabels(NamedTuple):
 def extract_features(
     sound: NDArray[np.generic], rate: int, feature_set: str = DEFAULT.name, start: int = 0
 ) -> SoundFeatures:
-    """Compute the features of sound, to the bits that a recorder would log.
+    """Compute the features of sound, bit for bit as a recorder would log them.
 
     Parameters
     ----------
     sound : np.ndarray [shape=(n,) or (n, channels)]
         Integers of the full range of their type, or floats in full scale, -1 to 1. Channels are
-        averaged, or the best one is taken where they cancel; what fills no frame at the end is left
-        out, and so are frames with samples that are not finite.
+        averaged, or the best channel is used where they cancel. An incomplete last frame and frames
+        with non-finite samples are dropped.
     rate : int
-        Samples per second; other than 16000 are resampled.
+        Samples per second; rates other than 16000 are resampled.
     feature_set : str
     start : int
         Time of the first sample in nanoseconds.
@@ -101,7 +101,7 @@ def extract_features(
     ModelError
         If there is no such feature set.
     SourceError
-        If the sound is shorter than a frame, or is none.
+        If the sound is shorter than a frame, or is not a valid array.
 
     Examples
     --------
@@ -128,13 +128,13 @@ def extract_features(
 
 
 def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0) -> SoundLabels:
-    """Label sound, to the bits that a recorder of one channel would log with this model.
+    """Label sound, bit for bit as a single-channel recorder with this model would log it.
 
     Parameters
     ----------
     model : Model
     sound, rate, start
-        Those of `extract_features`.
+        As in `extract_features`.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
     ModelError
         If the model's feature set is not installed.
     SourceError
-        If the sound is shorter than a frame, or is none.
+        If the sound is shorter than a frame, or is not a valid array.
 
     Examples
     --------
@@ -191,12 +191,12 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
 
 
 def _runs(frames: Int64) -> list[Int64]:
-    """Divide numbers of frames where they do not follow each other."""
+    """Split frame numbers into runs of consecutive numbers."""
     return np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
 
 
 def load_model(path: Path | str) -> Model:
-    """Read a model file and check all that is in it; nothing of it is executed.
+    """Read and validate a model file; nothing in the file is executed.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def load_model(path: Path | str) -> Model:
     Raises
     ------
     ModelError
-        If it is missing, damaged, or needs what is not installed.
+        If the file is missing or damaged, or needs something that is not installed.
 
     Examples
     --------
@@ -227,12 +227,12 @@ def save_model(model: Model, path: Path | str) -> None:
     ----------
     model : Model
     path : Path or str
-        Must end in `.safetensors`, and not exist.
+        Must end in `.safetensors`; the file must not exist.
 
     Raises
     ------
     ModelError
-        If it exists or cannot be written.
+        If the file exists or cannot be written.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The public way to learn models and to compare them."""
+"""Public API to train and compare models."""
 
 import warnings
 from pathlib import Path
@@ -29,25 +29,25 @@ __all__ = ["Comparison", "compare", "train"]
 def train(
     manifest: Path | str, scenario: str, method: str | None = None, smoothing: str = "hmm"
 ) -> Model:
-    """Learn a model from labelled clips, and measure it on sources that it has not heard.
+    """Train a model on labelled clips, and evaluate it on held-out sources.
 
     Parameters
     ----------
     manifest : Path or str
         CSV file with the columns `path`, `label` and `source_group`.
     scenario : str
-        What to tell apart: `bathroom`, `general`, or a TOML file.
+        Classes to distinguish: `bathroom`, `general`, or a TOML file.
     method : str, optional
-        `embedding`, `room`, `room21` (the same of the 21 features of auros21), `bands`, `paper`, or
-        one that another distribution adds. By default `embedding` where its network is, else
-        `room`.
+        `embedding`, `room`, `room21` (the same with the 21 features of auros21), `bands`, `paper`,
+        or a method of another distribution. By default `embedding` if its network is available,
+        else `room`.
     smoothing : str
         How labels become segments: `hmm` or `merge`.
 
     Returns
     -------
     Model
-        Its `description.metrics` are those of cross-validation by source group.
+        Its `description.metrics` are cross-validated by source group.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def train(
     Warns
     -----
     UserWarning
-        If clips were left out: those that cannot be read, and lines of the manifest of no use.
+        If clips are skipped: unreadable clips, and unusable lines of the manifest.
 
     Examples
     --------
@@ -86,19 +86,20 @@ def train(
 
 
 def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
-    """Compare two models on labelled clips that neither has learned from.
+    """Compare two models on labelled clips that neither was trained on.
 
     Parameters
     ----------
     a, b : Model
-        Of the same classes and the same feature set.
+        Models with the same classes and the same feature set.
     manifest : Path or str
-        As of `train`.
+        As in `train`.
 
     Returns
     -------
     Comparison
-        `difference.macro_f1` is that of b minus that of a; `clear` tells whether it means anything.
+        `difference.macro_f1` is the value of b minus the value of a; `clear` is whether the
+        difference is significant.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
     Warns
     -----
     UserWarning
-        As `train`.
+        As in `train`.
 
     Examples
     --------

@@ -1,3 +1,3 @@
-"""The version, which logs carry: apart from the public names, on which nothing of ours stands."""
+"""The version, also recorded in logs; separate from the public names, which our code avoids."""
 
 __version__ = "0.2.0"
