@@ -13,22 +13,22 @@ import numpy as np
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Float32
 
-# Fields of the tables of a TFLite file, as numbered in its schema.
+# Field numbers of the tables in the TFLite schema.
 _SUBGRAPHS, _TENSORS, _OUTPUTS, _OPERATORS = 2, 0, 2, 3
 _SHAPE, _OPERATOR_INPUTS, _OPERATOR_OUTPUTS = 0, 1, 2
 _MOST_STEPS = 64
-_NOTICE = b"XNNPACK delegate"  # in the line of LiteRT that says how it computes
+_NOTICE = b"XNNPACK delegate"  # in the line that LiteRT prints about its delegate
 _loading = threading.Lock()
 
 
 class NetworkOutput(NamedTuple):
-    """What a network gives for a window.
+    """The output of a network for a window.
 
     Attributes
     ----------
     embedding : np.ndarray [shape=(E,)], float32
     logits : np.ndarray [shape=(N,)], float32
-        Of the classes that it has names for.
+        Of the classes with names.
     """
 
     embedding: Float32
@@ -36,7 +36,7 @@ class NetworkOutput(NamedTuple):
 
 
 class NetworkSession(Protocol):
-    """A network in memory."""
+    """A loaded network."""
 
     def __call__(self, window: Float32) -> NetworkOutput:
         """Compute the output for a window.
@@ -49,14 +49,14 @@ class NetworkSession(Protocol):
 
 
 class TfliteSession:
-    """A network of a TFLite file, as `NetworkSession`.
+    """A network from a TFLite file, as `NetworkSession`.
 
     Its embedding and logits need not be among its outputs.
 
-    The file is not unpacked: a longer list of outputs is appended to it, as the library that
+    The file is not unpacked: an extended list of outputs is appended, because the library that
     rewrites such files takes 50 MB.
 
-    Raise `ModelError` if LiteRT is not installed, or the file is no such network.
+    Raise `ModelError` if LiteRT is not installed, or the file is not such a network.
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:
@@ -94,17 +94,17 @@ class TfliteSession:
 
 @contextmanager
 def _without_notice() -> Iterator[None]:
-    """Keep from standard error the line in which LiteRT says how it computes.
+    """Suppress the line that LiteRT prints to standard error about its delegate.
 
-    LiteRT has no switch for it. What else is written in the meantime, by whichever thread, comes
-    when the block ends.
+    LiteRT has no switch for it. Other output in the meantime, from any thread, appears when the
+    block ends.
     """
     with _loading, ExitStack() as stack:
         try:
             error = os.dup(2)
             stack.callback(os.close, error)
             lines = stack.enter_context(tempfile.TemporaryFile(buffering=0))
-        except OSError:  # no standard error, or no room: then the line may come
+        except OSError:  # no standard error, or no space: then do not suppress the line
             yield
             return
         os.dup2(lines.fileno(), 2)
@@ -140,7 +140,7 @@ def _with_outputs(data: bytes, embedding: int, names: int) -> tuple[bytes, tuple
     for number in _upstream(scores, maker):
         width = (tensors[number].numbers(_SHAPE) or [0])[-1]
         if width == names:
-            found[names] = number  # the last one is the one before the logistic function
+            found[names] = number  # the last tensor found is the input of the logistic function
         if width == embedding:
             found[embedding] = number
             break
@@ -155,7 +155,7 @@ def _with_outputs(data: bytes, embedding: int, names: int) -> tuple[bytes, tuple
 
 
 def _upstream(number: int, maker: "dict[int, _Table]") -> Iterator[int]:
-    """Walk from a tensor to those that it is computed from, by the first input of each operator."""
+    """Iterate over the tensors from which a tensor is computed, by each operator's first input."""
     for _ in range(_MOST_STEPS):
         yield number
         if number not in maker:
@@ -173,7 +173,7 @@ class _Table:
         self._size = struct.unpack_from("<H", data, self._fields)[0]
 
     def place(self, field: int) -> int:
-        """Return where a field is; 0 if it is left out."""
+        """Return the position of a field; 0 if it is absent."""
         entry = 4 + 2 * field
         if entry >= self._size:
             return 0
@@ -208,17 +208,17 @@ _LONGEST_LIST = 64  # characters of names in a message
 
 
 class OnnxModel:
-    """A network of one input, which takes the samples of a window.
+    """A network with one input, the samples of a window.
 
     Parameters
     ----------
     input_name : str, optional
-        Name of the input; empty for the only one.
+        Name of the input; empty for the only input.
 
     Raises
     ------
     ModelError
-        If onnxruntime is not installed, or the file is no such network.
+        If onnxruntime is not installed, or the file is not such a network.
     """
 
     def __init__(
@@ -234,7 +234,7 @@ class OnnxModel:
             self._session = self._runtime.InferenceSession(
                 data, options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # onnxruntime has a dozen, of no common kind
+        except Exception as error:  # onnxruntime raises a dozen types without a common base
             raise ModelError(f"is no network that onnxruntime takes ({error})") from error
         self._input, self._shape = self._only_input(window, input_name, whose)
         self.outputs = {each.name: list(each.shape) for each in self._session.get_outputs()}
@@ -251,9 +251,9 @@ class OnnxModel:
         )
 
     def chosen_output(self, wanted: str) -> str:
-        """Return the name of the output that is wanted, or of the only one if that is empty.
+        """Return the name of the wanted output, or of the only output if `wanted` is empty.
 
-        Raise `ModelError` if there is none, or there are several.
+        Raise `ModelError` if there is no such output, or several.
         """
         name = wanted or next(iter(self.outputs), "")
         if name not in self.outputs or (not wanted and len(self.outputs) > 1):
@@ -266,9 +266,9 @@ class OnnxModel:
         outputs: Sequence[str],
         check: Callable[[list[Any]], None],
     ) -> list[Any]:
-        """Try it with some windows, for some seconds at most; return the outputs of the last.
+        """Run the network on some windows, for at most some seconds; return the last outputs.
 
-        Raise `ModelError` if it fails, takes too long, or an output cannot be.
+        Raise `ModelError` if the network fails, takes too long, or an output is invalid.
         """
         options = self._runtime.RunOptions()
         watch = threading.Timer(_PATIENCE_SECONDS, lambda: setattr(options, "terminate", True))
@@ -289,7 +289,7 @@ class OnnxModel:
         return values
 
     def _only_input(self, window: int, input_name: str, whose: str) -> tuple[str, tuple[int, ...]]:
-        """Return the name of the input, and the shape of the samples for it."""
+        """Return the name of the input, and the shape of its samples."""
         inputs = {each.name: each for each in self._session.get_inputs()}
         wanted = input_name or next(iter(inputs), "")
         if list(inputs) != [wanted]:
@@ -305,12 +305,11 @@ class OnnxModel:
 
 
 class OnnxSession:
-    """A network of an ONNX file among whose outputs are embedding and logits, as `Session`.
+    """A network from an ONNX file whose outputs include embedding and logits, as `Session`.
 
-    They are told apart by their widths. Where it gives several rows of them for a window, their
-    mean counts.
+    Embedding and logits are identified by their widths. Several rows per window are averaged.
 
-    Raise `ModelError` if onnxruntime is not installed, or the file is no such network.
+    Raise `ModelError` if onnxruntime is not installed, or the file is not such a network.
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:
@@ -351,12 +350,12 @@ def _runtime() -> Any:
 
 
 def _check_file(data: bytes) -> None:
-    """Refuse what is no network, and one whose weights are in other files."""
+    """Refuse files that are not networks, and networks with weights in other files."""
     import onnx  # noqa: PLC0415  only where there is a network
 
     try:
         network = onnx.load_model_from_string(data)
-    except Exception as error:  # protobuf's, which is no dependency of ours
+    except Exception as error:  # protobuf's error, and protobuf is not our dependency
         raise ModelError(f"is no ONNX file ({error})") from error
     if not network.graph.node:
         raise ModelError("is no ONNX file (there is nothing in it)")
@@ -365,7 +364,7 @@ def _check_file(data: bytes) -> None:
 
 
 def _messages(message: Any) -> Iterator[Any]:
-    """Walk through a message of protobuf, and all that are in it."""
+    """Iterate over a protobuf message and all nested messages."""
     yield message
     for field, value in message.ListFields():
         if field.message_type is not None:
